@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
 
+from brakeline.errors import BusError, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import BusError
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import Array, BackupPlan
-from brakeline.safety.service.client import SafetyError, read_reply
+from brakeline.safety.service.client import read_reply
 from brakeline.safety.service.filter_client import Answer, accept
 
 Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError if there is no answer

@@ -38,7 +38,7 @@ from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
 from brakeline.actors.policies import PolicyFactory, Stop
-from brakeline.messaging.bus import BusError
+from brakeline.errors import BusError, FilterRequired, TakeoffNotVerified
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -55,14 +55,6 @@ log = logging.getLogger("brakeline.flight")
 
 GOALS = 12  # of a flight, which then come again: a policy prepares for each of them before the flight
 RETRY_INTERVAL = 0.2  # s between two questions to a service that does not answer yet
-
-
-class FilterRequired(ValueError):
-    """A real-time flight needs the filter: without an answer the vehicle flies the filter's plan."""
-
-
-class TakeoffNotVerified(ValueError):
-    """The filter cannot verify that the vehicle may hover where the flight begins."""
 
 
 class BackgroundPublisher:

@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 
+from brakeline.errors import BadWeights, BusError, Implausible, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, Sample
-from brakeline.messaging.message_checks import Implausible
-from brakeline.messaging.policy_weights import MLP, BadWeights, decode
+from brakeline.messaging.bus import Bus, Sample
+from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import FLOW, JOIN, WEIGHTS
 
@@ -21,10 +21,6 @@ REJOIN_AFTER = 2.0  # s without permission: the learner may have missed the last
 MOST_VERSIONS_AHEAD = 1000  # of published weights; an actor that is farther behind joins the learner again
 MOST_STEPS_AHEAD = 10_000  # that a learner may permit at once
 LOG_INTERVAL = 10.0  # s between two log lines while there is no learner
-
-
-class RefusedByLearner(RuntimeError):
-    """The learner does not accept this actor: their layouts differ, or the learner has enough actors."""
 
 
 class LearnerClient:

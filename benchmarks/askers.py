@@ -29,8 +29,9 @@ import psutil
 from benchmarks import situations
 from benchmarks.timing import Figures
 from brakeline.deploy.interpreter import spawning
+from brakeline.errors import BusError, Late
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, BusSettings, Late
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named

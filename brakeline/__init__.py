@@ -16,25 +16,39 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from brakeline.messaging.bus import BusError, BusSettings, Late, NoReply, Refused, Unreachable
-    from brakeline.messaging.obstacle import BadShape, Obstacle, Shapes
+    from brakeline.errors import (
+        BadData,
+        BadDescription,
+        BadModel,
+        BadRequest,
+        BadScan,
+        BadShape,
+        BusError,
+        ErrorBoundError,
+        Late,
+        NoReply,
+        Refused,
+        SafetyError,
+        UnknownRobot,
+        Unreachable,
+    )
+    from brakeline.messaging.bus import BusSettings
+    from brakeline.messaging.obstacle import Obstacle, Shapes
     from brakeline.messaging.obstacle_motion import Motion
     from brakeline.messaging.range_image import RangeImage
-    from brakeline.messaging.robot import Disc, Limit, Robot, UnknownRobot, robot_named
-    from brakeline.messaging.robot_description import BadDescription
-    from brakeline.messaging.scan import BadScan, Scan
+    from brakeline.messaging.robot import Disc, Limit, Robot, robot_named
+    from brakeline.messaging.scan import Scan
     from brakeline.messaging.task import RobotWithTask, Task, robot_with_task
     from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
     from brakeline.safety.filter.filter import Filter
-    from brakeline.safety.filter.request import BadRequest, Decision, Request
+    from brakeline.safety.filter.request import Decision, Request
     from brakeline.safety.gym import SafetyWrapper
-    from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
-    from brakeline.safety.model.error_bounds import ErrorBoundError
+    from brakeline.safety.model.dataset import Dataset, Trajectory
     from brakeline.safety.model.fitting import fit_model_set
-    from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
+    from brakeline.safety.model.model_set import ModelConfig, ModelSet
     from brakeline.safety.model.validation import ValidationReport, validate
     from brakeline.safety.perception.image_memory import filled, memory_of
-    from brakeline.safety.service.client import SafetyClient, SafetyError
+    from brakeline.safety.service.client import SafetyClient
     from brakeline.safety.service.filter_client import Answer, FilterClient
     from brakeline.safety.service.fleet_client import FleetClient
     from brakeline.safety.service.in_process import InProcess

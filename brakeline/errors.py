@@ -1,6 +1,17 @@
-"""Every exception of Brakeline, in one tree. `except BrakelineError` catches what the package raises on purpose."""
+"""Every exception of Brakeline, in one tree. `except BrakelineError` catches what the package raises on purpose.
+
+An exception's message says what happened, where, and what to do next. Exceptions that stand for a wrong argument are
+also `ValueError`s, so code that catches those keeps working.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from brakeline.messaging import brakeline_pb2 as pb
 
 
 class BrakelineError(Exception):
@@ -9,3 +20,394 @@ class BrakelineError(Exception):
 
 class MissingExtra(BrakelineError, ImportError):
     """An optional package is not installed. The message names the extra that brings it."""
+
+
+# --- Robots, tasks, obstacles and the bus ---
+
+
+class BusError(BrakelineError):
+    """Base class of the errors of the bus."""
+
+
+class Unreachable(BusError):
+    """No router answers at any endpoint, or the process cannot listen on an endpoint."""
+
+
+class Insecure(BusError):
+    """Other machines could reach this bus without authentication."""
+
+
+class BadKeys(BusError):
+    """A folder of keys lacks a file that is needed; the message names it."""
+
+
+class NoReply(BusError):
+    """No service answers this query, or the service has ended."""
+
+
+class Late(BusError):
+    """The deadline passed without a reply."""
+
+
+class Busy(BusError):
+    """The queue of queries is full."""
+
+
+class Expired(BusError):
+    """The deadline of a query passed while it was in the queue."""
+
+
+class Malformed(BusError, ValueError):
+    """The bytes are no message of the topic's type, or the message is implausible."""
+
+
+class Refused(BusError):
+    """The service replied with an error.
+
+    Attributes:
+        type: name of the error.
+        field: the invalid field of the query, or empty.
+        text: the message.
+    """
+
+    def __init__(self, error: pb.Error) -> None:
+        super().__init__(f"{error.type}: {error.message}")
+        self.type, self.field, self.text = error.type, error.field, error.message
+
+
+class BadLink(BrakelineError, ValueError):
+    """The URL is none of those above."""
+
+
+class Implausible(BrakelineError, ValueError):
+    """A message has a time, a name or a size that no correct sender uses."""
+
+
+class BadShape(BrakelineError, ValueError):
+    """An obstacle is invalid. `field` names the invalid field."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+class BadPerceptrons(BrakelineError, ValueError):
+    """Layers do not fit each other, or are not finite; the message names the layer."""
+
+
+class BadWeights(BrakelineError, ValueError):
+    """Not a policy, or not one of this robot; the message says which part is wrong."""
+
+
+class UnknownRobot(BrakelineError, ValueError):
+    """No robot has this name, or its description is invalid."""
+
+    field = "robot"  # the field of a request that is wrong
+
+
+class BadDescription(UnknownRobot):
+    """A robot description has mistakes.
+
+    Attributes:
+        problems: (field, mistake and allowed values) of every mistake.
+    """
+
+    def __init__(self, source: str, problems: Sequence[tuple[str, str]]) -> None:
+        lines = "".join(f"\n  {field}: {text}" for field, text in problems)
+        super().__init__(f"{source} is no robot's description:{lines}")
+        self.problems = problems
+
+
+class BadRosName(BrakelineError, ValueError):
+    """A name or token is not valid in ROS."""
+
+
+class BadScan(BrakelineError, ValueError):
+    """A scan or range image is invalid."""
+
+    field = "scan"
+
+
+class UnknownTask(BrakelineError, ValueError):
+    """The robot has no such task, or the task's file has mistakes, which the message lists."""
+
+
+# --- Data, models and decisions ---
+
+
+class Mismatch(BrakelineError, ValueError):
+    """The environment does not fit the robot. The message says which argument to give."""
+
+
+class BadRequest(BrakelineError, ValueError):
+    """A request that can't be decided on: `field` names what is wrong."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
+class StaleModel(BadRequest):
+    """The committed plan was verified by a model set that this filter never had."""
+
+
+class BadData(BrakelineError, ValueError):
+    """A data set that must not be used; the message says which check failed."""
+
+
+class ErrorBoundError(BrakelineError, ValueError):
+    """The data do not support the error bound; the message says why."""
+
+
+class BadModel(BrakelineError, ValueError):
+    """A model set that must not be used; the message says why."""
+
+
+class TooLoose(BadModel):
+    """A model set whose statement is looser than what is used without a question; the message says what to do."""
+
+
+class BadTensors(BrakelineError, ValueError):
+    """The bytes are no such file."""
+
+
+class SafetyError(BusError):
+    """The service answered a request with an error, or its reply is not valid. `field` names the wrong field."""
+
+    def __init__(self, error: pb.Error) -> None:
+        super().__init__(f"{error.type}: {error.message}")
+        self.type, self.field = error.type, error.field
+
+
+class AskedApart(BadRequest):
+    """A batch does not hold all robots of a world once: the service can check no reservation."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("fleet", message)
+
+
+class BadKey(BrakelineError, ValueError):
+    """The key of the plan tokens is too short."""
+
+
+class NoModel(BadRequest):
+    """The service has no model of the robot."""
+
+
+class Untrusted(BadModel):
+    """No trusted signer signed the model, or the model is not what was signed."""
+
+
+# --- Simulation ---
+
+
+class UnknownArena(BrakelineError, ValueError):
+    """The robot has no arena of this name; the message lists the names."""
+
+
+class NoArena(BrakelineError, RuntimeError):
+    """No drawn arena had a path from start to goal: the numbers of its kind leave too little room."""
+
+
+class UnknownRules(BrakelineError, ValueError):
+    """No rule set has this name."""
+
+
+class RequestRefused(BrakelineError):
+    """The vehicle refuses a command or a setpoint now; the message says why."""
+
+
+class UnknownMode(RequestRefused):
+    """The requested mode does not exist."""
+
+
+class AutopilotGone(BrakelineError, RuntimeError):
+    """The autopilot no longer answers, or does not support lockstep."""
+
+
+class BadParameter(BrakelineError, ValueError):
+    """The parameter does not exist, or cannot have this value."""
+
+
+class Px4Error(BrakelineError, RuntimeError):
+    """The folder holds no PX4, or PX4 did not start."""
+
+
+class UnknownPolicy(BrakelineError, ValueError):
+    """The robot has no scripted policy of this name; the message lists the names."""
+
+
+class NoFleet(BrakelineError, ValueError):
+    """Several robots cannot share a world: their kind, the arena or the conditions do not allow it."""
+
+
+class BadInput(BrakelineError, ValueError):
+    """The input is not a finite vector with one number for each of the robot's inputs."""
+
+
+# --- Actors and their vehicles ---
+
+
+class FilterRequired(BrakelineError, ValueError):
+    """A real-time flight needs the filter: without an answer the vehicle flies the filter's plan."""
+
+
+class TakeoffNotVerified(BrakelineError, ValueError):
+    """The filter cannot verify that the vehicle may hover where the flight begins."""
+
+
+class RefusedByLearner(BrakelineError, RuntimeError):
+    """The learner does not accept this actor: their layouts differ, or the learner has enough actors."""
+
+
+class MavlinkError(BrakelineError, RuntimeError):
+    """The autopilot does not carry out a command."""
+
+
+class NoAutopilot(MavlinkError):
+    """No heartbeat of PX4 or ArduPilot arrives."""
+
+
+class CommandRefused(MavlinkError):
+    """The COMMAND_ACK has another result than accepted, or there is none."""
+
+
+class TelemetryMissing(MavlinkError):
+    """The autopilot sends none of the messages that carry a quantity which the flight needs."""
+
+
+class HandoverRefused(MavlinkError):
+    """The server does not hand the vehicle over to this actor, which has to take control of it anew."""
+
+
+class BadMessage(BrakelineError, ValueError):
+    """A message is not valid: its receiver drops it, and goes on."""
+
+
+class BadLaserScan(BrakelineError, ValueError):
+    """A scan is not valid."""
+
+
+class UnsupportedRobot(BrakelineError, ValueError):
+    """A robot cannot be driven by Twist messages."""
+
+
+class InputMissing(BrakelineError):
+    """An input of a decision is missing or stale; the message says which."""
+
+
+# --- Learning ---
+
+
+class CheckpointError(BrakelineError, RuntimeError):
+    """A checkpoint could not be written or read."""
+
+
+class NoCheckpoint(CheckpointError):
+    """There is none in this folder."""
+
+
+class MissingPart(CheckpointError):
+    """A part, or a file of it, is not there; `part` names it."""
+
+    def __init__(self, part: str, where: Path) -> None:
+        super().__init__(f"{where}: the part {part!r} is missing")
+        self.part = part
+
+
+class DamagedPart(CheckpointError):
+    """A part is not what was written, or does not fit; `part` names it."""
+
+    def __init__(self, part: str, where: Path, why: str) -> None:
+        super().__init__(f"{where}: the part {part!r} is damaged: {why}")
+        self.part = part
+
+
+class OtherRun(CheckpointError):
+    """It is of another robot or configuration; `field` names the difference."""
+
+    def __init__(self, field: str, where: Path) -> None:
+        super().__init__(f"{where}: the checkpoint differs from this run in {field}")
+        self.field = field
+
+
+class BadState(BrakelineError, ValueError):
+    """A piece is missing, or of another shape or kind; the message names it."""
+
+
+class TooFew(BrakelineError, ValueError):
+    """Not enough samples for a batch."""
+
+
+class BadStep(BrakelineError, ValueError):
+    """A step that cannot be learned from; `field` names what is wrong with it."""
+
+    def __init__(self, field: str, why: str) -> None:
+        super().__init__(f"{field}: {why}")
+        self.field = field
+
+
+# --- Logs ---
+
+
+class LogError(BrakelineError):
+    """The log cannot be read."""
+
+
+class BeingRecorded(LogError):
+    """A recorder is writing to the file."""
+
+
+class NotMcap(BrakelineError):
+    """The file does not start with the MCAP magic bytes."""
+
+
+class Crowded(BrakelineError, ValueError):
+    """The run has too many publishers, actors or processes."""
+
+
+class ExportError(BrakelineError, ValueError):
+    """The log cannot be exported."""
+
+
+class NoLog(LogError):
+    """There is no log at the path."""
+
+
+class NotALog(LogError):
+    """The file is not an MCAP file."""
+
+
+# --- Commands and runs ---
+
+
+class Unsupported(BadData):
+    """No kind of windows supports a model set. `reasons` maps each kind to the reason; the message lists them."""
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        super().__init__("; ".join(f"{kind} windows: {reason}" for kind, reason in reasons.items()))
+        self.reasons = reasons
+
+
+class FlightEnded(BrakelineError, RuntimeError):
+    """The flight ended early; the message gives the reason. The data up to then remain valid."""
+
+
+class NoSource(BadData):
+    """A source cannot be read as data of a robot; the message gives the reason and the remedy."""
+
+
+class FigureMismatch(BrakelineError, RuntimeError):
+    """The log of a run does not agree with the figures that the run counted."""
+
+
+class StaleResultError(BrakelineError, ValueError):
+    """An existing result was made with other settings."""
+
+
+class ReplayError(BrakelineError, ValueError):
+    """The log cannot be replayed; the message says what is missing."""
+
+
+class LaunchError(BrakelineError, RuntimeError):
+    """A run can't start or go on. The message says what to do."""

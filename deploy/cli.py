@@ -151,8 +151,7 @@ def _default(item: Field[Any]) -> Any:
 
 def expected_errors() -> tuple[type[Exception], ...]:
     """Return the exceptions whose message tells the user enough. Whatever raised one has imported its module."""
-    from brakeline.logs.reader import LogError
-    from brakeline.messaging.bus import BusError
+    from brakeline.errors import BusError, LogError
 
     return BusError, LogError, ValueError, OSError, RuntimeError
 

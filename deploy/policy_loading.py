@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.quantity_names import column_names
-from brakeline.deploy.data.sources.source_table import NoSource
-from brakeline.messaging.policy_weights import MLP, BadWeights
+from brakeline.errors import BadWeights, NoSource
+from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.scripted_policies import Policy, scripted
 

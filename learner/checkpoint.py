@@ -19,6 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from brakeline.errors import CheckpointError, DamagedPart, MissingPart, NoCheckpoint
 from brakeline.learner.checkpoint_state import PartState
 
 FORMAT = 1
@@ -26,38 +27,6 @@ CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints
 LATEST = "latest"
 MANIFEST = "manifest.json"
 PARTIAL = ".partial"
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint could not be written or read."""
-
-
-class NoCheckpoint(CheckpointError):
-    """There is none in this folder."""
-
-
-class MissingPart(CheckpointError):
-    """A part, or a file of it, is not there; `part` names it."""
-
-    def __init__(self, part: str, where: Path) -> None:
-        super().__init__(f"{where}: the part {part!r} is missing")
-        self.part = part
-
-
-class DamagedPart(CheckpointError):
-    """A part is not what was written, or does not fit; `part` names it."""
-
-    def __init__(self, part: str, where: Path, why: str) -> None:
-        super().__init__(f"{where}: the part {part!r} is damaged: {why}")
-        self.part = part
-
-
-class OtherRun(CheckpointError):
-    """It is of another robot or configuration; `field` names the difference."""
-
-    def __init__(self, field: str, where: Path) -> None:
-        super().__init__(f"{where}: the checkpoint differs from this run in {field}")
-        self.field = field
 
 
 def exists(root: Path) -> bool:

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
-class BadState(ValueError):
-    """A piece is missing, or of another shape or kind; the message names it."""
+from brakeline.errors import BadState
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from brakeline.errors import BadStep, CheckpointError, DamagedPart, OtherRun
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import LearnerConfig
@@ -25,7 +26,7 @@ from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.learner.step_ledger import StepLedger
 from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.learner.td3 import TD3
-from brakeline.learner.transition_reader import LATEST, BadStep, StepReader
+from brakeline.learner.transition_reader import LATEST, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
 from brakeline.messaging.task import RobotWithTask
@@ -262,7 +263,7 @@ class Learner:
         parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}
         try:
             return checkpoint.save(root, parts, self._about())
-        except checkpoint.CheckpointError:
+        except CheckpointError:
             self._saved_at = saved_before
             raise
 
@@ -279,7 +280,7 @@ class Learner:
             try:
                 restore(states[name])
             except (ValueError, TypeError, KeyError, IndexError) as error:
-                raise checkpoint.DamagedPart(name, root, str(error)) from error
+                raise DamagedPart(name, root, str(error)) from error
         self._encode()
         if self._published_updates != self._td3.updates:
             self.publish()
@@ -306,7 +307,7 @@ class Learner:
             else:
                 names = [name] if theirs != ours[name] else []
             if names:
-                raise checkpoint.OtherRun(", ".join(names), root)
+                raise OtherRun(", ".join(names), root)
 
     def _run_state(self) -> PartState:
         values = {

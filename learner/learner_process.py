@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 
-from brakeline.learner.checkpoint import CHECKPOINT, CheckpointError, exists
+from brakeline.errors import BadStep, CheckpointError
+from brakeline.learner.checkpoint import CHECKPOINT, exists
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
-from brakeline.learner.transition_reader import BadStep
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample

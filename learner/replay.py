@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from brakeline.learner.checkpoint_state import BadState, PartState
+from brakeline.errors import BadState
+from brakeline.learner.checkpoint_state import PartState
 
 Vector = NDArray[np.float32]
 

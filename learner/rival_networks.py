@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from brakeline.errors import TooFew
 from brakeline.learner.adam import Adam
 from brakeline.learner.networks import Network
 from brakeline.learner.symmetry import SymmetryAugmentation
@@ -36,10 +37,6 @@ class FitConfig:
     def __post_init__(self) -> None:
         if min(self.batch, self.epochs) < 1 or not self.hidden or not 0.0 < self.held_out < 1.0:
             raise ValueError(f"batch and epochs are 1 or more, held_out is between 0 and 1: {self}")
-
-
-class TooFew(ValueError):
-    """Not enough samples for a batch."""
 
 
 Gradient = Callable[[Tensor, NDArray[np.intp]], Tensor]  # outputs (count, batch, out) and their rows -> dL/doutputs

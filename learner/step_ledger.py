@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.learner.checkpoint_state import BadState, PartState
+from brakeline.errors import BadState
+from brakeline.learner.checkpoint_state import PartState
 
 
 @dataclass

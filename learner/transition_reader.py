@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.errors import BadStep
 from brakeline.learner.n_step import ActorStep
 from brakeline.learner.replay import Vector
 from brakeline.messaging import brakeline_pb2 as pb
@@ -18,14 +19,6 @@ MOST_OBSERVED = 10.0  # observations are clipped at 1.5
 MOST_PROPOSED = 1e2  # half ranges from the middle: policies may propose what is out of bounds, and are clipped
 ROUNDING = 1e-3  # of half a range, of an executed action at its bounds
 LATEST = 2**31  # number of an episode or a step
-
-
-class BadStep(ValueError):
-    """A step that cannot be learned from; `field` names what is wrong with it."""
-
-    def __init__(self, field: str, why: str) -> None:
-        super().__init__(f"{field}: {why}")
-        self.field = field
 
 
 class StepReader:

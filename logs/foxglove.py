@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
+from brakeline.errors import UnknownRobot
 from brakeline.logs import foxglove_scene
 from brakeline.logs.reader import Record
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
-from brakeline.messaging.robot import Robot, UnknownRobot
+from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, EXCHANGE, LOG, STEP
 from brakeline.safety.perception.displayed_map import reserved_boxes

@@ -10,8 +10,9 @@ from typing import Any, TextIO
 
 from google.protobuf.message import DecodeError
 
+from brakeline.errors import ExportError
 from brakeline.logs.foxglove import FoxgloveConverter
-from brakeline.logs.minari_export import ExportError, nothing_of
+from brakeline.logs.minari_export import nothing_of
 from brakeline.logs.reader import TYPES, Log, Paths, Record, open_log
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb

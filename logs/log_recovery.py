@@ -15,16 +15,12 @@ from typing import IO, Any
 import mcap.writer
 from mcap.records import Attachment, Metadata
 
-from brakeline.logs.mcap_container import DamagedBytes, LogChannel, NotMcap, records
-from brakeline.logs.reader import LogError, NotALog
+from brakeline.errors import BeingRecorded, NotALog, NotMcap
+from brakeline.logs.mcap_container import DamagedBytes, LogChannel, records
 from brakeline.logs.segment import CHUNK, being_written
 
 DAMAGED = ".damaged"
 UNFINISHED = ".recovering"
-
-
-class BeingRecorded(LogError):
-    """A recorder is writing to the file."""
 
 
 @dataclass

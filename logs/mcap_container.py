@@ -22,6 +22,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 
+from brakeline.errors import NotMcap
+
 MAGIC = b"\x89MCAP0\r\n"
 MOST_CHUNK_BYTES = 2**27  # a chunk that declares more is damaged
 BROKEN = (McapError, struct.error, ValueError, EOFError, RuntimeError, zstandard.ZstdError)
@@ -31,10 +33,6 @@ SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.M
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time; then the payload
 _TO_PAYLOAD = _HEAD.size + _MESSAGE.size
-
-
-class NotMcap(Exception):
-    """The file does not start with the MCAP magic bytes."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
+from brakeline.errors import Crowded
 from brakeline.logs import tube_stats
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
@@ -33,10 +34,6 @@ MOST_STREAMS = 20_000  # keys and process starts; a message beyond them is rejec
 MOST_NAMES = 4_000  # actors, learners or processes; the sketches of one actor take 10 kB and more
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 SILENT = HEALTH.stale_after or 3.0  # s without a Health message after which a process counts as silent
-
-
-class Crowded(ValueError):
-    """The run has too many publishers, actors or processes."""
 
 
 @dataclass(slots=True)

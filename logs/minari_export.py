@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.errors import ExportError
 from brakeline.logs.reader import Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
@@ -18,10 +19,6 @@ from brakeline.messaging.task import RobotWithTask
 BATCH = 100  # episodes per write
 # Fields of a step in the `infos` of the data set.
 INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
-
-
-class ExportError(ValueError):
-    """The log cannot be exported."""
 
 
 def nothing_of(robot: RobotWithTask, others: Collection[str]) -> str:

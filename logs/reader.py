@@ -16,28 +16,17 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Metadata
 
-from brakeline.logs.mcap_container import DamagedBytes, LogChannel, NotMcap, Row, records
+from brakeline.errors import Implausible, NoLog, NotALog, NotMcap
+from brakeline.logs.mcap_container import DamagedBytes, LogChannel, Row, records
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import being_written, name_of, number_of
-from brakeline.messaging.message_checks import Implausible, check
+from brakeline.messaging.message_checks import check
 from brakeline.messaging.topics import TOPICS
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 TYPES: dict[str, type[Message]] = {topic.message.DESCRIPTOR.full_name: topic.message for topic in TOPICS}
 NAMES: dict[str, str] = {topic.key.split("/", 1)[0]: topic.name for topic in TOPICS}
-
-
-class LogError(Exception):
-    """The log cannot be read."""
-
-
-class NoLog(LogError):
-    """There is no log at the path."""
-
-
-class NotALog(LogError):
-    """The file is not an MCAP file."""
 
 
 class Record(NamedTuple):

@@ -6,7 +6,8 @@ import json
 import logging
 from collections.abc import Iterable, Mapping
 
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, UnknownRobot, refuse_shipped_name, shipped_robots
+from brakeline.errors import UnknownRobot
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.task import robot_with_task
 

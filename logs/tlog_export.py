@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from typing import BinaryIO
 
-from brakeline.logs.minari_export import ExportError
+from brakeline.errors import ExportError
 from brakeline.logs.reader import Paths, open_log
 
 TIME = struct.Struct(">Q")

@@ -13,12 +13,10 @@ import socket
 import time
 from typing import Protocol
 
+from brakeline.errors import BadLink
+
 FORGET = 10.0  # s of silence after which a UDP peer is no longer answered
 LARGEST = 65536  # bytes read at once
-
-
-class BadLink(ValueError):
-    """The URL is none of those above."""
 
 
 class Link(Protocol):

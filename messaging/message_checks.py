@@ -11,6 +11,8 @@ from typing import Any
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import Message
 
+from brakeline.errors import Implausible
+
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,100}")  # a name that can be part of a key
 NAME_FIELDS = ("robot", "actor", "process", "source")  # fields with such a name; they may be empty
 MAX_WALL_TIME = 2**62  # [ns since the Unix epoch]
@@ -20,10 +22,6 @@ MAX_NUMBERS = 10_000  # in one repeated field
 STEP_NUMBERS = ("reward", "penalty", "speed")
 
 Check = Callable[[Any], None]
-
-
-class Implausible(ValueError):
-    """A message has a time, a name or a size that no correct sender uses."""
 
 
 def check(message: Message) -> None:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brakeline.errors import BadShape
 from brakeline.messaging.obstacle_motion import Motion
 
 Array = NDArray[np.float64]
@@ -30,14 +31,6 @@ FARTHEST = 1e4  # largest coordinate of an obstacle's position, and largest size
 WALL_DEPTH = 1e5  # half the edge of the box that represents a wall [m]
 BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
 KINDS = (BOX, CYLINDER, SPHERE, WALL)
-
-
-class BadShape(ValueError):
-    """An obstacle is invalid. `field` names the invalid field."""
-
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
 
 
 @dataclass(frozen=True)

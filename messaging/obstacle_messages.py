@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from brakeline.errors import BadShape
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.obstacle import BadShape, Obstacle
+from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 
 

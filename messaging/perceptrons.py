@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadPerceptrons
+
 Tensor = NDArray[np.float32]
 Layer = tuple[Tensor, Tensor]  # weight (count, out, in), bias (count, out)
-
-
-class BadPerceptrons(ValueError):
-    """Layers do not fit each other, or are not finite; the message names the layer."""
 
 
 class Perceptrons:

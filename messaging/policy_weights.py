@@ -18,15 +18,12 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
+from brakeline.errors import BadWeights
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Array, shipped_robots
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 Matrix = NDArray[np.float32]
 Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
-
-
-class BadWeights(ValueError):
-    """Not a policy, or not one of this robot; the message says which part is wrong."""
 
 
 class MLP:

@@ -16,8 +16,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from brakeline.errors import BusError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, BusSettings, Publisher
+from brakeline.messaging.bus import Bus, BusSettings, Publisher
 from brakeline.messaging.metrics_endpoint import MetricsServer, ProcessStatus
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import HEALTH, LOG

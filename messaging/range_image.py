@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.scan import BadScan, check_numbers, check_unit
+from brakeline.errors import BadScan
+from brakeline.messaging.scan import check_numbers, check_unit
 
 Array = NDArray[np.float64]
 

@@ -17,6 +17,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import UnknownRobot
+
 Array = NDArray[np.float64]
 
 INPUT_ROUNDING = 1e-9  # rounding that the bounds of an input allow
@@ -26,12 +28,6 @@ RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
 INPUT_TOLERANCE = 1e-6  # share of an input's range: closer inputs are equal (logs hold single precision)
 DEFAULT_ACCEPT_BOUND = 0.01
 ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
-
-
-class UnknownRobot(ValueError):
-    """No robot has this name, or its description is invalid."""
-
-    field = "robot"  # the field of a request that is wrong
 
 
 @dataclass(frozen=True)

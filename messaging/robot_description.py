@@ -18,17 +18,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from brakeline.messaging.robot import (
-    DEFAULT_ACCEPT_BOUND,
-    FEEDBACK,
-    HOLD,
-    RAMP,
-    REAL_TIME_SUFFIX,
-    Disc,
-    Limit,
-    Robot,
-    UnknownRobot,
-)
+from brakeline.errors import BadDescription, UnknownRobot
+from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP, REAL_TIME_SUFFIX, Disc, Limit, Robot
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
 MAX_NAME_LENGTH = 64
@@ -47,19 +38,6 @@ def _check_unit(unit: str) -> str:
 
 
 Unit = Annotated[str, AfterValidator(_check_unit)]
-
-
-class BadDescription(UnknownRobot):
-    """A robot description has mistakes.
-
-    Attributes:
-        problems: (field, mistake and allowed values) of every mistake.
-    """
-
-    def __init__(self, source: str, problems: list[Problem]) -> None:
-        lines = "".join(f"\n  {field}: {text}" for field, text in problems)
-        super().__init__(f"{source} is no robot's description:{lines}")
-        self.problems = problems
 
 
 class _Strict(BaseModel):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import FARTHEST
 
 Array = NDArray[np.float64]
@@ -21,12 +22,6 @@ Array = NDArray[np.float64]
 MAX_BEAMS = 1000
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
 MAX_TRACK_VALUE = 1e4  # largest speed [m/s], error [m/s] and acceleration [m/s²] of a track
-
-
-class BadScan(ValueError):
-    """A scan or range image is invalid."""
-
-    field = "scan"
 
 
 def check_unit(ranges: object) -> None:

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.errors import BadScan
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.scan import BadScan, BeamTracks, Scan
+from brakeline.messaging.scan import BeamTracks, Scan
 
 RangeMeasurement = Scan | RangeImage
 

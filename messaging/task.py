@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from brakeline.errors import UnknownTask
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import (
     FORMER_LAYOUTS,
@@ -34,10 +35,6 @@ from brakeline.messaging.robot import (
 )
 
 _STRICT = ConfigDict(extra="forbid")
-
-
-class UnknownTask(ValueError):
-    """The robot has no such task, or the task's file has mistakes, which the message lists."""
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brakeline.errors import Mismatch
 from brakeline.messaging.robot import Robot
 
 Array = NDArray[np.float64]
 
 SAME_BOUND = 1e-6  # of an input's range: rounding error of bounds in single precision
-
-
-class Mismatch(ValueError):
-    """The environment does not fit the robot. The message says which argument to give."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from brakeline.safety.action_mapping import Mismatch
+from brakeline.errors import Mismatch
 
 # (environment, observation, info) -> the state or the obstacles
 View = Callable[[Any, Any, dict[str, Any]], Any]

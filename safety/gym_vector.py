@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from brakeline.errors import Mismatch
 from brakeline.messaging.sensor_messages import RangeMeasurement
-from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space
+from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.gym import diagnostics

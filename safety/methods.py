@@ -9,11 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.model.model_config import DDPC as DDPC
-from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.tensor_file import has_entry
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
 from brakeline.safety.rivals.sailr import SAILR, Sailr

@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import NoArena, UnknownArena
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
@@ -21,14 +22,6 @@ from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
 from brakeline.sim.traffic import Crowd
 
 Array = NDArray[np.float64]
-
-
-class UnknownArena(ValueError):
-    """The robot has no arena of this name; the message lists the names."""
-
-
-class NoArena(RuntimeError):
-    """No drawn arena had a path from start to goal: the numbers of its kind leave too little room."""
 
 
 ATTEMPTS = 1000  # arenas drawn before giving up

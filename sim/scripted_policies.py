@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import UnknownPolicy
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
@@ -23,10 +24,6 @@ from brakeline.sim.reciprocal_avoidance import ReciprocalAvoidance
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Policy = Callable[[Observation, dict[str, Any]], Array]  # (observation, info) -> input in physical units
-
-
-class UnknownPolicy(ValueError):
-    """The robot has no scripted policy of this name; the message lists the names."""
 
 
 def scripted(name: str, robot: RobotWithTask, rng: np.random.Generator) -> Policy:

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import NoFleet
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, same_room
 from brakeline.sim.arena_generator import arena_kind, draw_fleet
@@ -23,10 +24,6 @@ Array = NDArray[np.float64]
 
 ROBOT_BIT = 4  # the contact bit with which robots touch each other
 FLOOR, OBSTACLE = -1, -2  # owners of a geom that belongs to no robot
-
-
-class NoFleet(ValueError):
-    """Several robots cannot share a world: their kind, the arena or the conditions do not allow it."""
 
 
 def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditions) -> None:

@@ -9,14 +9,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadInput
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 
 Array = NDArray[np.float64]
-
-
-class BadInput(ValueError):
-    """The input is not a finite vector with one number for each of the robot's inputs."""
 
 
 def clip_input(robot: Robot, input: Array, before: Array) -> Array:

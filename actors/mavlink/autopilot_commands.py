@@ -16,6 +16,7 @@ from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.mavlink_decoder import AUTOPILOT, OFFBOARD, MavlinkDecoder
 from brakeline.actors.mavlink.position_lookahead import MASK, PARAMETERS, PositionLookahead
 from brakeline.actors.mavlink.telemetry import ESTIMATORS, SOURCES, Array
+from brakeline.errors import CommandRefused, MavlinkError, NoAutopilot, TelemetryMissing
 
 VELOCITY_ONLY = 0x0DC7  # type mask: ignore position, acceleration, yaw and yaw rate
 REPLY_TIMEOUT = 0.5  # s for a reply, before the message is sent again
@@ -32,22 +33,6 @@ RESULTS = {
 }
 
 Wait = Callable[[Callable[[], bool], float], bool]  # (condition, timeout in s) -> whether the condition holds
-
-
-class MavlinkError(RuntimeError):
-    """The autopilot does not carry out a command."""
-
-
-class NoAutopilot(MavlinkError):
-    """No heartbeat of PX4 or ArduPilot arrives."""
-
-
-class CommandRefused(MavlinkError):
-    """The COMMAND_ACK has another result than accepted, or there is none."""
-
-
-class TelemetryMissing(MavlinkError):
-    """The autopilot sends none of the messages that carry a quantity which the flight needs."""
 
 
 class AutopilotClient(MavlinkDecoder):

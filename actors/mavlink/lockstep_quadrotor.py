@@ -7,9 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, CommandRefused, message_id
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, message_id
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, MOTION, SOURCES, Array
+from brakeline.errors import CommandRefused
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
 from brakeline.sim.vehicle import Period, clip_input

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError, TelemetryMissing
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
 from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array
+from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.byte_links import Link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot

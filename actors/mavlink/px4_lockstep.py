@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
+from brakeline.errors import AutopilotGone, MavlinkError
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
+from brakeline.sim.autopilot.hil_link import HilLink
 from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise

@@ -10,13 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import (
-    AutopilotClient,
-    MavlinkError,
-    TelemetryMissing,
-    Wait,
-    message_id,
-)
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, Wait, message_id
 from brakeline.actors.mavlink.autopilot_limits import (
     AUTOPILOT_LIMITS,
     FIXED_TIMEOUT,
@@ -26,6 +20,7 @@ from brakeline.actors.mavlink.autopilot_limits import (
     limits_below_demand,
 )
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, missing
+from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.robot import Robot
 
 log = logging.getLogger("brakeline.flight")

@@ -14,21 +14,13 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.autopilot_commands import MavlinkError
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.telemetry import Array
-from brakeline.actors.mavlink.vehicle_messages import (
-    FlightRequest,
-    HandoverRefused,
-    error_of,
-    level_of,
-    period_of,
-    request_message,
-)
-from brakeline.actors.mavlink.vehicle_socket import BadMessage, MessageSocket, connect
+from brakeline.actors.mavlink.vehicle_messages import FlightRequest, error_of, level_of, period_of, request_message
+from brakeline.actors.mavlink.vehicle_socket import MessageSocket, connect
+from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.sim.vehicle import BadInput
 
 log = logging.getLogger("brakeline.flight")
 

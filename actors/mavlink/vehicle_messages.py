@@ -14,26 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.autopilot_commands import MavlinkError
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.telemetry import Array
-from brakeline.actors.mavlink.vehicle_socket import BadMessage
+from brakeline.errors import BadInput, BadLink, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
-from brakeline.sim.vehicle import BadInput, Period
+from brakeline.sim.vehicle import Period
 
 LONGEST_TEXT = 8000  # characters of a log line or an error
 MOST_PORTS, MOST_SYSTEMS = 65535, 255
-
-
-class HandoverRefused(MavlinkError):
-    """The server does not hand the vehicle over to this actor, which has to take control of it anew."""
 
 
 # The errors that keep their type on the way to the actor; another one arrives as a MavlinkError. Subclasses come first.

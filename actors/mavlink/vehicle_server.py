@@ -22,27 +22,25 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from brakeline.actors.mavlink.autopilot_commands import MavlinkError
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod, MavlinkVehicle
 from brakeline.actors.mavlink.takeoff import REST, STOPPING
 from brakeline.actors.mavlink.vehicle_messages import (
     FlightRequest,
-    HandoverRefused,
     error_message,
     log_message,
     period_message,
     plan_of,
     request_of,
 )
-from brakeline.actors.mavlink.vehicle_socket import BadMessage, MessageSocket, listening, same_user
+from brakeline.actors.mavlink.vehicle_socket import MessageSocket, listening, same_user
+from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
-from brakeline.sim.vehicle import BadInput
 
 log = logging.getLogger("brakeline.flight")
 

@@ -16,16 +16,12 @@ from typing import TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
-from brakeline.actors.mavlink.autopilot_commands import MavlinkError
+from brakeline.errors import BadMessage, MavlinkError
 
 LARGEST = 2**17  # bytes of a message
 SEND_TIMEOUT = 1.0  # s that the other end may take to make room for a message
 
 M = TypeVar("M", bound=Message)
-
-
-class BadMessage(ValueError):
-    """A message is not valid: its receiver drops it, and goes on."""
 
 
 class MessageSocket:

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
 from brakeline.actors.ros2.ros_clock import RosClock, SimulatedClock, SystemClock
-from brakeline.actors.ros2.ros_inputs import AgeLimits, InputMissing, RosInputs, SensorSettings
+from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
+from brakeline.errors import InputMissing, UnsupportedRobot
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
@@ -47,10 +48,6 @@ RESEND = 0.05  # s after which an input is sent again
 SILENCE = 0.5  # s for which a simulation's clock may stand still
 LATE = 0.02  # s after a period's beginning, from which on an answer is too late
 DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision changes
-
-
-class UnsupportedRobot(ValueError):
-    """A robot cannot be driven by Twist messages."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.actors.ros2.laser_obstacles import BadScan, HitErrors, LaserBeams, obstacles, read
+from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
 from brakeline.actors.ros2.odometry import OdometryHistory
 from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, frame_name, pose_of
+from brakeline.errors import BadLaserScan, InputMissing
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
@@ -21,10 +22,6 @@ Array = NDArray[np.float64]
 
 LONGEST_FRAME = 100  # characters of a frame's name
 OTHER_CLOCK = 1e3  # s: a message of this age has the time of another clock
-
-
-class InputMissing(Exception):
-    """An input of a decision is missing or stale; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ class RosInputs:
         try:
             frame = headline(message.header.frame_id, LONGEST_FRAME)
             scan, bad = (read(message, self.settings.zero_is_free), frame), ""
-        except BadScan as error:
+        except BadLaserScan as error:
             scan, bad = None, str(error)
         with self._lock:
             self._scan, self._bad_scan = scan or self._scan, bad

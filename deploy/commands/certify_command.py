@@ -22,12 +22,13 @@ from brakeline.deploy.commands.common_options import (
     errors,
     print_json,
 )
-from brakeline.deploy.data.certification import Unsupported, certify_supported
+from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, record_path
 from brakeline.deploy.data.run_dataset import Recorded, from_log
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.progress import under_way
+from brakeline.errors import Unsupported
 from brakeline.logs.console_tables import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus

@@ -49,8 +49,8 @@ class ExportCommand:
         return 0
 
     def _csv(self) -> dict[str, Any]:
+        from brakeline.errors import ExportError
         from brakeline.logs.log_export import to_csv
-        from brakeline.logs.minari_export import ExportError
 
         assert self.csv is not None
         robot = robot_with_task(self.robot)

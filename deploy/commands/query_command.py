@@ -11,12 +11,13 @@ from typing import Any
 from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed, console, print_json
+from brakeline.errors import BadScan
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.scan import BadScan, Scan
+from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import describe_verification
 from brakeline.safety.service.client import SafetyClient

@@ -11,9 +11,10 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import Json, console, errors, print_json
 from brakeline.deploy.data.description_plot import draw_description, summary
+from brakeline.errors import BadDescription
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
-from brakeline.messaging.robot_description import NAME, BadDescription
+from brakeline.messaging.robot_description import NAME
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from brakeline.safety.model.dataset import BadData, Dataset
-from brakeline.safety.model.error_bounds import ErrorBoundError
+from brakeline.errors import BadData, ErrorBoundError, Unsupported
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.validation import Array, ValidationReport, most_violations, validate_plans
@@ -20,14 +20,6 @@ MAX_ROUNDS = 4  # error bounds that mix data and envelopes do not widen in propo
 ROUNDING = 1e-6
 AUTO = "auto"
 PLAN_HINT = " (in a plan window the robot brakes as the filter does: a chosen input, then the description's stop rules)"
-
-
-class Unsupported(BadData):
-    """No kind of windows supports a model set. `reasons` maps each kind to the reason; the message lists them."""
-
-    def __init__(self, reasons: dict[str, str]) -> None:
-        super().__init__("; ".join(f"{kind} windows: {reason}" for kind, reason in reasons.items()))
-        self.reasons = reasons
 
 
 def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:

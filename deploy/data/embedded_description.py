@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.data.description_template import key
-from brakeline.deploy.data.sources.source_table import NoSource
+from brakeline.errors import NoSource
 from brakeline.logs.reader import open_log
 
 ROBOTS = "robots"  # metadata of a log: robot name -> description as JSON

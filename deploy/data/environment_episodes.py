@@ -17,10 +17,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from brakeline.deploy.data.excitation import MOST_HELD, excitation
+from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.windows import displacement
 
 Array = NDArray[np.float64]

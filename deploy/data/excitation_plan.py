@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from brakeline.deploy.data.description_plot import nominal_stopping_distance
 from brakeline.deploy.data.excitation import excitation
 from brakeline.deploy.data.sources.quantity_names import column_names, quantities
+from brakeline.errors import BadData
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.braking import braking_plan
-from brakeline.safety.model.dataset import BadData
 
 Region = tuple[float, float, float, float]  # x and y, least and most [m]
 

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
-from brakeline.deploy.data.certification import Unsupported, certify_supported
+from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.excitation import limit_slew, random_target
+from brakeline.errors import BadData, FlightEnded, Unsupported
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.validation import ValidationReport
 from brakeline.safety.model.windows import FREE, windows
@@ -43,10 +44,6 @@ RETURN_SPEED = 0.5  # share of the level's speed, towards the middle, near a wal
 NEAR = 0.3  # share of the distance to the wall from which the next manoeuvre leads back
 OUTSIDE = 10.0  # m beyond the box at which the flight ends
 ORIGIN = "maiden flight"
-
-
-class FlightEnded(RuntimeError):
-    """The flight ended early; the message gives the reason. The data up to then remain valid."""
 
 
 @dataclass(frozen=True)

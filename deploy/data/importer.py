@@ -16,7 +16,8 @@ from mcap.reader import make_reader
 from brakeline.deploy.data.resample import HOLD, ImportedData, ImportReport, resample
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.sources.quantity_names import mapping
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
 

@@ -18,11 +18,11 @@ from rich.console import Console
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import method_path, model_path
 from brakeline.deploy.progress import under_way
+from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.methods import DDPC, METHODS, Model
-from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.model_set import BadModel, ModelConfig, ModelSet
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.pretrained import Pretrained
 

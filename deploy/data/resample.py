@@ -15,7 +15,8 @@ import numpy as np
 
 from brakeline.deploy.data.input_delay import estimate_delay, followed_inputs
 from brakeline.deploy.data.sources.quantity_names import column_names, resolve, split
-from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
+from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.errors import NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory

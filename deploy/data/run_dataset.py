@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from brakeline.errors import BadData
 from brakeline.logs.reader import read
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 
 FEWEST_STEPS = 5  # shorter trajectories are dropped
 

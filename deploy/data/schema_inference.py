@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.data.input_delay import estimate_delay
 from brakeline.deploy.data.sources.quantity_names import AXES, COMMAND
-from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
+from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.errors import NoSource
 
 Indices = NDArray[np.signedinteger]
 

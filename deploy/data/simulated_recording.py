@@ -13,9 +13,10 @@ from brakeline.deploy.data import collect
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.progress import each
+from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
 PACE = 0.25  # s per trajectory, on a core that other processes share

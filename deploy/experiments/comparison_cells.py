@@ -21,6 +21,7 @@ from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, evaluate
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, policy_named
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import FigureMismatch
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.report import analyse
@@ -34,10 +35,6 @@ from brakeline.safety.rivals.secas import SECAS
 NONE, LEARNING = "none", "learning"
 METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
-
-
-class FigureMismatch(RuntimeError):
-    """The log of a run does not agree with the figures that the run counted."""
 
 
 @dataclass(frozen=True)

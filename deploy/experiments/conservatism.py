@@ -20,9 +20,9 @@ from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.trials import EpisodeTable, evaluate
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.error_bounds import KINDS, ErrorBoundError
+from brakeline.safety.model.error_bounds import KINDS
 from brakeline.safety.model.model_set import MODES, ModelConfig
 from brakeline.sim.arena_generator import arena_kind
 

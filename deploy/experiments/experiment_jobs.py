@@ -17,13 +17,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from brakeline.deploy.interpreter import spawning
+from brakeline.errors import StaleResultError
 from brakeline.messaging.atomic_files import write_atomically
 
 LONGEST_LINE = 500  # characters per progress message
-
-
-class StaleResultError(ValueError):
-    """An existing result was made with other settings."""
 
 
 class Job(Protocol):

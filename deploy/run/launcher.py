@@ -15,7 +15,8 @@ from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_end
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, sign_models
 from brakeline.deploy.run.run_view import RunView
-from brakeline.deploy.run.supervisor import LaunchError, SupervisedProcess, last_line
+from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
+from brakeline.errors import LaunchError
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health

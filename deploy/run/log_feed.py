@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from brakeline.actors.learner_client import LearnerClient
+from brakeline.errors import BadStep
 from brakeline.learner.step_ledger import StepLedger
-from brakeline.learner.transition_reader import BadStep, StepReader
+from brakeline.learner.transition_reader import StepReader
 from brakeline.logs.reader import by_run, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher

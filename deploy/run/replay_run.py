@@ -21,6 +21,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from brakeline.deploy.data.data_paths import data_root
+from brakeline.errors import ReplayError
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.reader import Log, Paths, open_log
@@ -41,10 +42,6 @@ NAMES = {pb.UNKNOWN: "error", **KINDS}
 
 Waiting = dict[tuple[tuple[str, ...], int, int], dict[str, tuple[pb.Request, pb.Reply]]]  # incomplete fleet requests
 Replacement = Callable[[Robot], Method]  # gives the filter for a robot instead of the one in use
-
-
-class ReplayError(ValueError):
-    """The log cannot be replayed; the message says what is missing."""
 
 
 @dataclass

@@ -8,10 +8,10 @@ from pathlib import Path
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
+from brakeline.errors import BadModel
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import load
-from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.server import archive_path
 from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, seal_of, write_signer

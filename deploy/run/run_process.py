@@ -26,7 +26,8 @@ from brakeline.deploy.run.processes import (
     process_specs,
 )
 from brakeline.deploy.run.run_config import RunConfig, load
-from brakeline.messaging.bus import BusError, BusSettings
+from brakeline.errors import BusError
+from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
 PR_SET_PDEATHSIG = 1  # of prctl: the signal that a process gets when its parent dies

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
+from brakeline.errors import LaunchError
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -19,10 +20,6 @@ FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s from a failure to the restart; d
 HEALTHY_AFTER = 20.0  # s after its first sign of life at which a process counts as healthy
 START_ALLOWANCE = 60.0  # s from the start of a process that gives no sign of life: imports are slow on a busy machine
 MOST_FAILURES = 5  # in a row, none of them after a healthy time, before the run ends
-
-
-class LaunchError(RuntimeError):
-    """A run can't start or go on. The message says what to do."""
 
 
 @dataclass

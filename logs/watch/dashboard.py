@@ -8,10 +8,11 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from brakeline.errors import Crowded
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.foxglove_scene import half_width
-from brakeline.logs.metrics import SILENT, Crowded, Metrics
+from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
 from brakeline.logs.watch.run_totals import run_totals, totals_from_health

@@ -4,18 +4,7 @@ A process that is given `listen` is a router; the others are clients of one of t
 show who they are, and the router lets each say and hear what the table of topics grants it.
 """
 
-from brakeline.messaging.bus.bus_errors import (
-    BadKeys,
-    BusError,
-    Busy,
-    Expired,
-    Insecure,
-    Late,
-    Malformed,
-    NoReply,
-    Refused,
-    Unreachable,
-)
+from brakeline.errors import BadKeys, BusError, Busy, Expired, Insecure, Late, Malformed, NoReply, Refused, Unreachable
 from brakeline.messaging.bus.bus_settings import BusSettings, configuration
 from brakeline.messaging.bus.publisher import Publisher
 from brakeline.messaging.bus.session import Bus

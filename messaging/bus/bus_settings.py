@@ -11,8 +11,8 @@ from pathlib import Path
 
 import zenoh
 
+from brakeline.errors import Insecure, Unreachable
 from brakeline.messaging.bus.access_control import access
-from brakeline.messaging.bus.bus_errors import Insecure, Unreachable
 from brakeline.messaging.bus.identity import names_in, tls
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # s between two attempts to find a router

@@ -22,8 +22,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from brakeline.errors import BadKeys
 from brakeline.messaging.atomic_files import write_atomically, write_secret
-from brakeline.messaging.bus.bus_errors import BadKeys
 from brakeline.messaging.bus.identity import SERVERS, certificate_file, key_file, role_of
 
 DAYS = 365  # that a certificate is valid; the authority's ten times as long

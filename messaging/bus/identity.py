@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from brakeline.messaging.bus.bus_errors import BadKeys
+from brakeline.errors import BadKeys
 from brakeline.messaging.topics import ROLES
 
 SERVERS = ("safety", "launcher", "router")  # roles that may be a router; others' certificates are a client's only

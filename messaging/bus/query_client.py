@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import zenoh
 
+from brakeline.errors import Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import Late, NoReply, Refused, as_bus_error
+from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.topic_keys import own_key
 
 RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy

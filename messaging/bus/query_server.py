@@ -12,8 +12,8 @@ from typing import Any
 
 import zenoh
 
+from brakeline.errors import Busy, Expired
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import Busy, Expired
 from brakeline.messaging.bus.fair_queue import FairQueue
 from brakeline.messaging.bus.subscription import ReceiverThreads
 from brakeline.messaging.rejected_messages import RejectedMessages

@@ -12,9 +12,10 @@ from typing import Any
 import zenoh
 from google.protobuf.message import DecodeError
 
-from brakeline.messaging.bus.bus_errors import Malformed, as_bus_error
+from brakeline.errors import Implausible, Malformed
+from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.topic_keys import names_of
-from brakeline.messaging.message_checks import NAME, Implausible, check
+from brakeline.messaging.message_checks import NAME, check
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Topic
 

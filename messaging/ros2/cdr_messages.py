@@ -13,7 +13,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores import ros2_jazzy as types
 
-from brakeline.messaging.bus.bus_errors import Malformed
+from brakeline.errors import Malformed
 
 M = TypeVar("M")
 

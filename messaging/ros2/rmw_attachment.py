@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import xxhash
 
-from brakeline.messaging.bus.bus_errors import Malformed
+from brakeline.errors import Malformed
 
 LAYOUT = struct.Struct("<qqB16s")
 GID = 16  # bytes

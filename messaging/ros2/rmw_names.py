@@ -10,16 +10,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from brakeline.errors import BadRosName
+
 NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"
 SPACE = "@ros2_lv"
 ANY_HASH = "*"  # a subscriber accepts any hash of its type: Humble has none, and invalid bytes are rejected anyway
 DEFAULT_DEPTH = 42  # of rmw_zenoh's history; a token leaves it out
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 RELIABLE, BEST_EFFORT, TRANSIENT_LOCAL, VOLATILE = 1, 2, 1, 2  # numbers of rmw
-
-
-class BadRosName(ValueError):
-    """A name or token is not valid in ROS."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from zenoh.ext import (
 )
 from zenoh.handlers import RingChannel
 
-from brakeline.messaging.bus.bus_errors import Malformed, Unreachable, as_bus_error
+from brakeline.errors import BadRosName, Malformed, Unreachable
+from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.subscription import Subscription
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.ros2.cdr_messages import decode, digest_of, encode, type_of
@@ -37,7 +38,6 @@ from brakeline.messaging.ros2.rmw_names import (
     PUBLISHER,
     SPACE,
     SUBSCRIPTION,
-    BadRosName,
     GraphEntity,
     Qos,
     full_name,

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.range_image import RangeImage
@@ -32,18 +33,6 @@ NOTHING_KNOWN = (
 STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.is_stop_input`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
-
-
-class BadRequest(ValueError):
-    """A request that can't be decided on: `field` names what is wrong."""
-
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
-
-
-class StaleModel(BadRequest):
-    """The committed plan was verified by a model set that this filter never had."""
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadData, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import Robot, UnknownRobot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.tensor_file import pack, unpack
 
 Array = NDArray[np.float64]
 
 ENTRY = "dataset"
-
-
-class BadData(ValueError):
-    """A data set that must not be used; the message says which check failed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import ErrorBoundError
 from brakeline.safety.model.model_config import KINDS as KINDS
 from brakeline.safety.model.model_config import MATRIX_ZONOTOPE as MATRIX_ZONOTOPE
 from brakeline.safety.model.model_config import RESIDUAL as RESIDUAL
@@ -22,10 +23,6 @@ from brakeline.safety.model.model_config import SET_MEMBERSHIP as SET_MEMBERSHIP
 Array = NDArray[np.float64]
 
 ROWS_A_ROUND = 64  # samples that each round adds to a linear program
-
-
-class ErrorBoundError(ValueError):
-    """The data do not support the error bound; the message says why."""
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import (
     MATRIX_ZONOTOPE,
     RESIDUAL,
     SET_MEMBERSHIP,
     ErrorBound,
-    ErrorBoundError,
     envelope,
     least_squares,
     matrix_zonotope,

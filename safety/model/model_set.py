@@ -12,15 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import (
-    FORMER_LAYOUTS,
-    REAL_TIME_SUFFIX,
-    Robot,
-    UnknownRobot,
-    refuse_shipped_name,
-    robot_named,
-)
+from brakeline.messaging.robot import FORMER_LAYOUTS, REAL_TIME_SUFFIX, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive
 from brakeline.safety.model.error_bounds import ErrorBound
@@ -39,10 +33,6 @@ ENTRY = "model_set"
 SHIPPED = Path(__file__).parents[2] / "robots"  # model sets lie beside the descriptions of their robots
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
-
-
-class BadModel(ValueError):
-    """A model set that must not be used; the message says why."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from brakeline.errors import TooLoose
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import CONFIDENCE, UNSTATED, percent, rounded_up, valid_bound
-from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.model.model_set import ModelSet
 
 
 def stated_bound(about: Mapping[str, str]) -> float:
@@ -35,10 +36,6 @@ def accepted_bound(robot: Robot, accept_bound: float | None = None) -> float:
     if not 0.0 < accept_bound <= 1.0:
         raise ValueError(f"--accept-bound is a share above 0 and at most 1, not {accept_bound:g}")
     return accept_bound
-
-
-class TooLoose(BadModel):
-    """A model set whose statement is looser than what is used without a question; the message says what to do."""
 
 
 def check_bound(model: object, robot: Robot, accept_bound: float | None = None) -> None:

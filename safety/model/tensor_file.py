@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-
-class BadTensors(ValueError):
-    """The bytes are no such file."""
+from brakeline.errors import BadTensors
 
 
 def pack(tensors: Mapping[str, NDArray[Any]], entry: str, about: Mapping[str, Any]) -> bytes:

@@ -13,9 +13,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadData
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_config import FREE as FREE
 from brakeline.safety.model.model_config import PLAN as PLAN
 from brakeline.safety.model.model_config import ModelConfig

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.errors import BadModel, BadPerceptrons, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.perceptrons import BadPerceptrons, Perceptrons
+from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.messaging.robot import Robot, UnknownRobot, robot_named
-from brakeline.safety.model.model_set import BadModel, robot_in
+from brakeline.messaging.robot import Robot, robot_named
+from brakeline.safety.model.model_set import robot_in
 from brakeline.safety.model.tensor_file import pack, unpack
 
 ENTRY = "pretrained"

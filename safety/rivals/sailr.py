@@ -17,12 +17,12 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
 from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
 from brakeline.safety.filter.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SAILR as SAILR
-from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ from time import perf_counter_ns
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadModel
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
@@ -26,7 +27,6 @@ from brakeline.safety.filter.braking import braking_decision, braking_plan, clip
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SECAS as SECAS
-from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]

@@ -18,15 +18,15 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import ArrayLike, NDArray
 
+from brakeline.errors import BadRequest, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, BusSettings
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import FEEDBACK, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from brakeline.safety.service.request_digest import digest
 from brakeline.safety.service.wire import decision_of, reservation_message, reservation_of
@@ -36,14 +36,6 @@ Array = NDArray[np.float64]
 DEADLINE = 0.1  # s
 NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding error allowed between two equal inputs
-
-
-class SafetyError(BusError):
-    """The service answered a request with an error, or its reply is not valid. `field` names the wrong field."""
-
-    def __init__(self, error: pb.Error) -> None:
-        super().__init__(f"{error.type}: {error.message}")
-        self.type, self.field = error.type, error.field
 
 
 def request_message(

@@ -14,13 +14,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.filter.request import BadRequest, Decision
+from brakeline.safety.filter.request import Decision
 
 Array = NDArray[np.float64]
 

@@ -11,16 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from brakeline.errors import AskedApart
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
-
-
-class AskedApart(BadRequest):
-    """A batch does not hold all robots of a world once: the service can check no reservation."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__("fleet", message)
 
 
 @dataclass

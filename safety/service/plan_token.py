@@ -18,6 +18,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+from brakeline.errors import BadKey
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.robot import FEEDBACK, HOLD, Robot
@@ -28,10 +29,6 @@ log = logging.getLogger("brakeline.safety")
 SIZE = 16  # bytes of a token
 KEY_FILE = "vouchers.key"  # in the folder of keys
 KEY_SIZE = 32  # bytes, at least
-
-
-class BadKey(ValueError):
-    """The key of the plan tokens is too short."""
 
 
 def write_key(folder: Path) -> None:

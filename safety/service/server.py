@@ -10,29 +10,25 @@ from pathlib import Path
 from threading import Lock
 from time import perf_counter_ns
 
+from brakeline.errors import BadModel, BadRequest, BusError, NoModel, StaleModel, UnknownRobot, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import BusError, BusSettings, Sample
+from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, UnknownRobot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, refuse_shipped_name, shipped_robots
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import BadRequest, StaleModel, check_for_filter
+from brakeline.safety.filter.request import check_for_filter
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.methods import Method, Model, load, ready
-from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.model.stated_bound import check_bound
 from brakeline.safety.service.joint_request import FleetReservations, group_by_fleet, joint_request
 from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.request_digest import digest
-from brakeline.safety.service.signature import SignedModel, TrustedSigners, Untrusted
+from brakeline.safety.service.signature import SignedModel, TrustedSigners
 from brakeline.safety.service.wire import batch_of, decision_reply, error_reply, request_of, reservation_of
 
 log = logging.getLogger("brakeline.safety")
-
-
-class NoModel(BadRequest):
-    """The service has no model of the robot."""
 
 
 @dataclass

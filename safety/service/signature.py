@@ -27,19 +27,16 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+from brakeline.errors import Untrusted
 from brakeline.messaging.atomic_files import write_atomically, write_secret
 from brakeline.safety.methods import Model, decode
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import Array, BadModel, ModelSet
+from brakeline.safety.model.model_set import Array, ModelSet
 from brakeline.safety.model.windows import windows
 
 CONTEXT = b"brakeline model 1\n"  # signed with each claim, so that a signature is valid for nothing else
 KEY, SIGNERS = "signer.key", "signers"
 ANY = "*"  # in a signer's list of robots: it may sign models of all
-
-
-class Untrusted(BadModel):
-    """No trusted signer signed the model, or the model is not what was signed."""
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from brakeline.errors import BadRequest, BadScan, BadShape
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import split_moving
-from brakeline.messaging.obstacle import FARTHEST, BadShape, Obstacle
+from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_of
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.scan import BadScan
 from brakeline.messaging.sensor_messages import RangeMeasurement, measurement_in
 from brakeline.messaging.stated_share import valid_bound
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, BadRequest, Decision, Request
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 
 KIND_NUMBERS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}

@@ -11,17 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from brakeline.errors import RequestRefused, UnknownMode
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink as m
-from brakeline.sim.autopilot.flight_modes import (
-    FlightLimits,
-    FlightStateMachine,
-    LandedState,
-    Mode,
-    RequestRefused,
-    Setpoint,
-    UnknownMode,
-)
+from brakeline.sim.autopilot.flight_modes import FlightLimits, FlightStateMachine, LandedState, Mode, Setpoint
 from brakeline.sim.autopilot.parameters import ARDUPILOT_PARAMETERS, PX4_PARAMETERS, Parameter, Parameters
 from brakeline.sim.flight_controller import STILL, Vector
 

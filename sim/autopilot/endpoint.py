@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from brakeline.errors import BadParameter, RequestRefused, UnknownMode, UnknownRules
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.autopilot_rules import RULES
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import FlightStateMachine, Mode, RequestRefused, UnknownMode
-from brakeline.sim.autopilot.parameters import BadParameter, Parameters
+from brakeline.sim.autopilot.flight_modes import FlightStateMachine, Mode
+from brakeline.sim.autopilot.parameters import Parameters
 from brakeline.sim.autopilot.telemetry_sender import BUILDERS, StreamSchedule, TelemetryBuilder
 from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.lidar import Lidar
@@ -22,10 +23,6 @@ HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 FORCED = 21196.0  # param2 of an arming command that skips all checks
 ACCEPTED, DENIED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_DENIED)
 FAILED = int(mavlink.MAV_RESULT_FAILED)
-
-
-class UnknownRules(ValueError):
-    """No rule set has this name."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
+from brakeline.errors import RequestRefused
 from brakeline.sim.flight_controller import STILL, Vector
 from brakeline.sim.quadrotor import Quadrotor
 
@@ -15,14 +16,6 @@ TOUCHDOWN_TIME = 0.3  # s on the floor after which a descending vehicle has land
 LIFT_OFF_CLIMB = 0.1  # m/s, the climb of a setpoint from which a vehicle leaves the floor
 READY_AFTER = 1.0  # s after switching on until the estimate is good enough to arm
 ROUNDING = 1e-6  # s
-
-
-class RequestRefused(Exception):
-    """The vehicle refuses a command or a setpoint now; the message says why."""
-
-
-class UnknownMode(RequestRefused):
-    """The requested mode does not exist."""
 
 
 class Mode(Enum):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import socket
 import time
 
+from brakeline.errors import AutopilotGone
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.flight_controller import Vector
@@ -20,10 +21,6 @@ ROTORS = 4
 ANSWER_TIMEOUT = 2.0  # s of real time
 MOST_UNANSWERED = 5  # timeouts in a row after which the autopilot counts as gone
 BOOT_TIMEOUT = 0.004  # s, the timeout before the first answer
-
-
-class AutopilotGone(RuntimeError):
-    """The autopilot no longer answers, or does not support lockstep."""
 
 
 class HilLink:

@@ -6,13 +6,10 @@ import math
 import struct
 from dataclasses import dataclass
 
+from brakeline.errors import BadParameter
 from brakeline.sim.autopilot.common_dialect import mavlink
 
 INTEGER, REAL = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
-
-
-class BadParameter(ValueError):
-    """The parameter does not exist, or cannot have this value."""
 
 
 @dataclass(frozen=True)

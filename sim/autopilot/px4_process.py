@@ -12,6 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from brakeline.errors import Px4Error
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.flight_controller import GRAVITY, Airframe
 
@@ -46,10 +47,6 @@ PARAMETERS: dict[str, float] = {
     "EKF2_HGT_REF": 1,  # height from GPS, which agrees with the map
     "SDLOG_MODE": -1,  # no log
 }  # fmt: skip
-
-
-class Px4Error(RuntimeError):
-    """The folder holds no PX4, or PX4 did not start."""
 
 
 class Px4Process:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import at_rest, next_input, request_decisions
+from brakeline.errors import BusError, Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import BusError, Late, NoReply, Refused
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import request_message
 from tests.robots import GROUND

@@ -6,9 +6,9 @@ import pytest
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import NoReply
 from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply
 from tests.robots import GROUND
 from tests.safety.rivals.test_sailr import known
 

@@ -7,9 +7,9 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import NoReply
 from brakeline.learner.transition_reader import StepReader
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.wire import KIND_NUMBERS

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.actors.flight_process import TakeoffNotVerified, takeoff_verified
+from brakeline.actors.flight_process import takeoff_verified
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.errors import TakeoffNotVerified
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.arena import Arena, staged_arena

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from brakeline.actors.learner_client import LearnerClient, RefusedByLearner
+from brakeline.actors.learner_client import LearnerClient
+from brakeline.errors import RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
 from tests.actors.scripted_learner import ScriptedLearner

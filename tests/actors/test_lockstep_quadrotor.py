@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, CommandRefused, NoAutopilot
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
+from brakeline.errors import BadInput, CommandRefused, NoAutopilot
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
@@ -19,7 +20,6 @@ from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from brakeline.sim.vehicle import BadInput
 from tests.robots import QUADROTOR
 
 RULES = ("px4", "ardupilot")

@@ -15,6 +15,7 @@ from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.ground_truth import UdpGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.telemetry import ATTITUDE
+from brakeline.errors import BadInput
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.messaging.process_clock import WallClock
@@ -22,7 +23,6 @@ from brakeline.sim.autopilot import autopilot_server
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
-from brakeline.sim.vehicle import BadInput
 from tests.actors.test_lockstep_quadrotor import RULES, quadrotor
 from tests.robots import QUADROTOR
 

@@ -9,8 +9,8 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, decide
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.errors import NoReply
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.model.model_set import ModelConfig

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, TelemetryMissing, message_id
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, message_id
 from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
 from brakeline.actors.mavlink.telemetry import (
     ATTITUDE,
@@ -25,6 +25,7 @@ from brakeline.actors.mavlink.telemetry import (
     mode_name,
     rotate,
 )
+from brakeline.errors import TelemetryMissing
 from brakeline.sim.autopilot import ned_frames
 from tests.robots import QUADROTOR
 

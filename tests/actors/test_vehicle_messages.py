@@ -11,11 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.autopilot_commands import CommandRefused, MavlinkError
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_messages import (
     FlightRequest,
-    HandoverRefused,
     error_message,
     error_of,
     period_message,
@@ -25,14 +23,14 @@ from brakeline.actors.mavlink.vehicle_messages import (
     request_of,
     text_of,
 )
-from brakeline.actors.mavlink.vehicle_socket import LARGEST, BadMessage
+from brakeline.actors.mavlink.vehicle_socket import LARGEST
+from brakeline.errors import BadInput, BadLink, BadMessage, CommandRefused, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.byte_links import BadLink
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import BadInput, Period
+from brakeline.sim.vehicle import Period
 from tests.robots import GROUND, QUADROTOR
 
 LATE = QUADROTOR.in_real_time()

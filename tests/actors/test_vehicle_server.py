@@ -19,21 +19,13 @@ import pytest
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink import vehicle_client
-from brakeline.actors.mavlink.autopilot_commands import MavlinkError
 from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest, period_message
 from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, ActorOutbox, next_actor
-from brakeline.actors.mavlink.vehicle_socket import (
-    LARGEST,
-    BadMessage,
-    MessageSocket,
-    address,
-    connect,
-    listening,
-    same_user,
-)
+from brakeline.actors.mavlink.vehicle_socket import LARGEST, MessageSocket, address, connect, listening, same_user
+from brakeline.errors import BadInput, BadMessage, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
@@ -43,7 +35,7 @@ from brakeline.sim.autopilot import autopilot_server as server
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import BadInput, Period
+from brakeline.sim.vehicle import Period
 from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until

@@ -16,11 +16,12 @@ from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main
 from brakeline.deploy.commands.certify_command import validation_table
 from brakeline.deploy.commands.query_command import load_scan, parse_obstacle
+from brakeline.errors import BadScan
 from brakeline.logs.report import analyse
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.scan import BadScan, Scan
+from brakeline.messaging.scan import Scan
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
 from brakeline.safety.model.validation import ValidationReport

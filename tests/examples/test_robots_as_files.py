@@ -19,10 +19,11 @@ from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import BadData
 from brakeline.messaging.obstacle import BOX, Obstacle
 from brakeline.messaging.task import RobotWithTask, address, robot_with_task
 from brakeline.safety.filter.braking import braking_plan
-from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.ground_estimator import NoiseLevels

@@ -31,8 +31,9 @@ from benchmarks import situations
 from benchmarks.askers import cells, used
 from benchmarks.timing import Figures, stalls
 from brakeline.deploy.interpreter import spawning
+from brakeline.errors import BusError, Late
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, BusSettings, Late
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.bus_settings import open_session
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.robot import robot_named

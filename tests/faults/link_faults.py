@@ -29,11 +29,12 @@ from benchmarks import sitl
 from benchmarks.flights import SETUPS, switched_on
 from benchmarks.repeated import repeated
 from benchmarks.timing import Words
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, MavlinkError
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
 from brakeline.actors.mavlink.telemetry import MOTION, TRUTH, Array
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.quadrotor_vehicles import flight_arena
+from brakeline.errors import MavlinkError
 from brakeline.messaging.byte_links import Link, TcpServer, open_link
 from brakeline.messaging.robot import robot_named
 

@@ -31,6 +31,7 @@ from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.mavlink_json import chain_derived, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig
+from brakeline.errors import BadModel, BadRequest, BusError
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
@@ -43,14 +44,12 @@ from brakeline.logs.segment import Metadata, Segment
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import BusError, BusSettings, Sample
+from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.methods import decode
-from brakeline.safety.model.model_set import BadModel
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.fuzz.message_fuzzer import Mill

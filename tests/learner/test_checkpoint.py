@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brakeline.errors import BadState
 from brakeline.learner import checkpoint
-from brakeline.learner.checkpoint_state import BadState, PartState
+from brakeline.learner.checkpoint_state import PartState
 
 NAMES = ("big", "small")
 

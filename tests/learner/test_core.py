@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.learner.checkpoint import DamagedPart, NoCheckpoint, OtherRun
+from brakeline.errors import BadStep, DamagedPart, NoCheckpoint, OtherRun
 from brakeline.learner.learner import Learner
-from brakeline.learner.transition_reader import BadStep
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.errors import BadStep
 from brakeline.learner.learner import AHEAD, MOST_ACTORS, Learner
-from brakeline.learner.transition_reader import MOST_OBSERVED, BadStep, StepReader
+from brakeline.learner.transition_reader import MOST_OBSERVED, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.learner.test_core import step
 from tests.learner.toy import CONFIG, TOY

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from brakeline.learner.rival_networks import FitConfig, TooFew, fit_cost, fit_linear
+from brakeline.errors import TooFew
+from brakeline.learner.rival_networks import FitConfig, fit_cost, fit_linear
 from tests.robots import GROUND
 
 HOW = FitConfig(hidden=(32, 32), rate=3e-3, batch=64, epochs=25)

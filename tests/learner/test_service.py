@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brakeline.errors import Refused, UnknownRobot
 from brakeline.learner import checkpoint
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.learner.learner_process import POLICY, LearnerLoop, LearnerSettings, main
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusSettings, Refused
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.policy_weights import MLP
-from brakeline.messaging.robot import UnknownRobot
 from brakeline.messaging.topics import FLOW, JOIN, LEARNER, STEP, WEIGHTS
 from tests.robots import GROUND
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.learner.checkpoint_state import BadState, PartState
+from brakeline.errors import BadState
+from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.replay import Batch, ReplayBuffer, Transition
 from brakeline.learner.step_ledger import StepLedger, mark

@@ -17,8 +17,9 @@ from mcap.writer import Writer as McapWriter
 from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline.deploy.cli import main
-from brakeline.logs.log_recovery import BeingRecorded, recover
-from brakeline.logs.reader import Log, NotALog, open_log
+from brakeline.errors import BeingRecorded, NotALog
+from brakeline.logs.log_recovery import recover
+from brakeline.logs.reader import Log, open_log
 from brakeline.logs.recorder import Inbox, Recording, Rotation, malformed_entry
 from brakeline.logs.segment import being_written, open_segment
 from brakeline.messaging import brakeline_pb2 as pb

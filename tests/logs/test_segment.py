@@ -10,7 +10,8 @@ from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from brakeline.logs.reader import NoLog, NotALog, find, open_log, read
+from brakeline.errors import NoLog, NotALog
+from brakeline.logs.reader import find, open_log, read
 from brakeline.logs.recorder import entry, malformed_entry
 from brakeline.logs.segment import Entry, Segment, number_of, open_segment, segments
 from brakeline.messaging import brakeline_pb2 as pb

@@ -3,7 +3,8 @@
 import subprocess
 from collections.abc import Callable
 
-from brakeline.messaging.bus import Bus, BusError
+from brakeline.errors import BusError
+from brakeline.messaging.bus import Bus
 from brakeline.messaging.topics import DECIDE
 
 Join = Callable[..., Bus]

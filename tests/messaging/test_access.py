@@ -14,18 +14,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from brakeline.errors import BadKeys, BusError, Insecure, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import (
-    BadKeys,
-    Bus,
-    BusError,
-    BusSettings,
-    Insecure,
-    NoReply,
-    Sample,
-    Unreachable,
-    configuration,
-)
+from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
 from brakeline.messaging.bus.access_control import grants
 from brakeline.messaging.bus.bus_settings import local
 from brakeline.messaging.free_ports import HERE, free_endpoint

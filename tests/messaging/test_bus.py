@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
+from brakeline.errors import BusError, Late, Malformed, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusError, BusSettings, Late, Malformed, NoReply, Sample, Unreachable
+from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import DECIDE, HEALTH, LOG, STEP, WEIGHTS
 from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers

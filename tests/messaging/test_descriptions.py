@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, UnknownRobot, refuse_shipped_name, robot_named
-from brakeline.messaging.robot_description import UNITS, BadDescription, describe, read_robot, robot_from_description
-from brakeline.messaging.task import UnknownTask, needs_task, read_task, robot_maybe_with_task, robot_with_task
+from brakeline.errors import BadDescription, UnknownRobot, UnknownTask
+from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot_description import UNITS, describe, read_robot, robot_from_description
+from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
 CAR = {

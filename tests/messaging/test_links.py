@@ -4,7 +4,8 @@ import time
 
 import pytest
 
-from brakeline.messaging.byte_links import BadLink, Link, Tcp, TcpServer, Udp, open_link
+from brakeline.errors import BadLink
+from brakeline.messaging.byte_links import Link, Tcp, TcpServer, Udp, open_link
 
 
 def arrives(link: Link, expected: bytes) -> bool:

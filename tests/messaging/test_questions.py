@@ -8,8 +8,9 @@ from contextlib import ExitStack
 
 import pytest
 
+from brakeline.errors import Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusSettings, Late, NoReply, Refused
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.query_client import HELD, Asker
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import DECIDE, STEP

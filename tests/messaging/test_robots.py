@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.messaging.robot import Disc, UnknownRobot, robot_named
+from brakeline.errors import UnknownRobot
+from brakeline.messaging.robot import Disc, robot_named
 from tests.robots import GROUND, ROBOTS
 
 

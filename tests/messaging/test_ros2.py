@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys.stores import Stores, get_typestore
 
-from brakeline.messaging.bus import Malformed, Unreachable
+from brakeline.errors import BadRosName, Malformed, Unreachable
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.ros2 import LATCHED, SENSOR, BadRosName, GraphEntity, Qos, RosNode, RosSettings
+from brakeline.messaging.ros2 import LATCHED, SENSOR, GraphEntity, Qos, RosNode, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, BadShape, Obstacle, Shapes, rotate
+from brakeline.errors import BadShape
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
 
 COORDINATE = st.floats(-4, 4)
 SIZE = st.floats(0.05, 2)

@@ -5,8 +5,9 @@ import math
 
 import pytest
 
+from brakeline.errors import Malformed
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Malformed, Sample
+from brakeline.messaging.bus import Sample
 from brakeline.messaging.message_checks import MAX_NUMBERS, MAX_OBSTACLES
 from brakeline.messaging.rejected_messages import MAX_LINE_LENGTH, RejectedMessages, headline
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from brakeline.messaging.bus import BusError, query_server
+from brakeline.errors import BusError
 from brakeline.messaging.bus import fair_queue as module
+from brakeline.messaging.bus import query_server
 from brakeline.messaging.bus.fair_queue import MAX_PER_CLIENT, FairQueue, T
 from brakeline.messaging.bus.query_client import PATIENT
 from brakeline.messaging.topics import DECIDE

@@ -7,7 +7,8 @@ import safetensors.numpy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.messaging.policy_weights import MLP, BadWeights, decode, encode
+from brakeline.errors import BadWeights
+from brakeline.messaging.policy_weights import MLP, decode, encode
 from tests.robots import GROUND
 
 POLICY = MLP.untrained(GROUND, seed=1, hidden=(16, 8))

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from brakeline.errors import BadData
 from brakeline.messaging.obstacle import rotate
-from brakeline.safety.model.dataset import ENTRY, BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import ENTRY, Dataset, Trajectory
 from brakeline.safety.model.tensor_file import pack, unpack
 from brakeline.safety.model.windows import check_regressors, displacement, non_overlapping, windows
 from tests.robots import GROUND

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
+from brakeline.errors import ErrorBoundError
 from brakeline.safety.filter.reachable_tube import RecursionMaps, stack_recursive
 from brakeline.safety.model.error_bounds import (
     ErrorBound,
-    ErrorBoundError,
     envelope,
     least_squares,
     matrix_zonotope,

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter import filter as filter_module
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.qp_solver import INFEASIBLE
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE, BadRequest
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.wire import decision_reply

@@ -6,6 +6,7 @@ from inspect import signature
 import numpy as np
 import pytest
 
+from brakeline.errors import BadRequest, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
@@ -13,8 +14,8 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import BadRequest, check_for_filter
-from brakeline.safety.service.client import SafetyClient, SafetyError, read_reply, request_message
+from brakeline.safety.filter.request import check_for_filter
+from brakeline.safety.service.client import SafetyClient, read_reply, request_message
 from brakeline.safety.service.filter_client import Answer, FilterClient, accept
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from brakeline.errors import NoReply, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.service.client import SafetyError
 from brakeline.safety.service.fleet_client import FleetClient
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.excitation import excitation
+from brakeline.errors import BadData
 from brakeline.messaging.robot_description import robot_from_description
-from brakeline.safety.model.dataset import BadData, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import MODES, ModelConfig

@@ -7,16 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.deploy.data.environment_episodes import collect
+from brakeline.errors import BadData, BadRequest, Mismatch
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
-from brakeline.safety.action_mapping import ActionMapping, Mismatch, mapping_for_space, normalised
+from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, normalised
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper, view_each_environment
-from brakeline.safety.model.dataset import BadData
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
@@ -118,7 +117,7 @@ class Silent(SafetyClient):
         self.robot, self.backup_plan = CAR, BackupPlan(CAR)
 
     def decide(self, *asked, **more):
-        from brakeline.messaging.bus import NoReply
+        from brakeline.errors import NoReply
 
         raise NoReply("nobody serves")
 

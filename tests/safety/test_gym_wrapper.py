@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from brakeline.messaging.bus import NoReply
+from brakeline.errors import NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadRequest, BadShape
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.obstacle import BOX, CYLINDER, FARTHEST, SPHERE, WALL, BadShape, Obstacle, Shapes
-from brakeline.safety.filter.request import BadRequest
+from brakeline.messaging.obstacle import BOX, CYLINDER, FARTHEST, SPHERE, WALL, Obstacle, Shapes
 from brakeline.safety.service.wire import MAX_BATCH_SIZE, MAX_REQUESTS, _count_fields, batch_of
 
 NEAR = 1e-6  # m: what rounding may hide of a distance

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.dataset import BadData
-from brakeline.safety.model.error_bounds import KINDS, ErrorBoundError, least_squares
+from brakeline.safety.model.error_bounds import KINDS, least_squares
 from brakeline.safety.model.fitting import fit_model_set
-from brakeline.safety.model.model_set import ENTRY, MODES, BadModel, ModelConfig, ModelSet
+from brakeline.safety.model.model_set import ENTRY, MODES, ModelConfig, ModelSet
 from brakeline.safety.model.tensor_file import pack, unpack
 from brakeline.safety.model.windows import periods_until_standing, windows
 from tests.robots import GROUND

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, BadRequest
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
 from brakeline.safety.service.wire import obstacles_of
 from brakeline.sim.arena import room_boundary
 from brakeline.sim.traffic import Crowd, CrowdSensor, MoverKind

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadShape
 from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
-from brakeline.messaging.obstacle import BadShape, Obstacle, Shapes
+from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.halfspaces import half_spaces
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces

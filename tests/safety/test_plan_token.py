@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brakeline.errors import BadKey
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
@@ -12,7 +13,7 @@ from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.filter_client import Answer, accept
-from brakeline.safety.service.plan_token import SIZE, BadKey, PlanAuthenticator, write_key
+from brakeline.safety.service.plan_token import SIZE, PlanAuthenticator, write_key
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND, QUADROTOR

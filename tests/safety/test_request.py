@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.request import MOST_OBSERVED, BadRequest, FastRequestCheck, Request, check_for_filter
+from brakeline.safety.filter.request import MOST_OBSERVED, FastRequestCheck, Request, check_for_filter
 from tests.safety.asked import cylinder, request, same
 from tests.safety.toys import car
 

@@ -6,13 +6,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from brakeline.errors import BadRequest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.filter.request import ALLOWED, FAILSAFE, BadRequest, check_for_filter
+from brakeline.safety.filter.request import ALLOWED, FAILSAFE, check_for_filter
 from brakeline.safety.perception.visibility_memory import FanMemory
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import batch_of, request_of

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.messaging.scan import BadScan, Scan
+from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
 from tests.messaging.test_shapes import sample
 

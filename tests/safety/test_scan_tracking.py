@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.messaging.scan import BadScan, BeamTracks, Scan
+from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.perception import scan_free_space, scan_tracking

@@ -5,14 +5,14 @@ import logging
 import numpy as np
 import pytest
 
+from brakeline.errors import BadRequest, NoReply, Refused, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply, Refused
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
-from brakeline.safety.filter.request import NOT_FINITE, BadRequest
+from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.client import SafetyClient, SafetyError, query_service, read_reply, request_message
+from brakeline.safety.service.client import SafetyClient, query_service, read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import MAX_BATCH_SIZE, request_of
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures

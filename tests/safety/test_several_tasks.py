@@ -8,12 +8,12 @@ import pytest
 
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import BadRequest, BadWeights, UnknownRobot
 from brakeline.messaging.perceptrons import Perceptrons
-from brakeline.messaging.policy_weights import MLP, BadWeights, decode
-from brakeline.messaging.robot import ROBOTS_FOLDER, UnknownRobot, robot_named
+from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import BadRequest
 from brakeline.safety.methods import Method
 from brakeline.safety.methods import decode as read_model
 from brakeline.safety.methods import ready as made_ready

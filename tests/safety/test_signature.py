@@ -12,19 +12,19 @@ import pytest
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from brakeline.deploy.run.run_keys import newest_model
+from brakeline.errors import BadModel, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, MODEL
 from brakeline.safety.model.error_bounds import ErrorBound
-from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.server import SafetySettings, archive_path, main
 from brakeline.safety.service.signature import (
     CONTEXT,
     ModelSigner,
     SignedModel,
     TrustedSigners,
-    Untrusted,
     recorded_domain,
     seal_of,
     write_signer,

@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from brakeline.errors import TooLoose
 from brakeline.logs.decision_explanation import bound_in, explain
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
@@ -15,14 +16,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper
-from brakeline.safety.model.stated_bound import (
-    TooLoose,
-    accepted_bound,
-    check_bound,
-    plans_needed,
-    refusal,
-    stated_bound,
-)
+from brakeline.safety.model.stated_bound import accepted_bound, check_bound, plans_needed, refusal, stated_bound
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import decision_of, decision_reply

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from brakeline.safety.model.tensor_file import BadTensors, content, has_entry, pack, unpack
+from brakeline.errors import BadTensors
+from brakeline.safety.model.tensor_file import content, has_entry, pack, unpack
 
 WORDS = st.dictionaries(st.text(max_size=5), st.one_of(st.text(max_size=5), st.integers(), st.booleans()), max_size=5)
 ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.float64, (2, 3)), max_size=3)

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import UnknownArena
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import UnknownArena, arena_kind, bounds_of, draw_arena, gaps
+from brakeline.sim.arena_generator import arena_kind, bounds_of, draw_arena, gaps
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
 ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in ROBOTS[robot].task.arenas]

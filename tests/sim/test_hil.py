@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from brakeline.errors import AutopilotGone, Px4Error
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.hil_link import AutopilotGone, HilLink
+from brakeline.sim.autopilot.hil_link import HilLink
 from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, HilSensors, SensorNoise
-from brakeline.sim.autopilot.px4_process import Px4Error, Px4Process
+from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_controller import GRAVITY
 from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor

@@ -12,8 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import UnknownRobot
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.robot import UnknownRobot
 from brakeline.sim.navigation_env import NavigationEnv, Reward
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.registration import ENVIRONMENTS, register

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from brakeline.errors import BadWeights, UnknownTask
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
-from brakeline.messaging.policy_weights import MLP, BadWeights, decode
+from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
-from brakeline.messaging.task import MoverKind, RobotWithTask, UnknownTask, address, read_task, robot_with_task
+from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
 from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation, TurnMemory

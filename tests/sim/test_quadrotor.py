@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.flight_controller import FlightController, VelocityAxis
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import MODEL, SAMPLES, Quadrotor
-from brakeline.sim.vehicle import BadInput
 from brakeline.sim.wind import Wind, WindProcess
 from tests.robots import QUADROTOR
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from brakeline.errors import UnknownPolicy
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, staged_arena
@@ -18,7 +19,7 @@ from brakeline.sim.quadrotor_policies import (
     StopPrediction,
     full_speed,
 )
-from brakeline.sim.scripted_policies import UnknownPolicy, scripted
+from brakeline.sim.scripted_policies import scripted
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
 

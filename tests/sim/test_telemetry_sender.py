@@ -8,12 +8,12 @@ import struct
 import numpy as np
 import pytest
 
+from brakeline.errors import BadParameter, UnknownRules
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.endpoint import TICK, UnknownRules
+from brakeline.sim.autopilot.endpoint import TICK
 from brakeline.sim.autopilot.flight_modes import Mode
-from brakeline.sim.autopilot.parameters import BadParameter
 from brakeline.sim.autopilot.telemetry_sender import BINS, obstacle_bins
 from brakeline.sim.lidar import Lidar
 from tests.robots import QUADROTOR

@@ -18,7 +18,8 @@ from pymavlink import DFReader
 from brakeline.deploy.data.sources.acceleration import add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
 from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, along_body, vector
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 
 CENTI = 0.01
 GUIDED_VELOCITY = 2  # type of a GUID message

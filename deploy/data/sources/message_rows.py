@@ -10,7 +10,8 @@ from typing import Any
 
 from brakeline.deploy.data.sources.angles import from_ned
 from brakeline.deploy.data.sources.quantity_names import AXES
-from brakeline.deploy.data.sources.source_table import NoSource, Table, table_of
+from brakeline.deploy.data.sources.source_table import Table, table_of
+from brakeline.errors import NoSource
 
 Row = dict[str, float]
 Kinds = dict[

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from pyulog import ULog
 
-from brakeline.deploy.data.sources.source_table import Array, NoSource, Table
+from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.errors import NoSource
 
 VELOCITY = ("vx", "vy", "vz")
 SET = ("velocity[0]", "velocity[1]", "velocity[2]")

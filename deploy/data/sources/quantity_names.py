@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
 AXES = "xyz"

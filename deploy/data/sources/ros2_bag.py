@@ -17,7 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from brakeline.deploy.data.sources.angles import turned, yaw_of
 from brakeline.deploy.data.sources.quantity_names import AXES
-from brakeline.deploy.data.sources.source_table import NoSource, Table, table_of
+from brakeline.deploy.data.sources.source_table import Table, table_of
+from brakeline.errors import NoSource
 
 Row = dict[str, float]
 OTHER_CLOCK = 1_000_000_000  # ns: a larger median difference of header and bag means two clocks

@@ -7,13 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.model.dataset import BadData
+from brakeline.errors import NoSource
 
 Array = NDArray[np.float64]
-
-
-class NoSource(BadData):
-    """A source cannot be read as data of a robot; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
 from brakeline.deploy.data.sources.acceleration import GRAVITY, add_accelerations
 from brakeline.deploy.data.sources.angles import yaw_from_ned
 from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, vector
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 
 TIME = struct.Struct(">Q")  # µs, before each frame
 V1, V2, SIGNED = 0xFE, 0xFD, 13  # first bytes of frames; bytes of a signature

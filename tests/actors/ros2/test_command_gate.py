@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFFERENCE, CommandGate, inflated
-from brakeline.actors.ros2.ros2_process import Ros2Settings, UnsupportedRobot, driven
+from brakeline.actors.ros2.ros2_process import Ros2Settings, driven
 from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
+from brakeline.errors import NoReply, UnsupportedRobot
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import NoReply
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2.cdr_messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from brakeline.safety.filter.request import NOT_FINITE

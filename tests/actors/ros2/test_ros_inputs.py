@@ -7,8 +7,9 @@ import pytest
 
 from brakeline.actors.ros2.odometry import HISTORY, OdometryHistory
 from brakeline.actors.ros2.ros_clock import SimulatedClock, SystemClock
-from brakeline.actors.ros2.ros_inputs import AgeLimits, InputMissing, RosInputs, SensorSettings
+from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree
+from brakeline.errors import InputMissing
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     Odometry,

@@ -17,8 +17,8 @@ from pyulog import ULog
 from brakeline.deploy.data.coverage import coverage
 from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.sources.quantity_names import resolve
-from brakeline.deploy.data.sources.source_table import NoSource
 from brakeline.deploy.data.sources.tlog_file import _frames
+from brakeline.errors import NoSource
 from tests.robots import QUADROTOR
 
 FLOWN = Path(__file__).parent / "flown"

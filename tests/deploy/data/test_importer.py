@@ -9,7 +9,8 @@ from rosbags.rosbag2 import StoragePlugin
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.resample import resample
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import _off_chord

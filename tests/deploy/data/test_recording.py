@@ -13,9 +13,10 @@ from brakeline.deploy.data import collect, data_paths, model_store, simulated_re
 from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.excitation import excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
+from brakeline.errors import BadData
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import windows
 from tests.accepting import BOUND

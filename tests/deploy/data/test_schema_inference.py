@@ -11,7 +11,8 @@ from mcap.writer import Writer
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.schema_inference import infer_schema
-from brakeline.deploy.data.sources.source_table import NoSource, Table
+from brakeline.deploy.data.sources.source_table import Table
+from brakeline.errors import NoSource
 from brakeline.messaging.robot import ROBOTS_FOLDER as ROBOTS
 from brakeline.messaging.robot import robot_named
 from tests.deploy.data.bags import write_bag

@@ -11,7 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from brakeline.deploy.experiments.experiment_jobs import StaleResultError, complete, read, write
+from brakeline.deploy.experiments.experiment_jobs import complete, read, write
+from brakeline.errors import StaleResultError
 from tests.waiting import until
 
 

@@ -13,9 +13,10 @@ from brakeline.deploy.data.excitation_plan import RegionExcitation
 from brakeline.deploy.experiments.evaluate import episode
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import BadData
 from brakeline.logs.reader import read
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.model.dataset import BadData, Dataset
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows
 from tests.robots import GROUND
 

@@ -10,12 +10,12 @@ from mcap.reader import make_reader
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.deploy.run.mavlink_json import ENCODING, chain_derived, frames_as_json
-from brakeline.logs.minari_export import ExportError
+from brakeline.errors import ExportError, Malformed
 from brakeline.logs.reader import read
 from brakeline.logs.recorder import Inbox, Recording
 from brakeline.logs.tlog_export import to_tlog
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Malformed, Sample
+from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import FRAMES, LOG
 from brakeline.sim.arena import staged_arena
 from brakeline.sim.autopilot.endpoint import Autopilot

@@ -12,7 +12,8 @@ from brakeline.deploy import cli
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
-from brakeline.deploy.run.replay_run import APART, Difference, ReplayError, differences, replay
+from brakeline.deploy.run.replay_run import APART, Difference, differences, replay
+from brakeline.errors import ReplayError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.model_set import ModelConfig

@@ -8,13 +8,8 @@ import pytest
 
 from brakeline.deploy.run import supervisor
 from brakeline.deploy.run.processes import ProcessSpec
-from brakeline.deploy.run.supervisor import (
-    HEALTHY_AFTER,
-    MOST_FAILURES,
-    START_ALLOWANCE,
-    LaunchError,
-    SupervisedProcess,
-)
+from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, START_ALLOWANCE, SupervisedProcess
+from brakeline.errors import LaunchError
 
 
 @pytest.fixture

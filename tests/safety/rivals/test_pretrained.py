@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.messaging.perceptrons import BadPerceptrons, Perceptrons
+from brakeline.errors import BadModel, BadPerceptrons
+from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.safety.methods import decode, load, ready
-from brakeline.safety.model.model_set import BadModel, ModelSet
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import Sailr
 from brakeline.safety.rivals.secas import Secas

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from brakeline.errors import BadModel, BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.safety.filter.braking import brake, braking_plan
-from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
-from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.filter.request import NOT_FINITE, Request
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import Sailr
 from tests.robots import GROUND, QUADROTOR

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadModel, BadRequest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import planar_rays
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
-from brakeline.safety.filter.request import NOT_FINITE, BadRequest, Request
-from brakeline.safety.model.model_set import BadModel
+from brakeline.safety.filter.request import NOT_FINITE, Request
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
 from brakeline.safety.service.client import read_reply, request_message
