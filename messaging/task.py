@@ -154,13 +154,34 @@ class Task:
         Raises:
             UnknownTask: the object cannot be imported.
         """
-        module, _, name = place.partition(":")
+        module, _, name = FORMER_PLACES.get(place, place).partition(":")
         try:
             if module.endswith(".py"):
                 return getattr(_module_in(self.folder / module), name)
             return getattr(importlib.import_module(module), name)
         except (ImportError, AttributeError, OSError) as error:
             raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
+
+
+# Where task files of version 0.2 look for code, and where it is now.
+FORMER_PLACES = {
+    "deploy.quadrotors:behind_px4": "brakeline.deploy.quadrotor_vehicles:behind_px4",
+    "deploy.quadrotors:embedded": "brakeline.deploy.quadrotor_vehicles:embedded",
+    "sim.ground:simulated": "brakeline.sim.ground_robot:simulated",
+    "sim.senses:AirSenses": "brakeline.sim.observations:QuadrotorObservation",
+    "sim.senses:GroundSenses": "brakeline.sim.observations:GroundObservation",
+    "sim.senses:PlanarSenses": "brakeline.sim.observations:PlanarObservation",
+    "sim.senses:TrackingSenses": "brakeline.sim.observations:TrackingObservation",
+    "sim.policies:RandomInputs": "brakeline.sim.scripted_policies:RandomPolicy",
+    "sim.policies:Greedy": "brakeline.sim.scripted_policies:GroundGreedyPolicy",
+    "sim.policies:Adversary": "brakeline.sim.scripted_policies:GroundAdversary",
+    "sim.policies:MapDriver": "brakeline.sim.scripted_policies:GroundRoutePolicy",
+    "sim.policies:CarefulDriver": "brakeline.sim.scripted_policies:GroundCarefulPolicy",
+    "sim.pilots:GreedyPilot": "brakeline.sim.quadrotor_policies:QuadrotorGreedyPolicy",
+    "sim.pilots:HostilePilot": "brakeline.sim.quadrotor_policies:QuadrotorAdversary",
+    "sim.pilots:MapPilot": "brakeline.sim.quadrotor_policies:QuadrotorRoutePolicy",
+    "sim.pilots:CarefulPilot": "brakeline.sim.quadrotor_policies:QuadrotorCarefulPolicy",
+}
 
 
 def _module_in(path: Path) -> Any:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.fast
+
 ROOT = Path(__file__).parents[2]
 PAGE = Path("docs/method.md")
 SUFFIXES = (".md", ".py", ".toml", ".proto", ".yml", ".yaml", ".js", ".ts", ".c", ".h", ".sh")

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.fast
+
 ROOT = Path(__file__).parents[2]
 FOLDERS = (
     *("brakeline", "messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "policies"),

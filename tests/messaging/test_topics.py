@@ -7,6 +7,8 @@ import pytest
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import RECORDED, TOPICS, Delivery, Topic
 
+pytestmark = pytest.mark.fast
+
 each = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
 
 

@@ -17,6 +17,8 @@ from brakeline.safety.model.windows import check_regressors, displacement, non_o
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 
+pytestmark = pytest.mark.fast
+
 
 @pytest.fixture(scope="module")
 def small() -> Dataset:

@@ -21,6 +21,8 @@ from brakeline.safety.model.error_bounds import (
 )
 from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
 
+pytestmark = pytest.mark.fast
+
 HORIZON = 5
 SEQUENCES = 10_000
 PLANS = 20

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
-from tests.messaging.test_shapes import obstacles, sample
+from tests.messaging.test_obstacle import obstacles, sample
+
+pytestmark = pytest.mark.fast
 
 BODY = 0.1
 

@@ -13,7 +13,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.halfspaces import half_spaces
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
-from tests.messaging.test_shapes import obstacles, sample
+from tests.messaging.test_obstacle import obstacles, sample
 
 BODY, PERIOD, PERIODS = 0.1, 0.2, 4
 

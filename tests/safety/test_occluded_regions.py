@@ -20,7 +20,7 @@ from brakeline.safety.perception.occluded_regions import (
     half_spaces,
     occluded_regions,
 )
-from tests.messaging.test_range_images import (
+from tests.messaging.test_range_image import (
     COLUMNS,
     EDGE,
     FAR,

@@ -29,7 +29,7 @@ from brakeline.safety.perception.occluded_regions import (
     half_spaces,
     occluded_regions,
 )
-from tests.messaging.test_range_images import COLUMNS, EDGE, RINGS
+from tests.messaging.test_range_image import COLUMNS, EDGE, RINGS
 from tests.safety.perception_twins import AXIS, NEAR, patch_minimum
 from tests.safety.test_occluded_regions import ORIGIN, room
 

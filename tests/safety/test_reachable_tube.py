@@ -11,6 +11,8 @@ from brakeline.safety.model.model_set import MODES
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
 
+pytestmark = pytest.mark.fast
+
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
 
 

@@ -11,7 +11,7 @@ from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
-from tests.messaging.test_shapes import sample
+from tests.messaging.test_obstacle import sample
 
 FAR, WIDTH = 3.5, 0.1
 FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)

@@ -91,6 +91,7 @@ def test_the_claim_must_match_the_file(model: ModelSet, keys: Path, field: str) 
     claim = json.loads(signed.claim) | {field: "quadrotor" if field != "domain" else (0.5 * model.domain).tolist()}
     words = json.dumps(claim, sort_keys=True).encode()
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
+    assert isinstance(key, Ed25519PrivateKey)
     other = replace(signed, claim=words, signature=key.sign(CONTEXT + words))
     with pytest.raises(Untrusted):
         TrustedSigners.load(keys).open(other)
@@ -108,6 +109,7 @@ def test_a_domain_wider_than_the_data_is_not_signed(model: ModelSet, data, keys:
     claim = json.loads(nothing.claim) | {"domain": None}
     words = json.dumps(claim).encode()
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
+    assert isinstance(key, Ed25519PrivateKey)
     with pytest.raises(BadModel):
         TrustedSigners.load(keys).open(SignedModel(nothing.file, words, key.sign(CONTEXT + words)))
 

@@ -9,6 +9,8 @@ from hypothesis.extra.numpy import arrays
 from brakeline.safety.model.zonotope import Zonotope, facet_normals
 from tests.safety.linear import PUBLISHED
 
+pytestmark = pytest.mark.fast
+
 NUMBERS = st.floats(-5, 5).map(lambda value: round(value, 3))
 
 

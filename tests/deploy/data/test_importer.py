@@ -38,7 +38,7 @@ def same(one: Dataset, other: Dataset, within: float) -> None:
 
 @pytest.mark.parametrize("storage", StoragePlugin)
 def test_a_bag_and_a_csv_of_the_same_drive_are_the_same_data(driven, as_csv, tmp_path, storage):
-    bag = write_bag(tmp_path / "bag", *driven, storage)
+    bag = write_bag(tmp_path / "bag", *driven, storage=storage)
     same(import_sources([as_csv], porter()).data, import_sources([bag], porter()).data, 1e-9)
     if storage is StoragePlugin.MCAP:  # the file alone does, too
         same(import_sources([as_csv], porter()).data, import_sources([bag / "bag.mcap"], porter()).data, 1e-9)

@@ -13,6 +13,8 @@ import pytest
 from brakeline.deploy.run.replay_run import replay
 from brakeline.safety.filter import qp_solver
 
+pytestmark = pytest.mark.fast
+
 STORED = Path(__file__).parents[2] / "stored"
 ROUNDING = 1e-9  # m/s, rad/s, m
 

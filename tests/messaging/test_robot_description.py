@@ -16,6 +16,8 @@ from brakeline.messaging.robot_description import UNITS, describe, read_robot, r
 from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
+pytestmark = pytest.mark.fast
+
 CAR = {
     "name": "car",
     "period": 0.1,

@@ -16,7 +16,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import BeamGrid, SphereCover, patch_free_ranges
-from tests.messaging.test_shapes import sample
+from tests.messaging.test_obstacle import sample
 from tests.robots import QUADROTOR
 
 RINGS, COLUMNS, FAR, WIDTH = 45, 90, 8.0, 0.6  # every 4°

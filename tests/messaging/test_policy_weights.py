@@ -11,6 +11,8 @@ from brakeline.errors import BadWeights
 from brakeline.messaging.policy_weights import MLP, decode, encode
 from tests.robots import GROUND
 
+pytestmark = pytest.mark.fast
+
 POLICY = MLP.untrained(GROUND, seed=1, hidden=(16, 8))
 FILE = encode(GROUND, POLICY.layers, version=7, noise=0.25)
 

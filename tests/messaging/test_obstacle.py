@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from brakeline.errors import BadShape
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
 
+pytestmark = pytest.mark.fast
+
 COORDINATE = st.floats(-4, 4)
 SIZE = st.floats(0.05, 2)
 ANGLE = st.floats(-7, 7)

@@ -9,6 +9,8 @@ from brakeline.errors import UnknownRobot
 from brakeline.messaging.robot import Disc, robot_named
 from tests.robots import GROUND, ROBOTS
 
+pytestmark = pytest.mark.fast
+
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_every_robot_is_consistent(robot):
