@@ -133,12 +133,11 @@ class ActorRunner:
         continuous: bool = False,
         env: Environment | None = None,
     ) -> None:
-        """
-        Args:
-            offset: the robot's number in this process.
-            propose: makes the policy; None: the robot learns.
-            continuous: see `EpisodeRunner`.
-            env: the robot's environment in a shared world; None: `make` makes one.
+        """Args:
+        offset: the robot's number in this process.
+        propose: makes the policy; None: the robot learns.
+        continuous: see `EpisodeRunner`.
+        env: the robot's environment in a shared world; None: `make` makes one.
         """
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"

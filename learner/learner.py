@@ -255,9 +255,8 @@ class Learner:
         return self.steps - self._saved_at >= self.config.checkpoint_every and self.may_save()
 
     def save(self, root: Path) -> Path:
-        """
-        Raises:
-            CheckpointError: it could not be written; the one before is untouched.
+        """Raises:
+        CheckpointError: it could not be written; the one before is untouched.
         """
         saved_before, self._saved_at = self._saved_at, self.steps
         parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}

@@ -32,7 +32,7 @@ class Dense:
         self.dx = torch.zeros(count, batch, inputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """z for x (count or 1, batch, in); x is kept by reference until the backward pass."""
+        """Z for x (count or 1, batch, in); x is kept by reference until the backward pass."""
         self.x = x.expand(self.weight.shape[0], -1, -1)
         return torch.baddbmm(self.bias, self.x, self.weight.mT, out=self.z)
 

@@ -73,7 +73,7 @@ class TD3:
         torch.set_flush_denormal(False)  # it holds for the whole thread, which is not ours alone
 
     def target(self, batch: Batch) -> Tensor:
-        """y (1, batch, 1)."""
+        """Y (1, batch, 1)."""
         config = self.config
         noise = self._noise.normal_(0.0, 1.0, generator=self._generator).mul_(config.target_noise)
         noise.clamp_(-config.target_noise_clip, config.target_noise_clip)

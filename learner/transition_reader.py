@@ -30,9 +30,8 @@ class StepReader:
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     def move(self, step: pb.Step) -> ActorStep:
-        """
-        Raises:
-            BadStep: it cannot be learned from.
+        """Raises:
+        BadStep: it cannot be learned from.
         """
         if step.robot != self.robot.name:
             raise BadStep("robot", f"{step.robot!r} where {self.robot.name!r} is learned")

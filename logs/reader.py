@@ -165,7 +165,7 @@ class Log:
 
 
 def find(paths: Paths) -> tuple[Path, ...]:
-    """Return the files at `paths`: for a folder all its logs, for run.mcap also its segments run_0001.mcap …
+    """Return the files at `paths`: for a folder all its logs, for run.mcap also its segments run_0001.mcap ….
 
     Raises:
         NoLog: a path has no log.

@@ -1,4 +1,4 @@
-"""Write one MCAP file of a run: run.mcap, then run_0001.mcap, run_0002.mcap …
+"""Write one MCAP file of a run: run.mcap, then run_0001.mcap, run_0002.mcap ….
 
 A run has several files if it was resumed, the recorder restarted, the disk was full, or a file grew too long. Each file
 can be read without the others.
@@ -64,7 +64,7 @@ class Entry:
 
 
 def name_of(path: Path | str, number: int) -> str:
-    """Return the file name of a segment: run.mcap for 0, then run_0001.mcap, run_0002.mcap …"""
+    """Return the file name of a segment: run.mcap for 0, then run_0001.mcap, run_0002.mcap …."""
     path = Path(path)
     return f"{path.stem}_{number:04}{path.suffix}" if number else path.name
 

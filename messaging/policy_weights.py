@@ -90,10 +90,9 @@ class MLP:
 
     @classmethod
     def load(cls, path: Path, robot: RobotWithTask | None = None) -> MLP:
-        """
-        Raises:
-            BadWeights: the file is not a policy (of that robot, if one is given).
-            OSError: it cannot be read.
+        """Raises:
+        BadWeights: the file is not a policy (of that robot, if one is given).
+        OSError: it cannot be read.
         """
         return decode(path.read_bytes(), robot)
 

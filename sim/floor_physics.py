@@ -26,13 +26,12 @@ class FloorPhysics:
     """
 
     def __init__(self, mjcf: str, height: float, arena: Arena, sample_time: float, period: float) -> None:
-        """
-        Args:
-            mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
-            height: m, of the origin of the base above the floor.
-            arena: the robot stands at its start.
-            sample_time: s, advanced by each call of `advance`.
-            period: s, which the robot has to settle on its wheels before the episode starts at time 0.
+        """Args:
+        mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
+        height: m, of the origin of the base above the floor.
+        arena: the robot stands at its start.
+        sample_time: s, advanced by each call of `advance`.
+        period: s, which the robot has to settle on its wheels before the episode starts at time 0.
         """
         self.model = _compile(mjcf, height, arena)
         self.data = mujoco.MjData(self.model)

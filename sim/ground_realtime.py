@@ -1,5 +1,6 @@
 """The ground robot in continuous time, as its ROS nodes see it: it takes a command at any sample and measures at every
-sample."""
+sample.
+"""
 
 from __future__ import annotations
 

@@ -149,7 +149,8 @@ class TrackingObservation(GroundObservation):
 
 class PlanarObservation:
     """The observation of any robot with a heading: lidar ranges from its position, the goal in polar coordinates, the
-    state after the pose, and the last input, each divided by its largest value."""
+    state after the pose, and the last input, each divided by its largest value.
+    """
 
     def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
         self._robot, self._goal = robot, arena.goal

@@ -112,11 +112,10 @@ class OtherRobots:
     pushes = True
 
     def __init__(self, now: Callable[[], Array], radius: float, reported: Callable[[], tuple[Array, Array]]) -> None:
-        """
-        Args:
-            now: returns their true positions (n, 2).
-            radius: m.
-            reported: returns the positions and velocities (n, 2) that they measure and report to each other.
+        """Args:
+        now: returns their true positions (n, 2).
+        radius: m.
+        reported: returns the positions and velocities (n, 2) that they measure and report to each other.
         """
         self._now, self._radius, self.reported = now, radius, reported
 

@@ -99,7 +99,8 @@ class FilterNode:
 
     def __init__(self, settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> None:
         """ask: sends requests to the filter; tap: called with every message. Raises Unreachable, BadRosName,
-        UnknownRobot, UnsupportedRobot."""
+        UnknownRobot, UnsupportedRobot.
+        """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
         self.gate = CommandGate(self.robot, ask, settings.name)

@@ -101,7 +101,8 @@ def evaluate(
     robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda tally: None
 ) -> dict[str, Any]:
     """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
-    called after every one."""
+    called after every one.
+    """
     if what.fleet:
         return _together(robot, what, each) | _about(what)
     driver, policy, question = prepare_evaluation(robot, what)

@@ -51,10 +51,9 @@ class BusSettings:
         return f"INSECURE: no keys at {', '.join(open_to_others)}; whoever reaches it can command the robots"
 
     def check(self) -> None:
-        """
-        Raises:
-            ValueError: neither `connect` nor `listen` is given, or the endpoints do not go with the keys.
-            Insecure: others than this machine could connect, and there are no keys.
+        """Raises:
+        ValueError: neither `connect` nor `listen` is given, or the endpoints do not go with the keys.
+        Insecure: others than this machine could connect, and there are no keys.
         """
         endpoints = (*self.connect, *self.listen)
         if not endpoints:
@@ -119,10 +118,9 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
 
 
 def open_session(settings: BusSettings, source: str) -> zenoh.Session:
-    """
-    Raises:
-        Unreachable: no router answered, or an endpoint cannot be listened on.
-        ValueError, Insecure, BadKeys: as `configuration` says.
+    """Raises:
+    Unreachable: no router answered, or an endpoint cannot be listened on.
+    ValueError, Insecure, BadKeys: as `configuration` says.
     """
     until = time.monotonic() + (0.0 if settings.listen else settings.patience)
     pause = FIRST_PAUSE

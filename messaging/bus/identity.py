@@ -1,5 +1,6 @@
 """Who a process is to the others: its certificate, from a folder of keys (messaging/bus/certificate_authority.py
-makes one)."""
+makes one).
+"""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def _asker(query: zenoh.Query) -> str:
 
 
 def _patience(query: zenoh.Query) -> float:
-    """[s]"""
+    """[s]."""
     try:
         said = float(query.attachment.to_string()) if query.attachment is not None else LONGEST
     except (ValueError, zenoh.ZError):

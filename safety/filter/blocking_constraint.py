@@ -27,7 +27,8 @@ class BlockingConstraint:
     """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its reservation),
     `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
     to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
-    from the free side on, through the obstacle's nearest point; empty where there is none."""
+    from the free side on, through the obstacle's nearest point; empty where there is none.
+    """
 
     by: str
     room: float
@@ -59,7 +60,8 @@ class ConstraintSources:
 class Planes:
     """Half-spaces for one disc of the body: start (d,) and ends (N, d), world, of its centre's nominal way; normals
     (n, N, d) and offsets (n, N) about `start`, in the order of `ConstraintSources`, of obstacles that keep_off [m] and
-    measured (d,) have been taken from."""
+    measured (d,) have been taken from.
+    """
 
     start: Array
     ends: Array

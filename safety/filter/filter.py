@@ -248,7 +248,8 @@ class Filter:
         self, local_map: LocalMap, z_0: Array, proposal: Array, adjusted: _Candidate | None
     ) -> _Candidate | None:
         """Return the proposal without the inputs that move the position, if that plan is verified and closer to
-        the proposal than the QP's answer."""
+        the proposal than the QP's answer.
+        """
         if self.in_place is None:
             return None
         (box, constraints), m = self.in_place, len(proposal)

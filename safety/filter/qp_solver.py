@@ -30,7 +30,8 @@ EXACT, FIRMNESS = 1e-7, 1e-2
 @dataclass(frozen=True)
 class QuadraticProgram:
     """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,). The last `always` of them
-    (bounds and slew) are in every small problem from the start."""
+    (bounds and slew) are in every small problem from the start.
+    """
 
     h: Array
     g: Array

@@ -138,7 +138,7 @@ class ReservationRows:
     """
 
     def __init__(self, position: Array, directions: Array) -> None:
-        """position (N, d, nz), directions (N, d, L): the tube's."""
+        """Position (N, d, nz), directions (N, d, L): the tube's."""
         N, d, nz = position.shape
         self._position = np.concatenate([np.zeros((1, d, nz)), position])
         self._directions = np.concatenate([np.zeros((1, d, directions.shape[2])), directions])

@@ -27,7 +27,7 @@ ROWS_A_ROUND = 64  # samples that each round adds to a linear program
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """y ∈ C z + Σ_j ( M_j |W z| + κ_j |z| + w_j ) g_j [-1, 1]        (docs/method.md §1, form 1)
+    """y ∈ C z + Σ_j ( M_j |W z| + κ_j |z| + w_j ) g_j [-1, 1]        (docs/method.md §1, form 1).
 
     Attributes:
         C (n, nz): linear predictor. W (q, nz): rows that all generators share.

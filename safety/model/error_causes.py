@@ -47,7 +47,8 @@ def state_parts(robot: Robot, discs: int = 0) -> list[str]:
 
 def regimes(robot: Robot, z: Array) -> NDArray[np.str_]:
     """How the robot drove in plans with regressors z (T, nz): the strongest of the input in force, the first chosen
-    one and the coordinates that follow them, as shares of the inputs' bounds."""
+    one and the coordinates that follow them, as shares of the inputs' bounds.
+    """
     m, reg = robot.action_dim, list(robot.regressor)
     before, chosen = z[:, len(reg) : len(reg) + m], z[:, len(reg) + m : len(reg) + 2 * m]
     strongest = np.maximum(np.abs(before), np.abs(chosen))

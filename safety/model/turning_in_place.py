@@ -40,7 +40,8 @@ class InPlace:
 
 def over_plan(each: Array, regressors: int, known: int) -> Array:
     """Repeat what is given for each input of a plan: (n, r + m) of [x_0; input in force; each input] becomes
-    (n, regressors); known: r."""
+    (n, regressors); known: r.
+    """
     count = (regressors - known) // (each.shape[1] - known)
     return np.hstack([each[:, :known], np.tile(each[:, known:], count)])
 
@@ -52,13 +53,14 @@ def widened(domain: Array) -> Array:
 
 
 def inside(z: Array, domain: Array) -> NDArray[np.bool_]:
-    """Which regressors z (T, nz) lie within the bounds (2, nz)? (T,)"""
+    """Which regressors z (T, nz) lie within the bounds (2, nz)? (T,)."""
     return np.asarray(((z >= domain[0]) & (z <= domain[1])).all(axis=-1))
 
 
 def turning(robot: Robot) -> NDArray[np.bool_]:
     """Which of [x_0; input in force; each input of a plan] (r + m,) may differ from zero in place: the inputs that do
-    not move the position, and the state coordinates that follow them."""
+    not move the position, and the state coordinates that follow them.
+    """
     free = ~np.array(robot.translates)
     followed = {index for index, is_free in zip(robot.follows, free, strict=True) if is_free}
     states = np.array([index in followed for index in robot.regressor], dtype=bool)

@@ -48,7 +48,8 @@ CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
 @dataclass(frozen=True)
 class ValidationReport:
     """Of one model set. The unit is a plan window that overlaps no other and whose stop was recorded for a period at
-    least; a violation is any part of it outside."""
+    least; a violation is any part of it outside.
+    """
 
     certificate: str
     mode: str
@@ -90,7 +91,8 @@ def upper_bound(violations: int, count: int) -> float:
 
 def most_violations(count: int, limit: float) -> int:
     """The most violations among so many held-out plans with which the bound is still within the limit; -1: even none
-    would be too many, for there are too few plans."""
+    would be too many, for there are too few plans.
+    """
     most = -1
     while most + 1 < count and upper_bound(most + 1, count) <= limit:
         most += 1
@@ -179,7 +181,7 @@ def _share(off: Array, half: Array) -> Array:
 
 
 def _first_excess(model: ModelSet, w: Windows) -> Array:
-    """How much of its predicted set each coordinate of the state comes to after one period. (T, n)"""
+    """How much of its predicted set each coordinate of the state comes to after one period. (T, n)."""
     z = w.z if model.model_config.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
     return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))

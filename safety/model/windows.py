@@ -134,7 +134,8 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
 
 def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
     """Of each period the largest distance from its chord (T,) [m], and the way while stopping (T+1,) [m]; found once
-    for the windows of all lengths."""
+    for the windows of all lengths.
+    """
     known = _found.get(t)
     if known is None or known[0] != robot:
         # The disc farthest from the regressed position goes off its chord by what turning does to it, too.
@@ -162,7 +163,8 @@ def stop_input_periods(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
 
 def predicted_outputs(robot: Robot, y: Array) -> Array:
     """What certificates predict: y (T, n), and the displacement of the centre of each disc that is not about the
-    regressed position, in the frame of the start. (T, n + d·discs)"""
+    regressed position, in the frame of the start. (T, n + d·discs).
+    """
     if robot.heading is None:
         return y
     arms = [np.asarray(disc.at) for disc in robot.body if disc.arm > 0.0]

@@ -35,7 +35,8 @@ class _StoredImage:
     @cached_property
     def free(self) -> tuple[float, Single]:
         """The lowest ring's elevation [rad], and free ranges (len(DRIFT_ANGLES), E, A) [m]: entry k is the least free
-        range of all directions within `DRIFT_ANGLES[k]` of a patch."""
+        range of all directions within `DRIFT_ANGLES[k]` of a patch.
+        """
         grid, free = patch_free_ranges(self.image)
         patch, step = 2.0 * grid.half_diagonal, self.image.step[0]
         windows = [GridWindow.of(grid.columns, grid.elevations, step, angle + patch) for angle in DRIFT_ANGLES]

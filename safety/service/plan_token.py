@@ -60,7 +60,8 @@ class PlanAuthenticator:
 
     def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
         """Return the tokens of a decision: one for each of the next periods. The last token stays valid: from there on,
-        the plan's tail no longer changes."""
+        the plan's tail no longer changes.
+        """
         m, n = robot.action_dim, robot.horizon
         plan = list(decision.plan)
         stop = [0.0 if robot.stop[j] != HOLD else plan[j - m] for j in range(m)]

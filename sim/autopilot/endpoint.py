@@ -62,8 +62,7 @@ class Autopilot:
         lidar: Lidar | None = None,
         quiet: bool = False,
     ) -> None:
-        """
-        Args:
+        """Args:
             rules: `px4` or `ardupilot`.
             system: MAVLink system id.
             parameters: values that replace the defaults.

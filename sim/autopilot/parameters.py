@@ -23,7 +23,7 @@ class Parameter:
 
     @property
     def type(self) -> int:
-        """MAV_PARAM_TYPE"""
+        """MAV_PARAM_TYPE."""
         return int(INTEGER if self.integer else REAL)
 
 

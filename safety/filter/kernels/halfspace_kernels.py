@@ -37,7 +37,8 @@ def rows(
     sizes: int,
 ) -> tuple[Array, Array, Array]:
     """Return gradient (n·E, nz), spread (n·E, sizes) and bound (n·E,) of the rows (3) of half-spaces a (n, N, d),
-    b (n, N)."""
+    b (n, N).
+    """
     n, ends, d, nz = len(normals), len(period), end_maps.shape[1], end_maps.shape[2]
     gradient, spread, bound = np.zeros((n * ends, nz)), np.zeros((n * ends, sizes)), np.empty(n * ends)
     for i in range(n):
