@@ -26,33 +26,50 @@ ENTRY = "dataset"
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One uninterrupted recording; nothing pairs its last sample with another's first. Compared by identity.
+    """One uninterrupted recording of T periods. Two trajectories are equal only if they are the same object.
 
-    states: (T+1, n) measured; inputs: (T, m) executed.
-    paths: (T, S, d) positions within each period relative to its start, in the frame of its start, from
-    dead reckoning; turned: (T,) heading change over each period, likewise [rad].
+    Attributes:
+        states (T+1, n): measured states.
+        inputs (T, m): executed inputs.
+        paths (T, S, d): S positions within each period [m], relative to its start and in the frame of its start, from
+            dead reckoning.
+        turned (T,): heading change over each period [rad], from dead reckoning.
+        before (m,): the input in force at the start. None if the robot stood still.
     """
 
     states: Array
     inputs: Array
     paths: Array
     turned: Array
-    before: Array | None = None  # (m,) the input in force at the start; None: standing still
+    before: Array | None = None
 
 
 @dataclass(frozen=True)
 class Dataset:
+    """Recorded trajectories of one robot.
+
+    Attributes:
+        robot: the robot's description.
+        trajectories: recordings, each uninterrupted.
+        about: the origin of the data: noise levels, seed, payload and more.
+        chord_deviation: how far the path may leave the straight line between two samples of the source [m].
+    """
+
     robot: Robot
     trajectories: tuple[Trajectory, ...]
-    about: dict[str, str] = field(default_factory=dict)  # where it comes from: noise levels, seed, payload ...
-    chord_deviation: float = 0.0  # m that a path may leave its chord by between the samples that the source has
+    about: dict[str, str] = field(default_factory=dict)
+    chord_deviation: float = 0.0
 
     @property
     def periods(self) -> int:
         return sum(len(t.inputs) for t in self.trajectories)
 
     def check(self) -> None:
-        """Raises BadData unless dimensions agree, everything is finite and inputs are within bounds."""
+        """Check shapes, finite values, the bounds of inputs, and that no position jumps.
+
+        Raises:
+            BadData: a check fails; the message says which one, and in which trajectory.
+        """
         robot = self.robot
         if not self.trajectories:
             raise BadData("the data set holds no trajectory")
@@ -81,7 +98,11 @@ class Dataset:
                 raise BadData(f"trajectory {i}: the position jumps in period {jumps[0]}: two recordings in one?")
 
     def split(self, shares: Sequence[float]) -> list[Dataset]:
-        """Whole trajectories dealt out in turn, by shares that add up to 1."""
+        """Split the data set into parts with whole trajectories.
+
+        Args:
+            shares: the share of each part; their sum is 1.
+        """
         edges = np.cumsum([0.0, *shares])
         place = (np.arange(len(self.trajectories)) * 0.6180339887) % 1.0  # low discrepancy: even over the recording
         parts = np.searchsorted(edges, place, side="right") - 1
@@ -91,7 +112,7 @@ class Dataset:
         ]
 
     def save(self, path: Path | str) -> None:
-        """Writes a safetensors file: trajectories one after the other, with their lengths."""
+        """Write a safetensors file with the concatenated trajectories and their lengths."""
         names = ("states", "inputs", "paths", "turned")
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
         still = np.zeros(self.robot.action_dim)
@@ -100,15 +121,15 @@ class Dataset:
         robot = self.robot.in_lockstep()
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
         about["bulge"] = self.chord_deviation
-        about["description"] = json.dumps(robot.description)  # a text: the order of its names counts
+        about["description"] = json.dumps(robot.description)  # as text, since the order of its names matters
         write_atomically(Path(path), pack(tensors, ENTRY, about))
 
     @staticmethod
     def load(path: Path | str) -> Dataset:
-        """Reads and checks a data set.
+        """Read and check a data set.
 
         Raises:
-            BadData: not such a file, of another robot layout, or a check fails.
+            BadData: the file is no data set, the robot's layout has changed, or a check fails.
         """
         try:
             tensors, about = unpack(Path(path).read_bytes(), ENTRY)
@@ -166,14 +187,14 @@ class Dataset:
 
     @staticmethod
     def about_of(path: Path) -> dict[str, str]:
-        """What a data set says of where it comes from, whatever robot it is of; nothing if the file is none."""
+        """Return the origin of a data set (`about`) of any robot, or nothing if the file is no data set."""
         try:
             return dict(unpack(path.read_bytes(), ENTRY)[1].get("about", {}))
         except (OSError, ValueError, TypeError):
             return {}
 
     def digest(self) -> str:
-        """Hash of the recorded numbers."""
+        """Return a hash of the recorded numbers, 12 hexadecimal digits."""
         sha = hashlib.sha256()
         for t in self.trajectories:
             sha.update(t.states.tobytes())
@@ -185,9 +206,9 @@ class Dataset:
 
 
 def _jump(robot: Robot, t: Trajectory) -> Array:
-    """How much farther [m] the measured position moved in each period than dead reckoning and noise explain: (T,)."""
+    """Return how much farther the measured position moved than dead reckoning and noise explain (T,) [m]."""
     moved = np.linalg.norm(np.diff(t.states[:, : robot.position_dim], axis=0), axis=1)
     steps = np.diff(t.paths, axis=1, prepend=0.0)
     way = np.linalg.norm(steps, axis=2).sum(1)
     noise = 2.0 * np.linalg.norm(robot.measurement_bound[: robot.position_dim])
-    return np.asarray(moved - 2.0 * (way + noise))  # twice: it is for gross errors, not for a slipping wheel
+    return np.asarray(moved - 2.0 * (way + noise))  # factor 2: detect gross errors, not slipping wheels

@@ -1,4 +1,4 @@
-"""Where held-out plans left their sets: by which coordinate, and how the robot drove then."""
+"""Group the held-out plans that left their predicted sets, by coordinate and by driving regime."""
 
 from __future__ import annotations
 
@@ -15,30 +15,43 @@ Array = NDArray[np.float64]
 PATH, AFTER = "the path within a period", "the way after the stop"
 STANDING, SLOW, TURNING, FAST, BOTH = "standing", "slow", "turning", "fast", "fast and turning"
 REGIMES = (STANDING, SLOW, TURNING, FAST, BOTH)
-STILL = 0.05  # of its bounds: a robot stands if every speed and input is below
-HALF = 0.5  # of its bounds: from there on it drives fast, or turns
+STILL = 0.05  # share of the inputs' bounds; a robot stands if every speed and input is below it
+HALF = 0.5  # share of the inputs' bounds; from there on the robot drives fast, or turns
 
 
 @dataclass(frozen=True)
 class ViolationGroup:
-    """Held-out plans of one regime that left their sets by the same part. of: the held-out plans of that regime."""
+    """Held-out plans of one regime that left their sets by the same part.
+
+    Attributes:
+        part: a coordinate's name, `PATH` or `AFTER`.
+        regime: one of `REGIMES`.
+        plans: number of these plans.
+        of: number of all held-out plans of the regime.
+        excess: the largest ratio of an error to its bound; above 1 the error is outside its set.
+    """
 
     part: str
     regime: str
     plans: int
     of: int
-    excess: float  # the largest share of its set that one of them came to
+    excess: float
 
 
 def position_parts(robot: Robot) -> list[str]:
-    """Names of the position's coordinates, as a tube is seen: in the frame of its start."""
+    """Return the names of the position's coordinates, in the frame of the tube's start."""
     if robot.heading is not None:
         return ["position ahead", "position aside"]
     return state_parts(robot)[: robot.position_dim]
 
 
 def state_parts(robot: Robot, discs: int = 0) -> list[str]:
-    """Names of the predicted coordinates; `discs`: so many are displacements of the body's further discs."""
+    """Return the names of the predicted coordinates.
+
+    Args:
+        robot: the robot.
+        discs: number of further coordinates, which are displacements of the body's other discs.
+    """
     names = [label.rpartition(" [")[0] for label in robot.state]
     if robot.heading is not None:
         names[: robot.position_dim] = position_parts(robot)
@@ -46,8 +59,17 @@ def state_parts(robot: Robot, discs: int = 0) -> list[str]:
 
 
 def regimes(robot: Robot, z: Array) -> NDArray[np.str_]:
-    """How the robot drove in plans with regressors z (T, nz): the strongest of the input in force, the first chosen
-    one and the coordinates that follow them, as shares of the inputs' bounds.
+    """Classify how the robot drove at the start of each plan.
+
+    The regime depends on the largest of the input in force, the first input of the plan and the coordinates that follow
+    them, as shares of the inputs' bounds.
+
+    Args:
+        robot: the robot.
+        z (T, nz): regressors of the plans.
+
+    Returns:
+        Regimes (T,), each one of `REGIMES`.
     """
     m, reg = robot.action_dim, list(robot.regressor)
     before, chosen = z[:, len(reg) : len(reg) + m], z[:, len(reg) + m : len(reg) + 2 * m]
@@ -67,7 +89,13 @@ def regimes(robot: Robot, z: Array) -> NDArray[np.str_]:
 
 
 def group_violations(excess: Array, parts: list[str], driving: NDArray[np.str_]) -> tuple[ViolationGroup, ...]:
-    """The plans whose excess (T,) is above 1, by part and regime; the most plans first."""
+    """Group the plans that left their sets by part and regime, the largest group first.
+
+    Args:
+        excess (T,): the largest ratio of an error to its bound in each plan; above 1 or NaN, the plan left its set.
+        parts: the part of each plan with that ratio (T).
+        driving (T,): the regime of each plan.
+    """
     left = ~(excess <= 1.0)
     every = Counter(driving.tolist())
     groups: dict[tuple[str, str], list[float]] = {}

@@ -1,4 +1,7 @@
-"""How a model set is made, and what there is to choose from. Nothing heavy here: whoever starts a run reads it."""
+"""The settings from which a model set is fitted, and their possible values.
+
+Every command that starts a run imports this module, so it imports nothing that loads slowly.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE = "residual", "set-membership", "matrix-zonotope"
-KINDS = (RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE)  # of certificates
+KINDS = (RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE)  # of error bounds
 DIRECT, RECURSION = "direct", "recursion"
 MODES = (DIRECT, RECURSION)
 PLAN, FREE = "plan", "free"
@@ -17,14 +20,14 @@ METHODS = (DDPC, SECAS, SAILR)  # of a safety service
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """How a model set is made from a data set."""
+    """The settings with which a model set is fitted to a data set (docs/method.md §1)."""
 
     certificate: str = RESIDUAL
     mode: str = DIRECT
-    inflation: float = 1.15  # of every envelope: what the next data may exceed the recorded ones by
-    seed: int = 0  # of the recursion's heading offsets
-    windows: str = PLAN  # FREE: from driving that follows no plan
-    fewest: int = 200  # windows of a length, below which nothing useful is bounded
+    inflation: float = 1.15  # factor on every envelope, since new data may exceed the recorded data
+    seed: int = 0  # for the recursion's random heading offsets
+    windows: str = PLAN  # PLAN, or FREE for recorded driving that follows no plan
+    fewest: int = 200  # least number of windows of each length
 
     def __post_init__(self) -> None:
         if self.certificate not in KINDS:
@@ -37,11 +40,15 @@ class ModelConfig:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
 
     def of_minutes(self) -> ModelConfig:
-        """The same from minutes of driving instead of hours: fewer windows, and every envelope half as wide again."""
+        """Return these settings for minutes of driving instead of hours: fewer windows, envelopes scaled by 1.5."""
         return replace(self, inflation=1.5, fewest=60)
 
 
 def check_reservations(method: str) -> None:
-    """Raises ValueError: robots that share a world are promised nothing by this method."""
+    """Check that a method reserves space, which robots that share a world need.
+
+    Raises:
+        ValueError: the method makes no reservations.
+    """
     if method not in (DDPC, "none"):
         raise ValueError(f"{method} predicts nothing, so it makes no promises: a fleet's method is {DDPC} or none")

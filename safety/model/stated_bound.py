@@ -1,8 +1,8 @@
-"""How loose the statement of a model set may be that is used without a question (docs/method.md §1, §12).
+"""Refuse a model set whose stated bound is above the robot's limit (docs/method.md §1, §12).
 
-A model set carries its statement: the largest share of plans that leave their tubes, at 99 % confidence. A robot's
-description has the largest share that is used without a question (`accept_bound`); who accepts more says so.
-Nothing heavy here: every process that loads a model set reads it.
+A model set states the largest share of plans that leave their tubes, at 99 % confidence. A robot's description limits
+this share (`accept_bound`). To use a model set above the limit, the caller must accept its bound explicitly.
+Every process that loads a model set imports this module, so it imports nothing that loads slowly.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from brakeline.safety.model.model_set import ModelSet
 
 
 def stated_bound(about: Mapping[str, str]) -> float:
-    """The largest share of plans outside their tubes that a model set states; `UNSTATED` if it states none."""
+    """Return the largest share of plans outside their tubes that a model set states, or `UNSTATED`."""
     try:
         bound = float(about["bound_plan"])
     except (KeyError, TypeError, ValueError):
@@ -26,10 +26,10 @@ def stated_bound(about: Mapping[str, str]) -> float:
 
 
 def accepted_bound(robot: Robot, accept_bound: float | None = None) -> float:
-    """The largest stated share that is used: the robot's own limit, or what is accepted explicitly.
+    """Return the limit of the stated share: `accept_bound`, or by default the robot's own limit.
 
     Raises:
-        ValueError: it is no share.
+        ValueError: `accept_bound` is not above 0 and at most 1.
     """
     if accept_bound is None:
         return robot.accept_bound
@@ -39,25 +39,44 @@ def accepted_bound(robot: Robot, accept_bound: float | None = None) -> float:
 
 
 def check_bound(model: object, robot: Robot, accept_bound: float | None = None) -> None:
-    """See that a model set may be put to use on that robot. A rival's networks verify nothing: they need no statement.
+    """Check that the stated bound of a model set is within the limit for this robot.
+
+    A rival's networks verify nothing, so they need no statement and always pass.
+
+    Args:
+        model: a model set, or a rival's networks.
+        robot: the robot that the model set is for.
+        accept_bound: the largest accepted share. Defaults to the robot's own limit.
 
     Raises:
-        TooLoose: it states more than the robot's limit, or than is accepted; ValueError: `accept_bound` is no share.
+        TooLoose: the stated share is above the limit.
+        ValueError: `accept_bound` is not above 0 and at most 1.
     """
     if isinstance(model, ModelSet) and (why := refusal(robot, model.about, accept_bound)):
         raise TooLoose(f"{robot.name}: {why}")
 
 
 def plans_needed(limit: float) -> int:
-    """So many held-out plans, none of which leaves its tube, state that share (`ln(100)/n`, docs/method.md §12)."""
+    """Return how many held-out plans, none of them outside its tube, bound the share by `limit`.
+
+    With n plans the bound is about `ln(100)/n` at 99 % confidence (docs/method.md §12).
+    """
     return math.ceil(math.log(1.0 - CONFIDENCE) / math.log1p(-limit))
 
 
 def refusal(robot: Robot, about: Mapping[str, str], accept_bound: float | None = None) -> str:
-    """Why a model set is not used on that robot: its bound, the limit, and what to do. Empty: it is used.
+    """Return why the filter must not use a model set on this robot, or an empty string if it may.
+
+    Args:
+        robot: the robot that the model set is for.
+        about: the metadata of the model set.
+        accept_bound: the largest accepted share. Defaults to the robot's own limit.
+
+    Returns:
+        The stated bound, the limit and a remedy, as one message.
 
     Raises:
-        ValueError: `accept_bound` is no share.
+        ValueError: `accept_bound` is not above 0 and at most 1.
     """
     bound, limit = stated_bound(about), accepted_bound(robot, accept_bound)
     if bound <= limit:
@@ -79,7 +98,7 @@ def refusal(robot: Robot, about: Mapping[str, str], accept_bound: float | None =
 
 
 def _remedy(about: Mapping[str, str], limit: float) -> str:
-    """What would bring a statement below the limit."""
+    """Return the step that would bring the stated share below the limit."""
     try:
         windows, violations, minutes = (float(about[name]) for name in ("windows", "violations", "minutes"))
         more = minutes * (plans_needed(limit) / windows - 1.0)

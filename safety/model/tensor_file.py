@@ -1,7 +1,7 @@
-"""Named arrays and what is said of them, as the bytes of a safetensors file: nothing in it can be executed.
+"""Store named arrays and their metadata as a safetensors file, which cannot contain code.
 
-What is said stands in one metadata entry, as JSON with sorted keys: several entries would come in another order each
-time, and the same content is to give the same bytes.
+All metadata are in one entry, as JSON with sorted keys. The order of several entries would vary from file to file,
+but the same content must give the same bytes.
 """
 
 from __future__ import annotations
@@ -19,20 +19,33 @@ from brakeline.errors import BadTensors
 
 
 def pack(tensors: Mapping[str, NDArray[Any]], entry: str, about: Mapping[str, Any]) -> bytes:
-    """`about` must be what JSON can hold."""
+    """Return the bytes of a safetensors file.
+
+    Args:
+        tensors: arrays by name, of any shape.
+        entry: name of the metadata entry.
+        about: the metadata; JSON must be able to represent it.
+    """
     return save(_contiguous(tensors), {entry: json.dumps(about, sort_keys=True)})
 
 
 def content(tensors: Mapping[str, NDArray[Any]]) -> bytes:
-    """The arrays alone, to make a hash of."""
+    """Return the arrays as bytes without metadata, as input to a hash."""
     return save(_contiguous(tensors))
 
 
 def unpack(payload: bytes, entry: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The arrays, and what the metadata entry says of them.
+    """Return the arrays and the metadata of a safetensors file.
+
+    Args:
+        payload: the file's bytes.
+        entry: name of the metadata entry.
+
+    Returns:
+        The arrays by name, and the content of the metadata entry.
 
     Raises:
-        BadTensors: it is no such file, or has no such entry; the message says which.
+        BadTensors: the bytes are no safetensors file, or the entry is missing or no JSON object.
     """
     try:
         about = json.loads(_metadata(payload)[entry])
@@ -47,7 +60,7 @@ def unpack(payload: bytes, entry: str) -> tuple[dict[str, NDArray[Any]], dict[st
 
 
 def has_entry(payload: bytes, entry: str) -> bool:
-    """Is it a safetensors file with that metadata entry?"""
+    """Return whether `payload` is a safetensors file with this metadata entry."""
     try:
         return entry in _metadata(payload)
     except (ValueError, TypeError, AttributeError):

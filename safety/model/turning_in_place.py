@@ -1,8 +1,8 @@
-"""Plans that turn a standing robot on the spot: predictors and bounds of their own (docs/method.md §1).
+"""Separate predictors and error bounds for plans that turn a standing robot on the spot (docs/method.md §1).
 
-Where a robot goes depends on the product of speed and turning, which no predictor that is linear in both can have. One
-bound for all plans covers the missing product, so it grows with the turn rate even where the speed is zero. The plans
-of a robot that stands, and is given no input that moves its position, are therefore a group of their own.
+A robot's motion depends on the product of speed and turn rate, which a linear predictor cannot represent. One error
+bound for all plans covers the missing product, so it grows with the turn rate even at zero speed. Plans that start at
+standstill and contain no input that moves the position therefore form a separate group.
 """
 
 from __future__ import annotations
@@ -17,49 +17,61 @@ from brakeline.safety.model.error_bounds import ErrorBound
 
 Array = NDArray[np.float64]
 
-OUTSIDE_DOMAIN = 0.02  # of the recorded range: how far beyond it a regressor may lie (rounding, not extrapolation)
-STANDING = 0.01  # of an input's range: a robot that moves no faster stands, if its measurement is better than that
+OUTSIDE_DOMAIN = 0.02  # share of the recorded range by which a regressor may exceed it: rounding, not extrapolation
+STANDING = 0.01  # share of an input's range; a robot stands below this speed, or below the measurement error if larger
 
 
 @dataclass(frozen=True)
 class InPlace:
-    """The predictors for plans in place.
+    """The predictors for plans that turn in place, and their domain.
 
-    steps: as in a model set of mode `direct` from free driving, where all inputs of a plan are regressors. box
-    (2, r + m): the least and the largest value of [x_0; input in force] (r,) and of each input of the plan (m,) for
-    which they hold.
+    Attributes:
+        steps: as in a model set of mode `direct` from free driving, where all inputs of a plan are regressors.
+        box (2, r + m): the least and the largest recorded value of [x_0; input in force] (r,) and of each input of the
+            plan (m,). The predictors hold only between them.
     """
 
     steps: tuple[ErrorBound, ...]
     box: Array
 
     def domain(self, regressors: int, known: int) -> Array:
-        """(2, regressors): the bounds of regressors z, of which the first `known` are [x_0; input in force]."""
+        """Return the bounds (2, regressors) of regressors z, whose first `known` are [x_0; input in force]."""
         return widened(over_plan(self.box, regressors, known))
 
 
 def over_plan(each: Array, regressors: int, known: int) -> Array:
-    """Repeat what is given for each input of a plan: (n, r + m) of [x_0; input in force; each input] becomes
-    (n, regressors); known: r.
+    """Repeat the columns of one input for every input of a plan.
+
+    Args:
+        each (n, r + m): columns for [x_0; input in force] (r) and for one input of the plan (m).
+        regressors: number of columns of the result.
+        known: r.
+
+    Returns:
+        Array (n, regressors).
     """
     count = (regressors - known) // (each.shape[1] - known)
     return np.hstack([each[:, :known], np.tile(each[:, known:], count)])
 
 
 def widened(domain: Array) -> Array:
-    """Bounds (2, r) of recorded regressors, with room for rounding."""
+    """Return recorded bounds (2, r), widened to allow for rounding."""
     spread = OUTSIDE_DOMAIN * (domain[1] - domain[0])
     return np.stack([domain[0] - spread, domain[1] + spread])
 
 
 def inside(z: Array, domain: Array) -> NDArray[np.bool_]:
-    """Which regressors z (T, nz) lie within the bounds (2, nz)? (T,)."""
+    """Return which regressors z (T, nz) lie within the bounds `domain` (2, nz), as a mask (T,)."""
     return np.asarray(((z >= domain[0]) & (z <= domain[1])).all(axis=-1))
 
 
 def turning(robot: Robot) -> NDArray[np.bool_]:
-    """Which of [x_0; input in force; each input of a plan] (r + m,) may differ from zero in place: the inputs that do
-    not move the position, and the state coordinates that follow them.
+    """Return which of [x_0; input in force; each input of a plan] may differ from zero in place.
+
+    They are the inputs that do not move the position, and the state coordinates that follow these inputs.
+
+    Returns:
+        Mask (r + m,).
     """
     free = ~np.array(robot.translates)
     followed = {index for index, is_free in zip(robot.follows, free, strict=True) if is_free}
@@ -68,13 +80,14 @@ def turning(robot: Robot) -> NDArray[np.bool_]:
 
 
 def standing_limits(robot: Robot) -> Array | None:
-    """Bounds (2, r + m) of [x_0; input in force; each input of a plan] for a robot that stands.
+    """Return the bounds of [x_0; input in force; each input of a plan] for a robot that stands.
 
-    They are infinite for what may differ from zero in place (`turning`). A measured speed counts as none if its error,
-    or one percent of the input that it follows, can make it.
+    Entries that may differ from zero in place (`turning`) are unbounded. A measured speed counts as zero up to its
+    measurement error, or up to one percent of the range of the input that it follows if that is larger.
 
     Returns:
-        None for a robot without such plans: none of its inputs, or all of them, move it, or it stops by feedback.
+        Bounds (2, r + m). None for a robot that stops by feedback, and for one of whose inputs none or all move the
+        position: it has no plans that turn in place.
     """
     if all(robot.translates) or not any(robot.translates) or robot.feedback:
         return None

@@ -1,8 +1,10 @@
-"""Windows of recorded data, to which model sets are fitted: a state, the inputs after it, and what followed.
+"""Cut recorded data into windows, to which model sets are fitted (docs/method.md §2).
+
+A window has a state, the inputs after it, and the state after these inputs.
 
 A *plan window* of length k starts at a period whose inputs follow the robot's schedule (chosen inputs, then its stop
-rules) for k periods; a *free window* at any period, and has every one of its inputs as a regressor. Displacement is
-taken in the robot's frame at the window's start, so position is no regressor.
+rules) for k periods. A *free window* starts at any period, and all of its inputs are regressors. Displacement is in
+the robot's frame at the window's start, so position is no regressor.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ class Windows:
         z (T, nz): regressors [x_0; u_{-1}; inputs].
         y (T, n): state after k periods, in the frame of the start: displacement, change of heading, other values.
         chord_deviation (T,) [m]: largest distance of the path from its chord, in the last period.
-        stopping_distance (T,) [m]: way after the window while the inputs stay those of a stop; NaN if they do not.
+        stopping_distance (T,) [m]: way after the window while the inputs stay those of a stop, otherwise NaN.
         start (T, 2): trajectory and period.
     """
 
@@ -133,8 +135,13 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
 
 
 def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
-    """Of each period the largest distance from its chord (T,) [m], and the way while stopping (T+1,) [m]; found once
-    for the windows of all lengths.
+    """Return the chord deviation of each period and the stopping distance from each sample on.
+
+    The result is cached for each trajectory, since windows of all lengths need it.
+
+    Returns:
+        The largest distance of the path from its chord (T,) [m], and the way while stopping (T+1,) [m]; NaN where the
+        inputs are not those of a stop.
     """
     known = _found.get(t)
     if known is None or known[0] != robot:
@@ -162,8 +169,15 @@ def stop_input_periods(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:
 
 
 def predicted_outputs(robot: Robot, y: Array) -> Array:
-    """What certificates predict: y (T, n), and the displacement of the centre of each disc that is not about the
-    regressed position, in the frame of the start. (T, n + d·discs).
+    """Append the displacements of the body's further discs to y.
+
+    Args:
+        robot: the robot.
+        y (T, n): state after a window, in the frame of its start.
+
+    Returns:
+        Array (T, n + d·discs): y, then the displacement of each disc whose centre is not the regressed position, in the
+        frame of the start [m].
     """
     if robot.heading is None:
         return y
@@ -209,11 +223,17 @@ def resting_periods_at_end(robot: Robot) -> int:
 
 
 def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
-    """So many periods after a plan began the robot stood, whatever the plan was, and went on standing: no measured
-    speed was more than its error can make of none. As many as a plan has where that was not so, or no plans were
-    recorded.
+    """Return the number of periods after which the robot stood in every recorded plan, and went on standing.
 
-    whole: the windows of all of a plan's periods.
+    The robot stands if every measured speed is within its measurement error of zero.
+
+    Args:
+        whole: windows over all periods of a plan.
+        data: the data set of these windows.
+        kind: `PLAN` or `FREE`.
+
+    Returns:
+        At most the horizon: in particular for `FREE` windows, or if the robot still moved at the end of a plan.
     """
     robot = data.robot
     speeds, none = list(robot.regressor), np.asarray(robot.measurement_bound)[list(robot.regressor)]
