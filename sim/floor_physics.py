@@ -26,12 +26,14 @@ class FloorPhysics:
     """
 
     def __init__(self, mjcf: str, height: float, arena: Arena, sample_time: float, period: float) -> None:
-        """Args:
-        mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
-        height: m, of the origin of the base above the floor.
-        arena: the robot stands at its start.
-        sample_time: s, advanced by each call of `advance`.
-        period: s, which the robot has to settle on its wheels before the episode starts at time 0.
+        """Compile the model with the robot at the start of the arena.
+
+        Args:
+            mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
+            height: height of the origin of the base above the floor [m].
+            arena: the arena; the robot stands at its start.
+            sample_time: time that each call of `advance` simulates [s].
+            period: time for the robot to settle on its wheels before the episode starts at time 0 [s].
         """
         self.model = _compile(mjcf, height, arena)
         self.data = mujoco.MjData(self.model)

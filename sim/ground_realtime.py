@@ -1,5 +1,6 @@
-"""The ground robot in continuous time, as its ROS nodes see it: it takes a command at any sample and measures at every
-sample.
+"""The ground robot in continuous time, as its ROS nodes see it.
+
+The robot accepts a command at any sample and measures at every sample.
 """
 
 from __future__ import annotations

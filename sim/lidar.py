@@ -26,10 +26,13 @@ class Lidar:
     def __init__(
         self, arena: Arena, rays: LidarRays, noise: float = 0.0, rng: np.random.Generator | None = None
     ) -> None:
-        """Args:
-        rays: in the frame of the robot's heading, of the arena's dimension.
-        noise: standard deviation of a range [m]; normal, cut off at two standard deviations, independent.
-        rng: the source of the noise; without it ranges are exact.
+        """Build the model of the arena for ray casting.
+
+        Args:
+            arena: the arena.
+            rays: directions in the frame of the robot's heading, with the arena's dimension.
+            noise: standard deviation of a range [m]; independent normal noise, truncated at two standard deviations.
+            rng: the source of the noise. Without it, ranges are exact.
         """
         self.rays, self.max_range, self._noise, self._rng = rays, rays.range, noise, rng
         beams = np.zeros((len(rays.directions), 3))

@@ -148,8 +148,10 @@ class TrackingObservation(GroundObservation):
 
 
 class PlanarObservation:
-    """The observation of any robot with a heading: lidar ranges from its position, the goal in polar coordinates, the
-    state after the pose, and the last input, each divided by its largest value.
+    """The observation of any robot with a heading.
+
+    It consists of lidar ranges from the robot's position, the goal in polar coordinates, the state entries after the
+    pose, and the last input. Each entry is divided by its largest value.
     """
 
     def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:

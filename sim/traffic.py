@@ -112,10 +112,12 @@ class OtherRobots:
     pushes = True
 
     def __init__(self, now: Callable[[], Array], radius: float, reported: Callable[[], tuple[Array, Array]]) -> None:
-        """Args:
-        now: returns their true positions (n, 2).
-        radius: m.
-        reported: returns the positions and velocities (n, 2) that they measure and report to each other.
+        """Connect to the other robots of a shared world.
+
+        Args:
+            now: returns their true positions (n, 2) [m].
+            radius: radius of each robot [m].
+            reported: returns the positions [m] and velocities [m/s] (n, 2) that they measure and report to each other.
         """
         self._now, self._radius, self.reported = now, radius, reported
 

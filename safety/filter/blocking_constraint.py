@@ -24,10 +24,15 @@ UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 @dataclass(frozen=True)
 class BlockingConstraint:
-    """by: cylinder | box | sphere | wall, `moving ` before it where it moves, `unseen`, `robot` (its reservation),
-    `sight` (the tube leaves what can be seen), or a limit's name; room [m, of a limit in its own units]: from the tube
-    to the half-space, negative: beyond it; after [s]: when, from now. normal (d,), at (d,): of the half-space, world,
-    from the free side on, through the obstacle's nearest point; empty where there is none.
+    """The constraint that a proposal violated, or came nearest to.
+
+    Attributes:
+        by: `cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves; `unseen`; `robot` (another
+            robot's reservation); `sight` (the tube leaves the visible space); or the name of a limit.
+        room: distance from the tube to the half-space [m], or in the limit's own unit. Negative if the tube crosses it.
+        after: time from now [s].
+        normal (d,): normal of the half-space, away from the free side, world. Empty if there is no half-space.
+        at (d,): the obstacle's nearest point [m], on the half-space, world. Empty if there is no half-space.
     """
 
     by: str
@@ -58,9 +63,15 @@ class ConstraintSources:
 
 @dataclass(frozen=True)
 class Planes:
-    """Half-spaces for one disc of the body: start (d,) and ends (N, d), world, of its centre's nominal way; normals
-    (n, N, d) and offsets (n, N) about `start`, in the order of `ConstraintSources`, of obstacles that keep_off [m] and
-    measured (d,) have been taken from.
+    """Half-spaces for one disc of the body, in the order of `ConstraintSources`.
+
+    Attributes:
+        start (d,): start of the nominal path of the disc's centre, world [m].
+        ends (N, d): its positions at the ends of the periods, world [m].
+        normals (n, N, d): normals of the half-spaces.
+        offsets (n, N): offsets about `start` [m], already reduced by `keep_off` and `measured`.
+        keep_off: distance to the obstacles [m].
+        measured (d,): bound of the position's measurement error [m].
     """
 
     start: Array

@@ -247,8 +247,9 @@ class Filter:
     def _turned_only(
         self, local_map: LocalMap, z_0: Array, proposal: Array, adjusted: _Candidate | None
     ) -> _Candidate | None:
-        """Return the proposal without the inputs that move the position, if that plan is verified and closer to
-        the proposal than the QP's answer.
+        """Return the proposal without the inputs that move the position, if it is the better candidate.
+
+        It is better if its plan is verified and closer to the proposal than the QP's answer.
         """
         if self.in_place is None:
             return None

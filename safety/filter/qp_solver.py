@@ -29,8 +29,12 @@ EXACT, FIRMNESS = 1e-7, 1e-2
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """`min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`: h, g (n,), A (rows, n), b (rows,). The last `always` of them
-    (bounds and slew) are in every small problem from the start.
+    """The problem `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`.
+
+    Attributes:
+        h, g (n,): diagonal and gradient of the cost.
+        A (rows, n), b (rows,): the constraints.
+        always: number of last rows (bounds and slew) that every reduced problem includes from the start.
     """
 
     h: Array

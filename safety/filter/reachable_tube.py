@@ -20,14 +20,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tube:
-    """The sets that hold the measured position at the end of each period i = 1..N, for regressors z:
+    """The sets that contain the measured position at the end of each period i = 1..N, for regressors z.
 
         p_i ∈ p_0 + R(θ_0) ( P_i z + Σ_l m_l(z) D_{i,l} [-1, 1] ),     m(z) = M |W z| + m_0
 
     so the support in a direction is linear in z and |W z| (docs/method.md §2, equation 2).
 
     Attributes:
-        position (N, d, nz): P. directions (N, d, L): D. W (q, nz).
+        position (N, d, nz): P.
+        directions (N, d, L): D.
+        W (q, nz): W.
         M (L+N+1, q), m_0 (L+N+1,): rows for the L generators, then the N chord deviations β_k, then the stopping
             distance σ.
         more (N, r, nz), more_directions (N, r, L): the same for other predicted coordinates, which a limit or a

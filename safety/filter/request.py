@@ -24,13 +24,13 @@ Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation
-FEW = 64  # numbers
+FEW = 64  # numbers, up to which a loop is faster than NumPy
 NOT_FINITE = "the proposed action holds NaN or infinity"  # the reason of a failsafe
 NOTHING_KNOWN = (
     "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
     "all space within reach is free"
 )
-STOPPED = 0.9e-9  # of an input: surely one of a stop (`Robot.is_stop_input`)
+STOPPED = 0.9e-9  # an input below it surely belongs to a stop (`Robot.is_stop_input`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
@@ -40,14 +40,19 @@ class Request:
     """A request: what the filter must know to decide on one input.
 
     Attributes:
-        state (n,): measured state. action (m,): proposal. input_in_force (m,): input of the period before.
-        plan (N, m): rest of the committed backup plan; in real time, from the input in force on.
+        state (n,): measured state.
+        action (m,): proposal.
+        input_in_force (m,): input of the period before.
+        plan (N, m): rest of the backup plan; in real time, from the input in force on.
         obstacles: at least those within `Filter.reach`.
-        model: version of the model set that verified the plan. Empty if the robot stands; `UNVERIFIED` without one.
+        model: version of the model set that verified the plan. Empty if the robot stands; `UNVERIFIED` if no model set
+            verified the plan.
         predicted: predicted set of this state, from the last decision.
         movers: moving obstacles, at least those that may come within reach before the plan ends.
-        scan: what it does not show to be free counts as occupied.
-        reservation: this robot's, in a world with other robots. other_reservations: theirs.
+        scan: a measurement of free space. All space that it does not show to be free counts as occupied.
+        reservation: the reservation of this robot, in a world with other robots.
+        other_reservations: the reservations of the other robots.
+        observation: the input of a rival's networks; the filter does not need it.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it.
     """
@@ -93,10 +98,17 @@ class Decision:
         plan (N, m): the first row is for now; in real time it is in force, and the second row is for the next period.
         tube_center, tube_half_width (N, d): boxes of the true positions at the ends of the periods, world.
         predicted: set of the next measured state.
-        margin [m]: distance of the tube to the nearest half-space. Of a failsafe, it may be negative although the plan
-            is verified: the plan was verified earlier, and this is the margin from the new measurement.
-        at_least: the margin is only a lower bound, since what is nearest is beyond reach.
+        margin [m]: distance of the tube to the nearest half-space. The margin of a failsafe may be negative although
+            the plan is verified: an earlier decision verified it, but this margin starts from the new measurement.
+        at_least: the margin is only a lower bound, since nothing is within reach.
         model: version of the model set.
+        broken: number of moving obstacles that a sensor saw outside their bounds of motion.
+        blocked_by: the constraint that the proposal violated, if it was not allowed.
+        reservation: the space that this robot reserves against the other robots of its world.
+        bound: the largest share of verified plans that leave their tubes, at 99 % confidence. 1 if the model set states
+            no bound, None if the method verifies nothing.
+        for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
+            unknown.
     """
 
     kind: str
@@ -116,23 +128,20 @@ class Decision:
     verify_ms: float = 0.0
     solver: str = ""
     iterations: int = 0
-    broken: int = 0  # movers that were seen outside of what their bounds allowed
-    blocked_by: BlockingConstraint | None = (
-        None  # for a proposal that was not allowed: what it would have come too near to
-    )
-    reservation: Reservation | None = None  # to the other robots of its world
-    # The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
-    # 1: it states nothing; None: of a method that verifies nothing.
+    broken: int = 0
+    blocked_by: BlockingConstraint | None = None
+    reservation: Reservation | None = None
     bound: float | None = None
-    for_clearance: bool | None = None  # adjusted though the proposal's tube was verified; None: not said
+    for_clearance: bool | None = None
 
 
 def check_for_filter(robot: Robot, request: Request) -> None:
-    """All fields, for our filter; the observation only if there is one.
+    """Check all fields that the filter reads, and the observation if the request has one.
+
+    A proposed action with NaN or infinity passes: the decision on it is a failsafe.
 
     Raises:
-        BadRequest: a value is missing, not finite or of the wrong size, with the field's name. A proposed action with
-        NaN or infinity raises nothing: the decision on it is a failsafe.
+        BadRequest: a value is missing, not finite, out of bounds or of the wrong size. It has the field's name.
     """
     predicted = request.predicted
     further: Named = {"plan": (request.plan, (robot.horizon, robot.action_dim))}
@@ -155,10 +164,10 @@ def check_for_filter(robot: Robot, request: Request) -> None:
 
 
 def check_surroundings(robot: Robot, request: Request) -> None:
-    """Check that a request says something about the space around the robot, of a kind that this robot meets.
+    """Check that a request describes the space around the robot, with the robot's number of dimensions.
 
     Raises:
-        BadRequest: it does not, with the field's name.
+        BadRequest: the description is missing or does not fit the robot. It has the field's name.
     """
     moving = request.movers is not None and len(request.movers)
     if not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
@@ -195,7 +204,7 @@ class FastRequestCheck:
         if not (sized and request.plan.shape == planned):
             return False
         if observed.shape != (0,):
-            # A product that is no number, or infinite, is of an observation in which one is, or which is very large.
+            # The product is NaN or infinite if a value of the observation is, or if a value is very large.
             bounded = observed.ndim == 1 and observed.size <= MOST_OBSERVED
             if not (bounded and math.isfinite(np.dot(observed, observed))):
                 return False
@@ -215,7 +224,7 @@ def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
     """Check the fields that the rivals read; `observed` is the number of values that the rival's networks observe.
 
     Raises:
-        BadRequest: a value is missing, not finite or of the wrong size, with the field's name.
+        BadRequest: a value is missing, not finite or of the wrong size. It has the field's name.
     """
     _check_motion(robot, request, {"observation": (request.observation, (observed,))})
 
@@ -248,6 +257,6 @@ def _sized(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tup
 def _finite(robot: Robot, named: Named) -> None:
     for name, (value, shape) in named.items():
         _sized(robot, name, value, shape)
-        few = value.size <= FEW  # sooner looked at one by one
+        few = value.size <= FEW  # faster in a loop
         if not (all(map(math.isfinite, value.ravel().tolist())) if few else np.isfinite(value).all()):
             raise BadRequest(name, f"{name} holds NaN or infinity")

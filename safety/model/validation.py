@@ -1,6 +1,6 @@
 """Validate a model set on held-out plans, at 99 % confidence (docs/method.md §12).
 
-A statement about the distribution that was recorded, and about no other.
+The resulting statement holds for the recorded distribution only.
 """
 
 from __future__ import annotations
@@ -42,13 +42,15 @@ Array = NDArray[np.float64]
 
 EPISODE = 300  # steps
 HOUR = 3600.0  # s
-CHUNK = 256  # windows at once: an exact matrix zonotope has thousands of atoms
+CHUNK = 256  # windows at once, since an exact matrix zonotope has thousands of generators
 
 
 @dataclass(frozen=True)
 class ValidationReport:
-    """Of one model set. The unit is a plan window that overlaps no other and whose stop was recorded for a period at
-    least; a violation is any part of it outside.
+    """The validation of one model set on held-out plan windows (docs/method.md §12).
+
+    The windows do not overlap, and each includes at least one recorded period after its stop. A window is a violation
+    if any part of it is outside its predicted set.
     """
 
     certificate: str
@@ -59,39 +61,48 @@ class ValidationReport:
     smallest_singular: float
     condition: float
     windows: int  # held out
-    violations: int  # windows of which a step, the chord deviation or the stopping distance was outside
-    step_violations: int  # windows of which the first step was outside, in any coordinate
+    violations: int  # windows with a step, chord deviation or stopping distance outside
+    step_violations: int  # windows whose first step was outside, in any coordinate
     bound_step: float  # probability that a step's measured state is outside, at 99 % confidence
-    bound_plan: float  # the same of any part of a plan
-    bound_episode: float  # of any step in an episode of `EPISODE`, from bound_step, if steps were independent
-    outside_episode: float  # steps outside in such an episode, on average, at most; from bound_step, independent or not
-    outside_hour: float  # the same in an hour of driving
-    half_width_rest: float  # m, of a full stop, largest axis, position noise of the estimate not included
+    bound_plan: float  # the same for any part of a plan
+    bound_episode: float  # the same for any of `EPISODE` steps, from bound_step, if steps were independent
+    outside_episode: float  # bound on the mean number of steps outside in `EPISODE` steps, from bound_step
+    outside_hour: float  # the same for an hour of driving
+    half_width_rest: float  # m, for a full stop, largest axis, without the position noise of the estimate
     half_width_full: float
-    clearance_margin: float  # m, kept to obstacles while driving so that turning in place stays possible
-    excess: float  # the largest share of its set that any part of a held-out plan came to; above 1: it was outside
-    in_place_windows: int = 0  # of the windows those of turning on the spot, which have predictors of their own
+    clearance_margin: float  # m, distance to obstacles that leaves the robot room to turn in place
+    excess: float  # largest ratio of an error to its bound in any held-out plan; above 1: outside
+    in_place_windows: int = 0  # windows that turn in place, which have separate predictors; included in `windows`
     in_place_violations: int = 0
     bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
-    inflation: float = 1.0  # of the envelopes that the model set was made with
-    leaving: tuple[
-        ViolationGroup, ...
-    ] = ()  # where the violations are: by which coordinate, and how the robot drove then
+    inflation: float = 1.0  # factor on the envelopes of the model set
+    leaving: tuple[ViolationGroup, ...] = ()  # the violations by coordinate and driving regime
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def upper_bound(violations: int, count: int) -> float:
-    """Clopper-Pearson: the largest probability with which so few violations are not surprising at 99 % confidence."""
+    """Return the upper Clopper-Pearson bound on the probability of a violation, at 99 % confidence.
+
+    Args:
+        violations: number of violations.
+        count: number of independent trials.
+    """
     if count == 0 or violations >= count:
         return 1.0
     return float(betaincinv(violations + 1, count - violations, CONFIDENCE))
 
 
 def most_violations(count: int, limit: float) -> int:
-    """The most violations among so many held-out plans with which the bound is still within the limit; -1: even none
-    would be too many, for there are too few plans.
+    """Return the largest number of violations for which the bound is still within a limit.
+
+    Args:
+        count: number of held-out plans.
+        limit: largest accepted probability of a violation.
+
+    Returns:
+        The number of violations, or -1 if the plans are too few even without a violation.
     """
     most = -1
     while most + 1 < count and upper_bound(most + 1, count) <= limit:
@@ -100,12 +111,21 @@ def most_violations(count: int, limit: float) -> int:
 
 
 def validate(model: ModelSet, fitted: Dataset, held_out: Dataset) -> ValidationReport:
-    """The statement of a model set made from `fitted` about trajectories that it has not seen."""
+    """Validate a model set fitted to `fitted` on the trajectories of `held_out`."""
     return validate_plans(model, fitted, held_out)[0]
 
 
 def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple[ValidationReport, Array]:
-    """The statement, and of each held-out plan the largest share of its set that any part of it came to (plans,)."""
+    """Validate a model set, and return the excess of each held-out plan too.
+
+    Args:
+        model: the model set.
+        fitted: the data set to which it was fitted.
+        held_out: trajectories that are not in `fitted`.
+
+    Returns:
+        The validation report, and for each plan the largest ratio of an error to its bound (plans,).
+    """
     robot, ready, kind = model.robot, Filter(model), model.model_config.windows
     turning = model.turning()
     made_of = windows(fitted, robot.horizon, kind)
@@ -122,7 +142,7 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
     parts = [""] * len(plans)
 
     def take(places: NDArray[np.intp], shares: Array, names: list[str]) -> None:
-        """Of the plans at these places the part that came to the largest share so far; shares (places, names)."""
+        """Update the largest ratio, and the part with it, for the plans `places`; shares (places, names)."""
         worst, largest = shares.argmax(1), shares.max(1)
         for row in np.flatnonzero(largest > excess[places]):
             parts[places[row]] = names[worst[row]]
@@ -175,25 +195,25 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
 
 
 def _share(off: Array, half: Array) -> Array:
-    """How much of half a set's width something is off its middle; of a set without a width nothing, or all."""
+    """Return the ratio of an error to its half-width: 0 without an error, infinite if only the half-width is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(off > 0.0, off / half, 0.0)
 
 
 def _first_excess(model: ModelSet, w: Windows) -> Array:
-    """How much of its predicted set each coordinate of the state comes to after one period. (T, n)."""
+    """Return the ratio (T, n) of error to bound for each coordinate of the state after one period."""
     z = w.z if model.model_config.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
     return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
 
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
-    """What the model set's certificates predict of these windows."""
+    """Return the outputs of these windows that the model set's error bounds cover."""
     return predicted_outputs(model.robot, w.y) if model.model_config.mode == DIRECT else w.y
 
 
 def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, list[str]]:
-    """Return the share of its bound (T, parts) that each part comes to after k periods, and the names of the parts.
+    """Return the ratio (T, parts) of error to bound for each part after k periods, and the names of the parts.
 
     The parts are position and further coordinates of the tube, chord deviation, and, at the end, stopping distance.
     """

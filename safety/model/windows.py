@@ -233,7 +233,7 @@ def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
         kind: `PLAN` or `FREE`.
 
     Returns:
-        At most the horizon: in particular for `FREE` windows, or if the robot still moved at the end of a plan.
+        A number of periods. It is the horizon for `FREE` windows, and if the robot still moved at a plan's last period.
     """
     robot = data.robot
     speeds, none = list(robot.regressor), np.asarray(robot.measurement_bound)[list(robot.regressor)]

@@ -34,8 +34,9 @@ class _StoredImage:
 
     @cached_property
     def free(self) -> tuple[float, Single]:
-        """The lowest ring's elevation [rad], and free ranges (len(DRIFT_ANGLES), E, A) [m]: entry k is the least free
-        range of all directions within `DRIFT_ANGLES[k]` of a patch.
+        """The lowest ring's elevation [rad], and the free ranges (len(DRIFT_ANGLES), E, A) [m].
+
+        Entry k of the ranges is the least free range of all directions within `DRIFT_ANGLES[k]` of a patch.
         """
         grid, free = patch_free_ranges(self.image)
         patch, step = 2.0 * grid.half_diagonal, self.image.step[0]

@@ -59,8 +59,9 @@ class PlanAuthenticator:
         return cls(secrets.token_bytes(KEY_SIZE))
 
     def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
-        """Return the tokens of a decision: one for each of the next periods. The last token stays valid: from there on,
-        the plan's tail no longer changes.
+        """Return the tokens of a decision, one for each of the next periods.
+
+        The last token stays valid, since from there on the plan's tail no longer changes.
         """
         m, n = robot.action_dim, robot.horizon
         plan = list(decision.plan)

@@ -66,6 +66,7 @@ class SignedModel:
 
 
 def seal_of(path: Path) -> Path:
+    """Return the path of the seal of a model's file."""
     return path.with_suffix(".seal")
 
 

@@ -62,7 +62,9 @@ class Autopilot:
         lidar: Lidar | None = None,
         quiet: bool = False,
     ) -> None:
-        """Args:
+        """Connect the autopilot to a vehicle.
+
+        Args:
             rules: `px4` or `ardupilot`.
             system: MAVLink system id.
             parameters: values that replace the defaults.

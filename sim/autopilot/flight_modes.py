@@ -19,6 +19,8 @@ ROUNDING = 1e-6  # s
 
 
 class Mode(Enum):
+    """The flight modes."""
+
     MANUAL = "manual"  # by sticks; there are none
     HOLD = "hold"
     POSITION = "position"  # by sticks; there are none, so the vehicle holds
@@ -29,6 +31,8 @@ class Mode(Enum):
 
 
 class LandedState(Enum):
+    """The states of MAV_LANDED_STATE."""
+
     ON_GROUND = "on the ground"
     TAKING_OFF = "taking off"
     IN_AIR = "in the air"

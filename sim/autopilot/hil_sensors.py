@@ -1,5 +1,6 @@
-"""Simulate the sensors of a real autopilot from the true state: IMU, magnetometer, barometer and GPS, as HIL_SENSOR and
-HIL_GPS messages.
+"""Simulate the sensors of a real autopilot from the true state.
+
+IMU, magnetometer and barometer become HIL_SENSOR messages, GPS becomes HIL_GPS messages.
 """
 
 from __future__ import annotations

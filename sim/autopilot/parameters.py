@@ -14,8 +14,10 @@ INTEGER, REAL = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 
 @dataclass(frozen=True)
 class Parameter:
+    """A parameter with its default value, its range and its description."""
+
     name: str
-    value: float  # by default
+    value: float  # default
     low: float
     high: float
     description: str

@@ -36,8 +36,10 @@ def rows(
     extra: Index,
     sizes: int,
 ) -> tuple[Array, Array, Array]:
-    """Return gradient (n·E, nz), spread (n·E, sizes) and bound (n·E,) of the rows (3) of half-spaces a (n, N, d),
-    b (n, N).
+    """Return the rows (3) of half-spaces with normals a (n, N, d) and offsets b (n, N).
+
+    Returns:
+        Gradient (n·E, nz), spread (n·E, sizes) and bound (n·E,).
     """
     n, ends, d, nz = len(normals), len(period), end_maps.shape[1], end_maps.shape[2]
     gradient, spread, bound = np.zeros((n * ends, nz)), np.zeros((n * ends, sizes)), np.empty(n * ends)
