@@ -241,7 +241,7 @@ class Filter:
                 break
         adjusted = self._turned_only(local_map, z_0, proposal, adjusted) or adjusted
         if adjusted is None:
-            record.reason += "; no verified input was candidate"
+            record.reason += "; no verified input was found"
         return adjusted
 
     def _turned_only(

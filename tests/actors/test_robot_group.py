@@ -49,9 +49,9 @@ def begin_close_together(fleet, seed=0):
     for i, robot in enumerate(fleet.world.world.robots):
         angle = 2.0 * np.pi * i / size
         robot._qpos[:2] = spot + 0.4 * np.array([np.cos(angle), np.sin(angle)])
-        robot.wake(None, np.random.default_rng(i))
+        robot.start_estimation(None, np.random.default_rng(i))
         runner = fleet.runners[i]
-        runner.info = runner.info | {"state": robot.measured, "others": fleet.world.others(i)}
+        runner.info = runner.info | {"state": robot.measured, "others": fleet.world.other_states(i)}
 
 
 def least_distance(fleet):

@@ -11,7 +11,7 @@ import pytest
 from brakeline.errors import Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
-from brakeline.messaging.bus.query_client import HELD, Asker
+from brakeline.messaging.bus.query_client import HELD, QueryClient
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import DECIDE, STEP
 from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
@@ -85,9 +85,9 @@ class _Silent:
 def test_a_question_that_ends_without_a_word_is_late_after_its_deadline_and_unheard_before(monkeypatch):
     monkeypatch.setattr("zenoh.SourceInfo", lambda *_: None)
     with pytest.raises(Late, match="within 20 ms"):
-        Asker(_Silent(0.03)).ask("a/key", b"", 0.02)
+        QueryClient(_Silent(0.03)).ask("a/key", b"", 0.02)
     with pytest.raises(NoReply):
-        Asker(_Silent(0.0)).ask("a/key", b"", 5.0)
+        QueryClient(_Silent(0.0)).ask("a/key", b"", 5.0)
 
 
 def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:

@@ -39,7 +39,7 @@ def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, 
         stranger = brakeline("query", "ground", "--connect", endpoint, "--keys", parts / "actor-0")
         assert stranger.returncode == 1 and "no keys of client" in stranger.stderr
         node = Ros2Command(connect=(endpoint,), keys=parts / "client")
-        with node._question(Ros2Settings("ground", lead=30.0)) as question:
+        with node._asker(Ros2Settings("ground", lead=30.0)) as question:
             (reply,) = question([pb.Request(robot="ground")])
         assert reply.error.field == "plan", "a ROS robot's questions are heard, and this one was empty"
     finally:

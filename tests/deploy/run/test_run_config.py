@@ -111,9 +111,9 @@ def test_a_resumed_run_keeps_its_configuration_but_for_the_steps(tmp_path: Path)
 def test_an_impossible_world_is_refused_before_anything_starts() -> None:
     scans = Conditions(perception=Perception("scan"))
     for wrong, said in (
-        ({"fleet": 2, "arena": "walkers"}, "things that move"),
+        ({"fleet": 2, "arena": "walkers"}, "obstacles that move"),
         ({"fleet": 2, "arena": "crossing", "conditions": scans}, "a scan shows other robots as walls"),
-        ({"fleet": 2, "robots": ("quadrotor",), "arena": "default"}, "several quadrotor robots"),
+        ({"fleet": 2, "robots": ("quadrotor",), "arena": "default"}, "only ground robots can share a world"),
         ({"robots": ("ground", "ground+tracks")}, "each robot once, with one task"),
         ({"robots": ("ground+trucks",)}, r"there is no ground\+trucks"),
     ):
