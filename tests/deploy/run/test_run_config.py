@@ -115,7 +115,7 @@ def test_an_impossible_world_is_refused_before_anything_starts() -> None:
         ({"fleet": 2, "arena": "crossing", "conditions": scans}, "a scan shows other robots as walls"),
         ({"fleet": 2, "robots": ("quadrotor",), "arena": "default"}, "only ground robots can share a world"),
         ({"robots": ("ground", "ground+tracks")}, "each robot once, with one task"),
-        ({"robots": ("ground+trucks",)}, r"there is no ground\+trucks"),
+        ({"robots": ("ground+trucks",)}, r"there is no task ground\+trucks"),
     ):
         with pytest.raises(ValueError, match=said):
             RunConfig(**wrong)
