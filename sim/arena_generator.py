@@ -36,7 +36,11 @@ def bounds_of(kind: ArenaKind) -> tuple[tuple[float, float], ...]:
 
 
 def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
-    """Return the kind of a robot's arena. Raises UnknownArena: the robot has no arena of this name."""
+    """Return the kind of a robot's arena.
+
+    Raises:
+        UnknownArena: the robot has no arena of this name.
+    """
     kinds = robot.task.arenas
     if name not in kinds:
         names = ", ".join(sorted(kinds)) or "none"
@@ -101,7 +105,11 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
 def _fleet_ends(
     kind: ArenaKind, shapes: Shapes, rng: np.random.Generator, robot: Robot, size: int
 ) -> tuple[Array, Array] | None:
-    """Draw starts and goals (size, d): opposite each other on the kind's ring, or anywhere; None: no room."""
+    """Draw starts and goals (size, d), opposite each other on the kind's ring, or anywhere.
+
+    Returns:
+        Starts and goals [m], or None if there is no room.
+    """
     low, high = np.array(bounds_of(kind)).T
     clear = robot.footprint + kind.start_clearance
     apart = 2.0 * clear
@@ -123,7 +131,10 @@ def _fleet_ends(
 
 
 def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Arena:
-    """Add moving obstacles at free positions off the start; fewer than the least if there is no room."""
+    """Add moving obstacles at free positions away from the start.
+
+    If there is no room, the arena gets fewer of them than the kind's least number.
+    """
     low, high = np.array(arena.bounds).T
     points = rng.uniform(low, high, (POINTS, arena.dim))
     free = arena.shapes.distance(points).min(axis=0) >= kind.radius + MOVER_GAP
@@ -156,7 +167,11 @@ def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: Rob
 
 
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
-    """Draw obstacles with gaps between their plans, the room's boundary last; None: too few of them found room."""
+    """Draw obstacles with gaps between their outlines.
+
+    Returns:
+        The obstacles, then the room's boundary. None if too few obstacles fit.
+    """
     walls = room_boundary(kind.half_width, None)
     placed: list[Obstacle] = []
     least = 2.0 * robot.footprint + kind.gap
@@ -174,7 +189,7 @@ def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obs
 
 
 def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Obstacle:
-    """Draw the plan of an obstacle at least `least` m from the walls, apart from the corners of boxes."""
+    """Draw the outline of an obstacle at least `least` m from the walls; corners of boxes may be nearer."""
     if shape == BOX:
         length, width = rng.uniform(*kind.edge, 2)
         size: tuple[float, ...] = (float(length), float(length if kind.square else width))

@@ -102,7 +102,12 @@ class VelocityAxis:
     )  # fmt: skip
 
     def __init__(self, gains: Gains, period: float, lag: float) -> None:
-        """period: s between two updates; lag: s until the vehicle has a commanded acceleration."""
+        """Start at rest.
+
+        Args:
+            period: time between two updates [s].
+            lag: time until the vehicle reaches a commanded acceleration [s].
+        """
         self._gains, self._period = gains, period
         self._ramped, self._rounded = (
             MovingAverage(round(gains.ramp / period)),
@@ -164,7 +169,12 @@ class FlightController:
     def __init__(
         self, period: float, outer_every: int, gains: Gains | None = None, body: Airframe | None = None
     ) -> None:
-        """period: s between two updates; outer_every: updates of the attitude loop for one of the velocity loop."""
+        """Start at rest.
+
+        Args:
+            period: time between two updates [s].
+            outer_every: updates of the attitude loop for each update of the velocity loop.
+        """
         self.gains, self.body = gains or Gains(), body or Airframe()
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every

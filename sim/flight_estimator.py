@@ -40,7 +40,11 @@ class FlightEstimator:
     """
 
     def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
-        """steps: number of calls of `advance` in a period."""
+        """Draw the first errors.
+
+        Args:
+            steps: number of calls of `advance` in a period.
+        """
         self.noise, self._rng, self._steps = noise, rng, steps
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
         self.errors = self._next = self._draw()
@@ -62,7 +66,7 @@ class FlightEstimator:
     def read(
         self, position: Vector, velocity: Vector, attitude: Quaternion, rates: Vector, acceleration: Vector
     ) -> Estimate:
-        """Return the estimate of a true state. acceleration: in the world [m/s²]."""
+        """Return the estimate of a true state; `acceleration` is in the world frame [m/s²]."""
         e = self.errors
         white = cut_normal(self._rng, self.noise.scale, (6,)).tolist()
         ax, ay, az = acceleration

@@ -74,7 +74,11 @@ class RealtimeGroundRobot(GroundRobot):
     def __init__(
         self, arena: Arena, rng: np.random.Generator, noise: NoiseLevels | None = None, **physics: float
     ) -> None:
-        """physics: `payload_kg` and `floor_friction`, as `GroundRobot` takes them."""
+        """Place the robot at the start of an arena.
+
+        Args:
+            physics: `payload_kg` and `floor_friction`, as for `GroundRobot`.
+        """
         super().__init__(arena, rng, noise, **physics)
         self.realtime_estimator = RealtimeEstimator(
             noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME
@@ -127,7 +131,11 @@ class SpinningLidar:
         farthest: float = 3.5,
         mount: float = -0.032,
     ) -> None:
-        """noise: standard deviation of a range [m]."""
+        """Start the first turn.
+
+        Args:
+            noise: standard deviation of a range [m].
+        """
         self.nearest, self.farthest, self.mount = nearest, farthest, mount
         self.gap = 2.0 * math.pi / beams
         angles = self.gap * np.arange(beams)

@@ -41,7 +41,12 @@ class TurtleBot:
     """
 
     def __init__(self, arena: Arena, data: mujoco.MjData, number: int = 0) -> None:
-        """data: of a model whose first bodies are TurtleBots; number: which one of them this is."""
+        """Use one robot of a compiled model.
+
+        Args:
+            data: data of a model whose first bodies are TurtleBots.
+            number: index of this robot among them.
+        """
         q, v, u = COORDINATES * number, SPEEDS * number, GROUND.action_dim * number
         self.arena = arena
         self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
@@ -153,7 +158,11 @@ class GroundRobot(TurtleBot):
         self.start_estimation(noise, rng)
 
     def alter(self, **changes: float) -> None:
-        """Change `payload_kg`, `floor_friction` or both, from now on. Raises ValueError for any other name."""
+        """Change `payload_kg`, `floor_friction` or both, from now on.
+
+        Raises:
+            ValueError: the name is another one.
+        """
         setters = {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
         if unknown := changes.keys() - setters.keys():
             raise ValueError(f"a ground robot has no {', '.join(sorted(unknown))}; it has: {', '.join(setters)}")
@@ -195,6 +204,6 @@ class GroundRobot(TurtleBot):
 
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
-    """Return what makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
+    """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
     c = conditions
     return partial(GroundRobot, noise=c.noise, payload_kg=c.payload_kg, floor_friction=c.floor_friction)

@@ -78,7 +78,7 @@ class MoverBodies:
         return bool(self._bodies)
 
     def place(self, time: float) -> None:
-        """Move them to their positions at a time [s]."""
+        """Move the obstacles to their positions at a time [s]."""
         if self._crowd is not None:
             positions, _ = self._crowd.at(max(time, 0.0))
             self._data.mocap_pos[self._bodies, : positions.shape[1]] = positions
@@ -104,7 +104,10 @@ class MoverBodies:
 
     @property
     def pushed(self) -> bool:
-        """Whether a mover pushed the robot in this period; then a contact with a static obstacle is not its fault."""
+        """Whether a mover pushed the robot in this period.
+
+        The robot is then not responsible for a contact with a static obstacle.
+        """
         return self._pushes and any(self.contacts)
 
 

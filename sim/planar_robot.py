@@ -35,7 +35,13 @@ class PlanarRobot:
     def __init__(
         self, robot: Robot, model: str, height: float, arena: Arena, rng: np.random.Generator, noise: NoiseLevels
     ) -> None:
-        """model: MJCF; height: m, of the base's origin above the floor; noise: only its `scale` matters."""
+        """Place the robot at the start of an arena.
+
+        Args:
+            model: MJCF of the robot.
+            height: height of the base's origin above the floor [m].
+            noise: only its `scale` has an effect.
+        """
         self.robot, self.arena = robot, arena
         self._physics = FloorPhysics(model, height, arena, robot.period / SAMPLES, robot.period)
         self.model, self.data = self._physics.model, self._physics.data
@@ -89,7 +95,11 @@ class PlanarRobot:
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
 
     def alter(self, **changes: float) -> None:
-        """Raises ValueError: this robot has nothing to change, unless a subclass says so."""
+        """Refuse every change; a subclass may allow some.
+
+        Raises:
+            ValueError: always.
+        """
         if changes:
             raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(changes))}")
 
@@ -115,7 +125,7 @@ class PlanarRobot:
         return np.array([*self.data.qpos[:2], self.heading(), *self.speeds()])
 
     def _measure(self) -> Array:
-        """Return the true state with errors: their standard deviation is half the bound, where they are cut off."""
+        """Return the true state with normal errors, truncated at their bounds of two standard deviations."""
         measured = self.true + cut_normal(self._rng, 0.5 * self._noise, self._bound.shape) * self._bound
         measured[2] = wrap(float(measured[2]))
         return np.asarray(measured)

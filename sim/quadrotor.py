@@ -53,7 +53,11 @@ class Quadrotor:
         gains: Gains | None = None,
         floor: float | None = None,
     ) -> None:
-        """floor: m, height of a plane to start from and to land on; None: no plane, and the vehicle starts hovering."""
+        """Place the vehicle at the start of an arena.
+
+        Args:
+            floor: height of a plane to start from and to land on [m]. Without one, the vehicle starts hovering.
+        """
         self.arena = arena
         self._model = _build(arena, floor)
         self._data = mujoco.MjData(self._model)

@@ -135,7 +135,11 @@ class DomeScanner(Scanner[RangeImage]):
     def __init__(
         self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
     ) -> None:
-        """Raises ValueError: tracks were asked for."""
+        """Make a scanner without tracks.
+
+        Raises:
+            ValueError: the conditions ask for tracks.
+        """
         if perception.tracks:
             raise ValueError("no tracker works in space: leave out --tracks")
         beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
@@ -170,5 +174,9 @@ def _random_rotation(rng: np.random.Generator, most: float) -> Array:
 def make_scanner(
     robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
 ) -> FanScanner | DomeScanner:
-    """Return the scanner of a robot in the plane or in space. Raises ValueError: it cannot carry one."""
+    """Return the scanner of a robot in the plane or in space.
+
+    Raises:
+        ValueError: the robot cannot carry a scanner.
+    """
     return (FanScanner if robot.position_dim == 2 else DomeScanner)(robot, arena, rng, noise, perception)

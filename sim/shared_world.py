@@ -47,11 +47,19 @@ class FleetRobot(TurtleBot):
     """One robot of a world; only the world advances it."""
 
     def step(self, input: Array) -> Period:
-        """Raises RuntimeError: step the world instead."""
+        """Refuse to step one robot alone; step the world instead.
+
+        Raises:
+            RuntimeError: always.
+        """
         raise RuntimeError("step the robot's world: it advances all robots together")
 
     def alter(self, **changes: float) -> None:
-        """Raises ValueError: the conditions of a fleet are fixed when its world is made."""
+        """Refuse every change, since the world fixes the conditions of its fleet.
+
+        Raises:
+            ValueError: always.
+        """
         if changes:
             raise ValueError(f"a robot of a fleet cannot change {', '.join(sorted(changes))} during a run")
 
@@ -65,7 +73,12 @@ class GroundWorld:
     """
 
     def __init__(self, arenas: Sequence[Arena], rngs: Sequence[np.random.Generator], conditions: Conditions) -> None:
-        """arenas: the same room with different starts and goals; rngs: the sources of each robot's sensor errors."""
+        """Place a robot at the start of each arena.
+
+        Args:
+            arenas: the same room with different starts and goals.
+            rngs: the sources of each robot's sensor errors.
+        """
         self._model = _build(arenas, conditions)
         self._data = mujoco.MjData(self._model)
         self.robots = [FleetRobot(arena, self._data, i) for i, arena in enumerate(arenas)]

@@ -53,7 +53,7 @@ class Crowd:
 
     @property
     def pushes(self) -> bool:
-        """Whether it pushes a robot that it runs into, instead of stepping over it."""
+        """Whether a moving obstacle pushes a robot that it runs into, instead of stepping over it."""
         return not self.kind.steps_over
 
     def at(self, time: float) -> tuple[Array, Array]:
@@ -66,12 +66,12 @@ class Crowd:
         return position + velocity * t + 0.5 * acceleration * t * t, velocity + acceleration * t
 
     def obstacles(self, time: float) -> tuple[Obstacle, ...]:
-        """Return them as obstacles at a time [s], without their motion."""
+        """Return the crowd as obstacles at a time [s], without their motion."""
         kind = SPHERE if self.dim == 3 else CYLINDER
         return tuple(Obstacle(kind, tuple(position), (self.kind.radius,)) for position in self.at(time)[0].tolist())
 
     def _draw_wishes(self, positions: Array) -> Array:
-        """Draw the velocities (n, d) that they want."""
+        """Draw the desired velocities (n, d) [m/s]."""
         direction = self._rng.normal(size=positions.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         count = len(direction)
@@ -95,7 +95,7 @@ class Crowd:
         self._next = position + velocity * TICK + 0.5 * acceleration * TICK * TICK, after
 
     def _can_stop(self, position: Array, velocity: Array) -> NDArray[np.bool_]:
-        """Return whether each can stop before every static obstacle, (n,)."""
+        """Return whether each obstacle of the crowd can stop before every static obstacle, as a mask (n,)."""
         if not len(self._static):
             return np.ones(len(position), dtype=bool)
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
@@ -130,7 +130,7 @@ class OtherRobots:
         return positions, np.zeros_like(positions)
 
     def obstacles(self, time: float) -> tuple[Obstacle, ...]:
-        """Return them as obstacles at their present positions."""
+        """Return the robots as obstacles at their present positions."""
         return tuple(Obstacle(CYLINDER, tuple(position), (self._radius,)) for position in self.at(time)[0].tolist())
 
 
@@ -143,7 +143,7 @@ class CrowdSensor:
         self._last_time = 0.0
 
     def measure(self, time: float) -> tuple[Obstacle, ...]:
-        """Return all of them with their motion, as measured at a time [s]."""
+        """Return the crowd with its motion, as measured at a time [s]."""
         kind, shape = self._crowd.kind, SPHERE if self._crowd.dim == 3 else CYLINDER
         positions, velocities = self._crowd.at(time)
         positions = positions + self._errors(kind.position_error)

@@ -94,7 +94,11 @@ class AutopilotRules:
         flight.arm()
 
     def take_off(self, flight: FlightStateMachine, altitude: float) -> None:
-        """Take off. altitude: param7 of NAV_TAKEOFF [m]: above sea level (PX4; NaN: default) or above home."""
+        """Take off.
+
+        Args:
+            altitude: param7 of NAV_TAKEOFF [m]. PX4 reads it above sea level (NaN: default), ArduCopter above home.
+        """
         if self.has_takeoff_mode:
             flight.change(Mode.TAKEOFF)
             default = flight.home[2] + flight.limits.takeoff_height
@@ -132,7 +136,7 @@ class AutopilotRules:
         return None
 
     def _fault(self, target: Target) -> str | None:
-        """Return what is wrong with the frame or the mask of a setpoint, None if they are valid."""
+        """Return the error in the frame or the mask of a setpoint, or None if they are valid."""
         mask, frame = target.type_mask, target.coordinate_frame
         if frame not in self.local_frames + self.body_frames:
             return f"coordinate frame {frame} unsupported"

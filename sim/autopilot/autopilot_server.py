@@ -35,7 +35,12 @@ class TruthSender:
         self._address = (host, port)
 
     def send(self, system: int, time: float, vehicle: Quadrotor, collisions: int) -> None:
-        """Send one datagram. time: s since the autopilot started; collisions: contacts that began since then."""
+        """Send one datagram.
+
+        Args:
+            time: time since the autopilot started [s].
+            collisions: number of contacts that began since then.
+        """
         state = vehicle.state()
         clearance = float(vehicle.clearance(state[:3]))
         message = {

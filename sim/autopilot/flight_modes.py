@@ -104,7 +104,11 @@ class FlightStateMachine:
         return self.time - self.last_setpoint <= self.limits.setpoint_timeout + ROUNDING
 
     def arm(self) -> None:
-        """Raises RequestRefused: the estimate is not ready yet."""
+        """Arm the vehicle.
+
+        Raises:
+            RequestRefused: the estimate is not ready yet.
+        """
         if self.armed:
             return
         if self.time < READY_AFTER:
@@ -116,7 +120,11 @@ class FlightStateMachine:
             self._leave_floor(LandedState.TAKING_OFF)
 
     def disarm(self, force: bool = False) -> None:
-        """Stop the rotors. Raises RequestRefused: the vehicle is in the air, and `force` is false."""
+        """Stop the rotors.
+
+        Raises:
+            RequestRefused: the vehicle is in the air, and `force` is false.
+        """
         if self.landed is not LandedState.ON_GROUND and not force:
             raise RequestRefused("not landed")
         if self.armed:
@@ -139,13 +147,16 @@ class FlightStateMachine:
             self.landed = LandedState.LANDING
 
     def take_off(self, height: float) -> None:
-        """Climb to a height [m, in the world] and hold it; if not armed yet, when armed."""
+        """Climb to a height in the world [m] and hold it. A disarmed vehicle climbs once it is armed."""
         self._takeoff_height = height
         if self.armed and self.landed is LandedState.ON_GROUND:
             self._leave_floor(LandedState.TAKING_OFF)
 
     def receive_setpoint(self, setpoint: Setpoint) -> None:
-        """Take a setpoint; the vehicle follows it in offboard mode, which it returns to after a loss of setpoints."""
+        """Follow a setpoint in offboard mode, and ignore it in other modes.
+
+        After a loss of setpoints, the next setpoint returns the vehicle to offboard mode.
+        """
         self.last_setpoint = self.time
         if self._lost_setpoints:
             self.announcements.append("Setpoints again")

@@ -65,7 +65,11 @@ class HilSensors:
     def __init__(
         self, noise: SensorNoise, rng: np.random.Generator, period: float, rates: SensorRates | None = None
     ) -> None:
-        """period: s between two readings of the IMU."""
+        """Draw the biases.
+
+        Args:
+            period: time between two readings of the IMU [s].
+        """
         rates = rates or SensorRates()
         self.noise, self._rng = noise, rng
         self._every = [round(1.0 / rate / period) for rate in (rates.magnetometer, rates.barometer, rates.gps)]

@@ -75,7 +75,12 @@ class Parameters:
     """The parameters of one vehicle, by name."""
 
     def __init__(self, table: tuple[Parameter, ...], bitwise: bool) -> None:
-        """bitwise: the 32 bits of an integer travel in place of the float's (PX4), not its value (ArduPilot)."""
+        """Start with the defaults.
+
+        Args:
+            bitwise: whether a message has an integer's 32 bits in place of the float's (PX4), or its value as a float
+                (ArduPilot).
+        """
         self.table, self.bitwise = table, bitwise
         self._values = {parameter.name: parameter.value for parameter in table}
 
@@ -83,14 +88,22 @@ class Parameters:
         return self._values[name]
 
     def index(self, name: str) -> int:
-        """Return the index of a parameter in the table. Raises BadParameter: it does not exist."""
+        """Return the index of a parameter in the table.
+
+        Raises:
+            BadParameter: the parameter does not exist.
+        """
         for index, parameter in enumerate(self.table):
             if parameter.name == name:
                 return index
         raise BadParameter(f"no parameter {name}")
 
     def set(self, name: str, value: float) -> None:
-        """Set a value. Raises BadParameter: it does not exist, or the value is not finite or out of range."""
+        """Set a value.
+
+        Raises:
+            BadParameter: the parameter does not exist, or the value is not finite or out of range.
+        """
         parameter = self.table[self.index(name)]
         if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
             raise BadParameter(f"{name} is {parameter.low:g} to {parameter.high:g}")
@@ -107,7 +120,11 @@ class Parameters:
         )
 
     def decode(self, name: str, value: float, kind: int) -> float:
-        """Decode a value that came in PARAM_SET. Raises BadParameter: the type is not the parameter's."""
+        """Decode the value of a PARAM_SET message.
+
+        Raises:
+            BadParameter: the message has another type than the parameter.
+        """
         parameter = self.table[self.index(name)]
         if not self.bitwise:
             return value

@@ -111,11 +111,11 @@ class Px4Process:
         return self._process.poll() is None
 
     def last_output(self) -> str:
-        """Return the end of its output."""
+        """Return the end of PX4's output."""
         return "\n".join(self.log.read_text(errors="replace").strip().splitlines()[-8:])
 
     def close(self) -> None:
-        """End PX4, and delete its files."""
+        """End PX4, and delete its temporary files."""
         self.connection.close()
         self._end()
 

@@ -70,7 +70,7 @@ class TelemetryBuilder:
 
     @property
     def estimate(self) -> Estimate:
-        """The estimate now; all messages of one moment share it."""
+        """The present estimate, which all messages of one moment share."""
         now = self._flight.time
         if self._estimate is None or self._estimate[0] != now:
             self._estimate = (now, self._flight.vehicle.estimate())
