@@ -126,7 +126,11 @@ def test_a_value_that_is_not_a_number_is_never_the_least():
 @pytest.mark.skipif(os.environ.get("NUMBA_BOUNDSCHECK") == "1", reason="this process checks the indices already")
 def test_no_kernel_reads_or_writes_outside_its_arrays(tmp_path):
     """Run the twins' tests once more with kernels that check every index. Compiled kernels do not, by default."""
-    environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = os.environ | {
+        "NUMBA_BOUNDSCHECK": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": str(HERE.parents[1]),
+    }
     tests = [str(HERE / name) for name in ("test_filter_kernels.py", "test_halfspace_kernels.py")]
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *tests]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

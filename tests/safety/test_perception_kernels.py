@@ -195,7 +195,11 @@ def test_without_a_folder_for_the_cache_each_process_compiles(monkeypatch):
 @pytest.mark.skipif("NUMBA_BOUNDSCHECK" in os.environ, reason="this is the run with checked indices")
 def test_no_kernel_reads_or_writes_out_of_bounds(tmp_path):
     """Run the tests of the kernels once with checked indices, in an interpreter and with a cache of their own."""
-    environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = os.environ | {
+        "NUMBA_BOUNDSCHECK": "1",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": str(HERE.parents[1]),
+    }
     command = [
         sys.executable,
         "-m",
