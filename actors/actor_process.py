@@ -133,11 +133,13 @@ class ActorRunner:
         continuous: bool = False,
         env: Environment | None = None,
     ) -> None:
-        """Args:
-        offset: the robot's number in this process.
-        propose: makes the policy; None: the robot learns.
-        continuous: see `EpisodeRunner`.
-        env: the robot's environment in a shared world; None: `make` makes one.
+        """Connect one robot of this process.
+
+        Args:
+            offset: the robot's number in this process.
+            propose: creates the policy. None: the robot learns.
+            continuous: see `EpisodeRunner`.
+            env: the robot's environment in a shared world. None: `make` creates one.
         """
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"

@@ -98,12 +98,14 @@ class EpisodeRunner:
         ends_on_intervention: bool = False,
         continuous: bool = False,
     ) -> None:
-        """Args:
-        penalty: the penalty for a correction by the whole range of an input.
-        filtered: whether the safety service decides about the proposals.
-        ends_on_intervention: an intervention ends the episode instead of costing a penalty. For the learner the
-            step is terminal and has the lowest reward; for the robot the episode is called off (SAILR's training).
-        continuous: a reset sets a new goal for a robot that stays where it is, so its committed plan stays too.
+        """Create the runner of one robot.
+
+        Args:
+            penalty: the penalty for a correction by the whole range of an input.
+            filtered: whether the safety service decides about the proposals.
+            ends_on_intervention: an intervention ends the episode instead of costing a penalty (SAILR's training).
+                The learner receives a terminal step with the lowest reward.
+            continuous: a reset sets a new goal and leaves the robot where it is. The backup plan stays in force.
         """
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
@@ -284,11 +286,13 @@ class RobotGroup:
     def __init__(
         self, runners: Sequence[EpisodeRunner], world: SharedWorld | None = None, reserving: bool = True
     ) -> None:
-        """Args:
-        runners: the robots; one, unless there is a world.
-        world: the world that they share; None: the robot has an environment of its own.
-        reserving: whether the robots of a world reserve space for each other; without reservations the filter
-            does not know about the other robots.
+        """Group the robots that step together.
+
+        Args:
+            runners: the robots. Without a world, exactly one.
+            world: the world that the robots share. None: the robot has an environment of its own.
+            reserving: whether the robots of a world reserve space for each other. Without reservations the filter
+                does not know about the other robots.
         """
         assert world is not None or len(runners) == 1, "robots without a shared world have groups of their own"
         self.runners, self.world = list(runners), world

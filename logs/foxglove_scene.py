@@ -65,6 +65,7 @@ WORDS = {pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recov
 
 
 def body_frame(actor: str) -> str:
+    """Return the name of the frame that is fixed to an actor's body."""
     return f"{actor}/body"
 
 
@@ -310,6 +311,7 @@ def lidar(rays: LidarRays, actor: str, observation: Sequence[float], time: int) 
 
 
 def log_line(line: pb.LogLine, time: int) -> Log:
+    """Convert a log line. `time`: ns since the Unix epoch."""
     return Log(timestamp=stamp(time), level=LEVELS.get(line.level, Log.UNKNOWN), message=line.text, name=line.process)
 
 

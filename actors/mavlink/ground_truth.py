@@ -24,8 +24,9 @@ MOST_DATAGRAMS = 100  # read in one call of `poll`
 
 
 class UdpGroundTruth:
-    """The latest ground truth that a simulator on this machine sends over UDP
-    (`brakeline.sim.autopilot.autopilot_server`).
+    """The latest ground truth that a simulator on this machine sends over UDP.
+
+    `brakeline.sim.autopilot.autopilot_server` is such a simulator.
 
     Attributes:
         state: (9,) true state; None before the first datagram.

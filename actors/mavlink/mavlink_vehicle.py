@@ -299,8 +299,10 @@ class MavlinkVehicle:
 
     @property
     def _offset(self) -> float:
-        """Our clock minus the autopilot's, s: from the messages with the least delay, minus half of the fastest
-        TIMESYNC round trip. The part of a round trip that our own polling explains does not count.
+        """Our clock minus the autopilot's, s.
+
+        The estimate comes from the messages with the least delay, minus half of the fastest TIMESYNC round trip. The
+        part of a round trip that our own polling explains does not count.
         """
         way = 0.5 * self.timing.round_trip - POLL
         return self._offsets.value - (way if 0.0 < way < STALE else 0.0)

@@ -52,13 +52,15 @@ class Takeoff:
         raise_limits: bool,
         lead: bool = False,
     ) -> None:
-        """Args:
-        client: the autopilot.
-        robot: the robot's description: its bounds, slew and measurement error.
-        wait: exchanges messages until a condition holds, or a time [s] is over.
-        hold: called with a setpoint (3,) [m/s] to repeat from now on; None: send none.
-        raise_limits: set each autopilot parameter that is below the robot's bounds.
-        lead: send positions ahead of the vehicle (`brakeline.actors.mavlink.position_lookahead`).
+        """Prepare the takeoff of one vehicle.
+
+        Args:
+            client: the autopilot.
+            robot: the robot's description: its bounds, slew and measurement error.
+            wait: exchanges messages until a condition holds, or a time [s] is over.
+            hold: called with a setpoint (3,) [m/s] to repeat from now on. None: send none.
+            raise_limits: set each autopilot parameter that is below the robot's bounds.
+            lead: send positions ahead of the vehicle (`brakeline.actors.mavlink.position_lookahead`).
         """
         self._client, self._robot, self._wait, self._hold = client, robot, wait, hold
         self._raise_limits, self._lead = raise_limits, lead

@@ -98,8 +98,14 @@ class FilterNode:
     """The node of one robot, and the loop over its periods."""
 
     def __init__(self, settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> None:
-        """ask: sends requests to the filter; tap: called with every message. Raises Unreachable, BadRosName,
-        UnknownRobot, UnsupportedRobot.
+        """Set up the gate, the clock and the inputs.
+
+        Args:
+            ask: sends requests to the filter.
+            tap: called with every message.
+
+        Raises:
+            Unreachable, BadRosName, UnknownRobot, UnsupportedRobot
         """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)

@@ -1,4 +1,4 @@
-"""`brakeline evaluate`: a policy through the filter, in process, on fresh episodes."""
+"""`brakeline evaluate`: run a policy through the filter, in process, on fresh episodes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.sim_conditions import Conditions
 
-FRESH = 1_000_000  # added to the seed: no training run draws its episodes from there
+FRESH = 1_000_000  # added to the seed, so that no training run has the same episodes
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What to evaluate."""
+    """The settings of one evaluation."""
 
     policy: str = "astar"  # a file, or trained | untrained | random | greedy | adversary | astar
     method: str = "ddpc"
@@ -42,10 +42,12 @@ class Evaluation:
 
 
 def in_process(model: Model, accept_bound: float | None = None) -> Ask:
-    """The safety service's own core, called directly: the same bytes, no bus.
+    """Return a function that calls the core of the safety service directly.
+
+    Requests and replies have the same bytes as on the bus.
 
     Raises:
-        TooLoose: the model set's statement is looser than the robot's limit, or than `accept_bound`.
+        TooLoose: the model set's validation report is looser than the robot's limit, or than `accept_bound`.
     """
     models = ModelRegistry(accept_bound=accept_bound)
     models.install(model)
@@ -65,7 +67,7 @@ def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number:
 
 
 def prepare_evaluation(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
-    """What an evaluation is made of: the driver in a fresh environment, the policy, and whom it asks."""
+    """Create the episode runner in a fresh environment, the policy, and the filter's function (None: no filter)."""
     policy = policy_named(what.policy, robot, what.seed)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
     question = _question(robot, what)
@@ -74,17 +76,18 @@ def prepare_evaluation(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeR
 
 
 def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
-    """Whom the robot asks: nobody where there is no filter."""
+    """Return the function that asks the filter, or None for the method `none`."""
     if what.method == "none":
         return None
     return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
 def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
-    """The same for several robots in one world.
+    """Create the group, the world, the policies and the filter's function for several robots in one world.
 
     Raises:
-        NoFleet: there is none of this kind, or in that arena; ValueError: this method makes no promises.
+        NoFleet: this robot or this arena has no fleet.
+        ValueError: this method supports no reservations.
     """
     check_reservations(what.method)
     world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
@@ -100,8 +103,10 @@ def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, F
 def evaluate(
     robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda tally: None
 ) -> dict[str, Any]:
-    """The shared figures of `what.episodes` episodes (of a fleet: of at least so many, each robot's counted); `each` is
-    called after every one.
+    """Run `what.episodes` episodes and return their closed-loop metrics.
+
+    A fleet runs at least that many episodes, counted over all its robots. The function calls `each` after every
+    episode with the statistics so far.
     """
     if what.fleet:
         return _together(robot, what, each) | _about(what)
@@ -115,7 +120,7 @@ def evaluate(
 
 
 def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any]) -> dict[str, Any]:
-    """A fleet's figures: of all, by kind and by robot as `analyse` has them, and of its worlds."""
+    """Run a fleet's episodes and return the metrics in total, by kind, by robot, and for its worlds."""
     fleet, world, policies, question = prepare_fleet(robot, what)
     tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.runners}
     rounds, periods = -(-what.episodes // what.fleet), 0
@@ -133,8 +138,8 @@ def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeSta
         "actors": {name: closed_loop([tally]) for name, tally in tallies.items()},
         "worlds": {
             "count": rounds,
-            "robot_steps": periods * what.fleet,  # of those that stand at their goals, too
-            "touches": world.touches,  # of two robots, whatever they did
+            "robot_steps": periods * what.fleet,  # includes robots that stand at their goals
+            "touches": world.touches,  # contacts between two robots, for any reason
             "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
         },
     }

@@ -35,6 +35,7 @@ class Job(Protocol):
 
 
 def result_path(results: Path, job: Job) -> Path:
+    """Return the path of a job's result file."""
     return results / job.robot / f"{job.name}.json"
 
 

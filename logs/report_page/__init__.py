@@ -137,6 +137,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(share: float | None) -> str:
+    """Format a share as a percentage, or as a dash if it is None or not finite."""
     if share is None or not math.isfinite(share):
         return "–"
     value = 100.0 * share
@@ -154,6 +155,7 @@ def moment(seconds: float | None) -> str:
 
 
 def pretty(value: Any) -> str:
+    """Encode a value as indented JSON."""
     return json.dumps(value, indent=2)
 
 
