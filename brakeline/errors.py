@@ -58,7 +58,7 @@ class Expired(BusError):
 
 
 class Malformed(BusError, ValueError):
-    """The bytes are no message of the topic's type, or the message is implausible."""
+    """The bytes cannot be decoded as a message of the topic's type, or the message is implausible."""
 
 
 class Refused(BusError):
@@ -76,7 +76,7 @@ class Refused(BusError):
 
 
 class BadLink(BrakelineError, ValueError):
-    """The URL is none of those above."""
+    """A link's URL has a form that `brakeline.messaging.byte_links` does not support."""
 
 
 class Implausible(BrakelineError, ValueError):
@@ -92,11 +92,11 @@ class BadShape(BrakelineError, ValueError):
 
 
 class BadPerceptrons(BrakelineError, ValueError):
-    """Layers do not fit each other, or are not finite; the message names the layer."""
+    """The layers of a network do not fit each other, or hold NaN or infinity; the message names the layer."""
 
 
 class BadWeights(BrakelineError, ValueError):
-    """Not a policy, or not one of this robot; the message says which part is wrong."""
+    """The file holds no policy, or a policy of another robot; the message says which part is wrong."""
 
 
 class UnknownRobot(BrakelineError, ValueError):
@@ -140,7 +140,7 @@ class Mismatch(BrakelineError, ValueError):
 
 
 class BadRequest(BrakelineError, ValueError):
-    """A request that can't be decided on: `field` names what is wrong."""
+    """The filter cannot decide on the request. `field` names the wrong field."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(message)
@@ -148,11 +148,11 @@ class BadRequest(BrakelineError, ValueError):
 
 
 class StaleModel(BadRequest):
-    """The committed plan was verified by a model set that this filter never had."""
+    """The backup plan was verified by a model set that the service does not know."""
 
 
 class BadData(BrakelineError, ValueError):
-    """A data set that must not be used; the message says which check failed."""
+    """The data set must not be used; the message says which check failed."""
 
 
 class ErrorBoundError(BrakelineError, ValueError):
@@ -160,15 +160,15 @@ class ErrorBoundError(BrakelineError, ValueError):
 
 
 class BadModel(BrakelineError, ValueError):
-    """A model set that must not be used; the message says why."""
+    """The model set must not be used; the message says why."""
 
 
 class TooLoose(BadModel):
-    """A model set whose statement is looser than what is used without a question; the message says what to do."""
+    """The model set states a larger share of plans outside their tubes than you accept; the message says what to do."""
 
 
 class BadTensors(BrakelineError, ValueError):
-    """The bytes are no such file."""
+    """The bytes are not a safetensors file of the expected kind."""
 
 
 class SafetyError(BusError):
@@ -180,7 +180,7 @@ class SafetyError(BusError):
 
 
 class AskedApart(BadRequest):
-    """A batch does not hold all robots of a world once: the service can check no reservation."""
+    """A request does not name every robot of a shared world exactly once, so the service cannot check reservations."""
 
     def __init__(self, message: str) -> None:
         super().__init__("fleet", message)
@@ -206,7 +206,7 @@ class UnknownArena(BrakelineError, ValueError):
 
 
 class NoArena(BrakelineError, RuntimeError):
-    """No drawn arena had a path from start to goal: the numbers of its kind leave too little room."""
+    """No drawn arena has a path from start to goal: the settings of the arena leave too little room."""
 
 
 class UnknownRules(BrakelineError, ValueError):
@@ -285,7 +285,7 @@ class BadMessage(BrakelineError, ValueError):
 
 
 class BadLaserScan(BrakelineError, ValueError):
-    """A scan is not valid."""
+    """A ROS laser scan is not valid."""
 
 
 class UnsupportedRobot(BrakelineError, ValueError):
@@ -304,11 +304,11 @@ class CheckpointError(BrakelineError, RuntimeError):
 
 
 class NoCheckpoint(CheckpointError):
-    """There is none in this folder."""
+    """The folder holds no checkpoint."""
 
 
 class MissingPart(CheckpointError):
-    """A part, or a file of it, is not there; `part` names it."""
+    """A part of the checkpoint, or one of its files, is missing; `part` names it."""
 
     def __init__(self, part: str, where: Path) -> None:
         super().__init__(f"{where}: the part {part!r} is missing")
@@ -316,7 +316,7 @@ class MissingPart(CheckpointError):
 
 
 class DamagedPart(CheckpointError):
-    """A part is not what was written, or does not fit; `part` names it."""
+    """A part of the checkpoint is damaged, or does not fit; `part` names it."""
 
     def __init__(self, part: str, where: Path, why: str) -> None:
         super().__init__(f"{where}: the part {part!r} is damaged: {why}")
@@ -324,7 +324,7 @@ class DamagedPart(CheckpointError):
 
 
 class OtherRun(CheckpointError):
-    """It is of another robot or configuration; `field` names the difference."""
+    """The checkpoint belongs to another robot or configuration; `field` names the difference."""
 
     def __init__(self, field: str, where: Path) -> None:
         super().__init__(f"{where}: the checkpoint differs from this run in {field}")
@@ -332,15 +332,15 @@ class OtherRun(CheckpointError):
 
 
 class BadState(BrakelineError, ValueError):
-    """A piece is missing, or of another shape or kind; the message names it."""
+    """An entry of a checkpoint is missing, or has another shape or type; the message names it."""
 
 
 class TooFew(BrakelineError, ValueError):
-    """Not enough samples for a batch."""
+    """The data hold fewer samples than one batch."""
 
 
 class BadStep(BrakelineError, ValueError):
-    """A step that cannot be learned from; `field` names what is wrong with it."""
+    """The learner cannot learn from the step; `field` names the wrong field."""
 
     def __init__(self, field: str, why: str) -> None:
         super().__init__(f"{field}: {why}")
