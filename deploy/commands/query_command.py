@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 
 from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed, console, print_json
@@ -21,6 +23,9 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import describe_verification
 from brakeline.safety.service.client import SafetyClient
+from brakeline.safety.service.filter_client import Answer
+
+Array = NDArray[np.float64]
 
 OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
 
@@ -76,14 +81,20 @@ class QueryCommand:
         clearance = " for clearance: the proposal is verified too," if answer.for_clearance else ""
         console.print(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}")
         console.print(describe_verification(answer.verified, answer.bound), markup=False)
-        table = StackingTable("period", *robot.action, "center [m]", "± [m]", **PLAIN)
-        rows = zip(figures["plan"], figures["tube"]["center"], figures["tube"]["half_width"], strict=True)
-        for k, (inputs, center, half_width) in enumerate(rows):
-            table.add_row(str(k), *(f"{value:.4f}" for value in inputs), _numbers(center), _numbers(half_width))
-        console.print(table)
+        console.print(plan_table(answer, robot.action))
         margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f} m"
         console.print(f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}")
         return 0
+
+
+def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:
+    """Return a table of an answer's plan, with its tube. The rivals predict no tube: its columns are then left out."""
+    has_tube = len(answer.tube_center) > 0
+    table = StackingTable("period", *inputs, *(("center [m]", "± [m]") if has_tube else ()), **PLAIN)
+    for k, values in enumerate(answer.plan):
+        tube = (_numbers(answer.tube_center[k]), _numbers(answer.tube_half_width[k])) if has_tube else ()
+        table.add_row(str(k), *(f"{value:.4f}" for value in values), *tube)
+    return table
 
 
 def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:
@@ -128,5 +139,5 @@ def load_scan(path: Path, dim: int) -> RangeMeasurement:
         raise error if isinstance(error, BadScan) else BadScan(f"{path}: not a {kind.__name__}: {error}") from error
 
 
-def _numbers(values: list[float]) -> str:
+def _numbers(values: Array) -> str:
     return ", ".join(f"{value:.4f}" for value in values)

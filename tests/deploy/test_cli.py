@@ -7,15 +7,17 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main
 from brakeline.deploy.commands.certify_command import validation_table
-from brakeline.deploy.commands.query_command import load_scan, parse_obstacle
+from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
 from brakeline.errors import BadScan
 from brakeline.logs.report import analyse
 from brakeline.logs.segment import open_segment
@@ -299,6 +301,16 @@ def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, caps
     with progress.under_way("driving", 3):
         time.sleep(0.1)
     assert "driving: 0 of 3" in capsys.readouterr().err and not progress.UNDER_WAY
+
+
+def test_a_plan_is_shown_with_its_tube_and_without_one_if_there_is_none():
+    """The rivals predict no tube."""
+    safety = InProcess(Filter.load("ground"))
+    answer = safety.decide(np.zeros(5), [0.2, 0.0], known_free=True)
+    nothing = np.zeros((0, 2))
+    for shown, columns in ((answer, 5), (replace(answer, tube_center=nothing, tube_half_width=nothing), 3)):
+        table = plan_table(shown, safety.robot.action)
+        assert (len(table.columns), table.row_count) == (columns, len(answer.plan))
 
 
 HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite", "google.protobuf", "pydantic")
