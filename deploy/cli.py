@@ -23,97 +23,103 @@ from rich.table import Table
 from brakeline.extras import missing_extra
 
 
-class Command(NamedTuple):
+class CommandEntry(NamedTuple):
     """What a command does, and how to call it."""
 
     summary: str
     example: str
 
 
-COMMANDS: dict[str, Command] = {
-    "demo": Command("Train the ground robot for some minutes and watch it.", "brakeline demo"),
-    "train": Command(
+COMMANDS: dict[str, CommandEntry] = {
+    "demo": CommandEntry("Train the ground robot for some minutes and watch it.", "brakeline demo"),
+    "train": CommandEntry(
         "Run all processes of a training on this machine: actors, safety service, learner, recorder.",
         "brakeline train ground --steps 90000 --actors 2 --seed 0",
     ),
-    "keys": Command(
+    "keys": CommandEntry(
         "Make the keys of processes on several machines, of whoever signs models, and of verified plans.",
         "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
     ),
-    "robot": Command("Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"),
-    "safety": Command("Run a safety service alone.", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"),
-    "router": Command(
+    "robot": CommandEntry(
+        "Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"
+    ),
+    "safety": CommandEntry(
+        "Run a safety service alone.", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
+    ),
+    "router": CommandEntry(
         "Run a router at which the processes of several machines meet. Linked routers form one bus.",
         "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
     ),
-    "learner": Command("Run a learner alone.", "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys"),
-    "actor": Command(
+    "learner": CommandEntry("Run a learner alone.", "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys"),
+    "actor": CommandEntry(
         "Run one actor process alone, with one or several robots.",
         "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
     ),
-    "fly": Command(
+    "fly": CommandEntry(
         "Fly a quadrotor in real time over MAVLink, with autopilot, safety service, actor and recorder.",
         "brakeline fly --minutes 10 --policy astar",
     ),
-    "autopilot": Command(
+    "autopilot": CommandEntry(
         "Simulate quadrotors behind MAVLink in real time, with the rules of PX4 or ArduPilot.",
         "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
     ),
-    "ros2": Command(
+    "ros2": CommandEntry(
         "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. Needs no ROS installation.",
         "brakeline ros2 ground --router tcp/localhost:7447",
     ),
-    "bridge-sim": Command(
+    "bridge-sim": CommandEntry(
         "Simulate a ground robot as a ROS 2 robot: odom, scan, tf, clock and cmd_vel.",
         "brakeline bridge-sim --arena dense --seed 3",
     ),
-    "recorder": Command(
+    "recorder": CommandEntry(
         "Run a recorder alone.", "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"
     ),
-    "collect": Command(
+    "collect": CommandEntry(
         "Record the data set that the filter learns a robot from.",
         "brakeline collect ground --seed 1",
     ),
-    "import": Command(
+    "import": CommandEntry(
         "Make a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, own runs.",
         "brakeline import drive.csv --robot my.toml --picture driven.png",
     ),
-    "excite": Command(
+    "excite": CommandEntry(
         "Print the inputs that excite a robot best within a region, or drive them in its simulator.",
         "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
     ),
-    "certify": Command(
+    "certify": CommandEntry(
         "Validate model sets on held-out data, and put them to use or publish them.",
         "brakeline certify --robot ground",
     ),
-    "evaluate": Command(
+    "evaluate": CommandEntry(
         "Evaluate a policy behind the filter, in this process, on fresh episodes.",
         "brakeline evaluate ground --policy astar --episodes 100 --json",
     ),
-    "pretrain": Command("Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"),
-    "compare": Command(
+    "pretrain": CommandEntry(
+        "Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"
+    ),
+    "compare": CommandEntry(
         "Train and evaluate each method from the same seeds, as tables and figures. Resumes from results/.",
         "brakeline compare ground --quick",
     ),
-    "query": Command(
+    "query": CommandEntry(
         "Ask a running safety service for a decision about a state and an action.",
         "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
     ),
-    "status": Command("Show the living processes and their figures.", "brakeline status"),
-    "watch": Command("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
-    "replay": Command(
+    "status": CommandEntry("Show the living processes and their figures.", "brakeline status"),
+    "watch": CommandEntry("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
+    "replay": CommandEntry(
         "Decide each logged request again and compare, to within 1e-12, or with another model set.",
         "brakeline replay runs/latest --certificate set-membership",
     ),
-    "export": Command(
+    "export": CommandEntry(
         "Export a log as CSV, Minari data set, .tlog, or MCAP with a picture of each step for Foxglove.",
         "brakeline export runs/latest --csv steps.csv",
     ),
-    "analyse": Command(
+    "analyse": CommandEntry(
         "Compute the figures of one or many logs, also of incomplete ones, and write a report page.",
         "brakeline analyse runs/latest --html report.html",
     ),
-    "recover": Command("Repair damaged logs.", "brakeline recover runs/latest"),
+    "recover": CommandEntry("Repair damaged logs.", "brakeline recover runs/latest"),
 }
 
 

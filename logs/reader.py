@@ -73,7 +73,7 @@ class MissingSegment:
 
 
 @dataclass
-class Segment:
+class LogSegment:
     """Counts of one file, complete once it has been read."""
 
     path: Path
@@ -108,7 +108,7 @@ class Log:
     attachments: dict[str, bytes] = field(default_factory=dict)
     cuts: list[DamagedFile | MissingSegment] = field(default_factory=list)
     malformed: int = 0
-    segments: list[Segment] = field(default_factory=list)
+    segments: list[LogSegment] = field(default_factory=list)
     robots: RecordedRobots = field(default_factory=RecordedRobots)
 
     def __iter__(self) -> Iterator[Record]:
@@ -134,7 +134,7 @@ class Log:
 
     def _rows_of(self, path: Path) -> Iterator[Row]:
         """Yield the messages of one file from front to back, which needs no summary."""
-        segment = Segment(path, path.stat().st_size, recording=being_written(path))
+        segment = LogSegment(path, path.stat().st_size, recording=being_written(path))
         self.segments.append(segment)
         try:
             with path.open("rb") as file:
@@ -154,7 +154,7 @@ class Log:
         except NotMcap as error:
             raise NotALog(f"{path} is not an MCAP file: {error}") from error
 
-    def _add_damage(self, segment: Segment, damage: DamagedBytes) -> None:
+    def _add_damage(self, segment: LogSegment, damage: DamagedBytes) -> None:
         reason = "the file is being recorded" if segment.recording and damage.at_end else damage.reason
         self.cuts.append(DamagedFile(segment.path, damage.lost, reason, None if damage.at_end else damage.at))
 

@@ -90,7 +90,7 @@ class ArenaKind:
 
 
 @dataclass(frozen=True)
-class Lidar:
+class LidarLayout:
     """The rays of an observation: `fan` rays in the plane, or `azimuths` times `elevations` rays in space."""
 
     __pydantic_config__ = _STRICT
@@ -121,7 +121,7 @@ class Task:
     policies: dict[str, str]  # scripted policies by name, code: (robot, rng) -> Policy
     observation: tuple[str, ...]  # "name [scale]" of each coordinate after the rays
     arenas: dict[str, ArenaKind]
-    lidar: Lidar | None = None
+    lidar: LidarLayout | None = None
     reward: Reward = field(default_factory=Reward)
     trajectories: int = 200  # number to record for a model set, 300 periods each
     steps: int = 60_000  # training steps in a comparison
@@ -133,7 +133,7 @@ class Task:
     @cached_property
     def rays(self) -> LidarRays:
         """Directions and range of the observation's rays; no rays without a lidar."""
-        lidar = self.lidar or Lidar(1.0, 0.0)
+        lidar = self.lidar or LidarLayout(1.0, 0.0)
         if lidar.azimuths:
             return spherical_rays(lidar.azimuths, lidar.elevations, lidar.degrees, lidar.range)
         return planar_rays(lidar.fan, lidar.degrees, lidar.range)

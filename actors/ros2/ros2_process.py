@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
-from brakeline.actors.ros2.ros_clock import RosClock, SimulatedClock, SystemClock
+from brakeline.actors.ros2.ros_clock import RosClock, RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, UnsupportedRobot
@@ -110,7 +110,7 @@ class FilterNode:
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
         self.gate = CommandGate(self.robot, ask, settings.name)
-        self.clock: RosClock = SimulatedClock() if settings.sim_time else SystemClock()
+        self.clock: RosClock = RosSimulatedClock() if settings.sim_time else SystemClock()
         self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
         self._ending = False
         self._diagnosed_at, self._diagnosed = -math.inf, ("", "")  # s; kind and reason of the last diagnostics
@@ -227,7 +227,7 @@ class FilterNode:
 
     def _subscribe(self) -> None:
         names, inputs, subscribe = self.settings.topics, self.inputs, self.node.subscribe
-        if isinstance(self.clock, SimulatedClock):
+        if isinstance(self.clock, RosSimulatedClock):
             subscribe("/clock", Clock, self.clock.on_clock, SENSOR)
         subscribe(names.fixed_transforms, TFMessage, inputs.on_fixed_transforms, LATCHED)
         if self.settings.sensors.base_frame:

@@ -48,7 +48,7 @@ class SystemClock:
         return difference
 
 
-class SimulatedClock:
+class RosSimulatedClock:
     """The time on /clock."""
 
     RESTART = 1.0  # s: a clock that goes back by more has restarted

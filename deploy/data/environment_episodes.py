@@ -125,7 +125,7 @@ def _episode(
     observation, info = env.reset(seed=seed, options=options)
     measured = np.array(state(env, observation, info), dtype=float)
     u, before = next(inputs), None
-    record = _Record(robot, measured, before)
+    record = _RecordedEpisode(robot, measured, before)
     for _ in range(most):
         action = cast_action(between.control_to_action(u), env.action_space)
         observation, _, terminated, truncated, info = env.step(action)
@@ -135,7 +135,7 @@ def _episode(
         executed = np.clip(np.asarray(info.get("input_in_force", u), dtype=float), robot.low(), robot.high())
         if disturbed(env, observation, info):
             yield from record.done()
-            record = _Record(robot, measured, executed)
+            record = _RecordedEpisode(robot, measured, executed)
         else:
             record.add(executed, measured, info)
         if truncated:
@@ -144,7 +144,7 @@ def _episode(
     yield from record.done()
 
 
-class _Record:
+class _RecordedEpisode:
     """A trajectory during its recording."""
 
     def __init__(self, robot: Robot, state: Array, before: Array | None) -> None:

@@ -19,7 +19,7 @@ CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MeanEstimate:
     """An estimate with its 95 % confidence interval, and the value of each seed."""
 
     value: float
@@ -28,7 +28,7 @@ class Estimate:
     seeds: tuple[float, ...]
 
 
-def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0) -> Estimate:
+def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
     """Estimate the mean over seeds of Σ above / Σ below, summed over the episodes of a seed.
 
     Each resample draws, with replacement, as many seeds as there are, and for each as many episodes as it has.
@@ -51,10 +51,10 @@ def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0)
     means = resampled[rng.integers(len(pairs), size=shape), rng.integers(RESAMPLES, size=shape)].mean(axis=0)
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
     low, high = np.percentile(means, (tail, 100.0 - tail))
-    return Estimate(float(per_seed.mean()), float(low), float(high), tuple(map(float, per_seed)))
+    return MeanEstimate(float(per_seed.mean()), float(low), float(high), tuple(map(float, per_seed)))
 
 
-def mean(values: Sequence[ArrayLike], seed: int = 0) -> Estimate:
+def mean(values: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
     """Estimate the mean over seeds and episodes of `values`, one array (episodes,) per seed."""
     return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed)
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from brakeline.deploy.experiments.bootstrap import Estimate
+from brakeline.deploy.experiments.bootstrap import MeanEstimate
 from brakeline.deploy.experiments.comparison_cells import METHODS
 from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW
 
@@ -99,7 +99,7 @@ def seeds_as_points(found: dict[str, Any], png: Path) -> None:
     picture.savefig(png, dpi=120, metadata={"Software": None})
 
 
-def _point(axes: Axes, place: int, estimate: Estimate, colour: str) -> None:
+def _point(axes: Axes, place: int, estimate: MeanEstimate, colour: str) -> None:
     axes.plot([place, place], [100.0 * estimate.low, 100.0 * estimate.high], color=colour, linewidth=2.0)
     axes.plot(place, 100.0 * estimate.value, marker="_", markersize=16, color=colour)
     offsets = place + 0.22 + 0.08 * (np.arange(len(estimate.seeds)) - 0.5 * (len(estimate.seeds) - 1))

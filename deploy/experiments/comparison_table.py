@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.experiments.bootstrap import Estimate, mean, ratio
+from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, ratio
 from brakeline.deploy.experiments.comparison_cells import METHODS, NONE
 from brakeline.deploy.experiments.trials import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
@@ -127,7 +127,7 @@ def _deployment(groups: dict[str, list[Result]], arena: str) -> dict[str, Row]:
 
 def plain(value: Any) -> Any:
     """Convert estimates to JSON values."""
-    if isinstance(value, Estimate):
+    if isinstance(value, MeanEstimate):
         return {"value": value.value, "low": value.low, "high": value.high, "seeds": list(value.seeds)}
     if isinstance(value, dict):
         return {name: plain(inner) for name, inner in value.items()}
@@ -156,7 +156,7 @@ def written(name: str, value: Any) -> str:
     else:
         form = lambda v: f"{v:.0f}"  # noqa: E731
     unit = " %" if name in PERCENT else ""
-    if isinstance(value, Estimate):
+    if isinstance(value, MeanEstimate):
         return f"{form(value.value)}{unit} [{form(value.low)}, {form(value.high)}]"
     return form(float(value)) + unit
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.ros2.odometry import HISTORY, OdometryHistory
-from brakeline.actors.ros2.ros_clock import SimulatedClock, SystemClock
+from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree
 from brakeline.errors import InputMissing
@@ -189,7 +189,7 @@ def test_transforms_can_replace_odometry():
 
 
 def test_a_clock_that_was_set_reports_the_jump_once(monkeypatch):
-    simulated = SimulatedClock()
+    simulated = RosSimulatedClock()
     for stamp in (100.0, 99.9, 101.0):
         simulated.on_clock(Clock(clock=time_of(stamp)))
     assert simulated.now() == 101.0 and simulated.jumped() == 0.0
