@@ -32,6 +32,7 @@ from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import ModelSigner, write_signer
 from tests.faults.network_hosts import Hosts
 
+CABLE = Path(__file__).with_name("cable_delay.py")  # a program: nothing installs the tests as a package
 PORT = 7447
 CLOCKS = {2: -7.0, 3: 5.0, 4: -3.0}  # h ahead of the others
 LEARNERS, MOVED = 5, 2  # the hosts that learners alternate between
@@ -105,16 +106,8 @@ class Fleet:
         """Everything, and look on."""
         for host in range(3, 3 + len(self.robots)) if self.delay else ():
             ports = [f"0.0.0.0:{PORT + i}={self.hosts.address(1 + i)}:{PORT}" for i in (0, 1)]
-            words = [
-                *PYTHON,
-                "-m",
-                "tests.faults.cable_delay",
-                *ports,
-                "--delay",
-                str(self.delay),
-                "--jitter",
-                str(self.delay),
-            ]
+            delay = str(self.delay)
+            words = [*PYTHON, str(CABLE), *ports, "--delay", delay, "--jitter", delay]
             self.hosts.start(host, words, self.folder / f"delay-{host}.out")
         for name in self.spots:
             self.launch(name)
