@@ -7,22 +7,18 @@ that stand on the floor or hang from the ceiling, spheres that float.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import NoArena, UnknownArena
-from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
 from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
 from brakeline.sim.traffic import Crowd
-
-Array = NDArray[np.float64]
-
 
 ATTEMPTS = 1000  # arenas drawn before giving up
 CANDIDATES = 12  # drawn for each obstacle; the first that fits stays
@@ -30,17 +26,8 @@ POINTS = 64  # drawn at once for start, goal and moving obstacles
 MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the start
 
 
-def bounds_of(kind: ArenaKind) -> tuple[tuple[float, float], ...]:
-    """Return (low, high) of the room for each axis."""
-    return room_bounds(kind.half_width, kind.height)
-
-
 def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
-    """Return the kind of a robot's arena.
-
-    Raises:
-        UnknownArena: the robot has no arena of this name.
-    """
+    """Return the kind of a robot's arena. Raises UnknownArena: the robot has no arena of this name."""
     kinds = robot.task.arenas
     if name not in kinds:
         names = ", ".join(sorted(kinds)) or "none"
@@ -58,17 +45,14 @@ def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Are
     kind = arena_kind(robot, name)
     if kind.ring is not None:
         return draw_fleet(name, rng, robot, 1)[0]
-    for _ in range(ATTEMPTS):
-        obstacles = _place(kind, rng, robot)
-        if obstacles is None:
-            continue
+    for obstacles in _rooms(kind, rng, robot):
         ends = _start_and_goal(kind, obstacles, rng, robot)
         if ends is None:
             continue
         start, goal = ends
         if robot.heading is not None:
             start = (*start, float(rng.uniform(-math.pi, math.pi)))
-        arena = Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, bounds_of(kind))
+        arena = _arena(name, kind, obstacles, start, goal)
         if arena.clearance_map.connected(start[: arena.dim], goal, robot.footprint + kind.path_clearance):
             return arena if kind.movers is None else _with_movers(arena, kind.movers, rng)
     raise NoArena(f"none of {ATTEMPTS} drawn arenas {name!r} has a path from start to goal; leave it more room")
@@ -82,15 +66,12 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
         NoArena: no draw has room for so many robots.
     """
     kind = arena_kind(robot, name)
-    for _ in range(ATTEMPTS):
-        obstacles = _place(kind, rng, robot)
-        if obstacles is None:
-            continue
+    for obstacles in _rooms(kind, rng, robot):
         points = _fleet_ends(kind, Shapes.of(obstacles, robot.position_dim), rng, robot, size)
         if points is None:
             continue
         starts, goals = (tuple(map(tuple, side.tolist())) for side in points)
-        first = Arena(name, obstacles, starts[0], goals[0], kind.goal_radius, kind.step_limit, bounds_of(kind))
+        first = _arena(name, kind, obstacles, starts[0], goals[0])
         clearance = robot.footprint + kind.path_clearance
         if not all(first.clearance_map.connected(*ends, clearance) for ends in zip(starts, goals, strict=True)):
             continue
@@ -102,15 +83,19 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
     raise NoArena(f"none of {ATTEMPTS} drawn arenas {name!r} has paths for {size} robots; use fewer robots")
 
 
+def _arena(
+    name: str, kind: ArenaKind, obstacles: tuple[Obstacle, ...], start: tuple[float, ...], goal: tuple[float, ...]
+) -> Arena:
+    """Return the arena of a kind with these obstacles, start and goal."""
+    bounds = room_bounds(kind.half_width, kind.height)
+    return Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, bounds)
+
+
 def _fleet_ends(
     kind: ArenaKind, shapes: Shapes, rng: np.random.Generator, robot: Robot, size: int
 ) -> tuple[Array, Array] | None:
-    """Draw starts and goals (size, d), opposite each other on the kind's ring, or anywhere.
-
-    Returns:
-        Starts and goals [m], or None if there is no room.
-    """
-    low, high = np.array(bounds_of(kind)).T
+    """Draw starts and goals (size, d) [m], opposite each other on the kind's ring, or anywhere; None without room."""
+    low, high = np.array(room_bounds(kind.half_width, kind.height)).T
     clear = robot.footprint + kind.start_clearance
     apart = 2.0 * clear
     if kind.ring is not None:
@@ -135,11 +120,9 @@ def _with_movers(arena: Arena, kind: MoverKind, rng: np.random.Generator) -> Are
 
     If there is no room, the arena gets fewer of them than the kind's least number.
     """
-    low, high = np.array(arena.bounds).T
-    points = rng.uniform(low, high, (POINTS, arena.dim))
-    free = arena.shapes.distance(points).min(axis=0) >= kind.radius + MOVER_GAP
-    free &= np.linalg.norm(points - arena.start[: arena.dim], axis=1) >= kind.radius + kind.keep
-    positions = points[free][: int(rng.integers(*kind.count, endpoint=True))]
+    points = _free_points(arena.shapes, arena.bounds, kind.radius + MOVER_GAP, rng)
+    away = np.linalg.norm(points - arena.start[: arena.dim], axis=1) >= kind.radius + kind.keep
+    positions = points[away][: int(rng.integers(*kind.count, endpoint=True))]
     return replace(arena, crowd=Crowd(kind, positions, arena.shapes, int(rng.integers(2**31))))
 
 
@@ -151,14 +134,12 @@ def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: Rob
         NoArena: no path leads to further goals.
     """
     kind, stages, start = arena_kind(robot, arena.name), list[Arena](), arena.start[: arena.dim]
-    low, high = np.array(bounds_of(kind)).T
     for _ in range(ATTEMPTS):
         if len(stages) == goals:
             return tuple(stages)
-        points = rng.uniform(low, high, (POINTS, arena.dim))
-        free = arena.shapes.distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
+        points = _free_points(arena.shapes, arena.bounds, robot.footprint + kind.start_clearance, rng)
         far = np.linalg.norm(points - start, axis=1) >= kind.goal_distance
-        for goal in (tuple(point) for point in points[free & far].tolist()):
+        for goal in (tuple(point) for point in points[far].tolist()):
             if arena.clearance_map.connected(start, goal, robot.footprint + kind.path_clearance):
                 stages.append(same_room(arena, start=start, goal=goal))
                 start = goal
@@ -166,12 +147,15 @@ def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: Rob
     raise NoArena(f"no sequence of {goals} goals with paths between them in the arena {arena.name!r}")
 
 
-def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
-    """Draw obstacles with gaps between their outlines.
+def _rooms(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> Iterator[tuple[Obstacle, ...]]:
+    """Draw `ATTEMPTS` rooms; yield the obstacles of those that have enough of them."""
+    for _ in range(ATTEMPTS):
+        if (obstacles := _place(kind, rng, robot)) is not None:
+            yield obstacles
 
-    Returns:
-        The obstacles, then the room's boundary. None if too few obstacles fit.
-    """
+
+def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
+    """Draw obstacles with gaps between their outlines, then the room's boundary; None if too few obstacles fit."""
     walls = room_boundary(kind.half_width, None)
     placed: list[Obstacle] = []
     least = 2.0 * robot.footprint + kind.gap
@@ -244,13 +228,16 @@ def _start_and_goal(
     kind: ArenaKind, obstacles: tuple[Obstacle, ...], rng: np.random.Generator, robot: Robot
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
     """Draw two free points that are far enough apart, or None."""
-    low, high = np.array(bounds_of(kind)).T
+    shapes, bounds = Shapes.of(obstacles, dim=robot.position_dim), room_bounds(kind.half_width, kind.height)
+    points = _free_points(shapes, bounds, robot.footprint + kind.start_clearance, rng)
+    far = points[np.linalg.norm(points - points[:1], axis=1) >= kind.goal_distance]
+    return (tuple(points[0].tolist()), tuple(far[0].tolist())) if len(far) else None
+
+
+def _free_points(
+    shapes: Shapes, bounds: Sequence[tuple[float, float]], clearance: float, rng: np.random.Generator
+) -> Array:
+    """Draw points in a room; return those (k, d), at most `POINTS`, with a clearance [m] from every shape."""
+    low, high = np.array(bounds).T
     points = rng.uniform(low, high, (POINTS, len(low)))
-    free = Shapes.of(obstacles, dim=len(low)).distance(points).min(axis=0) >= robot.footprint + kind.start_clearance
-    points = points[free]
-    if not len(points):
-        return None
-    far = np.linalg.norm(points - points[0], axis=1) >= kind.goal_distance
-    if not far.any():
-        return None
-    return tuple(points[0].tolist()), tuple(points[far][0].tolist())
+    return np.asarray(points[shapes.distance(points).min(axis=0) >= clearance])

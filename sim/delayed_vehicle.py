@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
-from brakeline.sim.arena import Arena
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle, clip_input
-
-Array = NDArray[np.float64]
 
 
 class DelayedVehicle:
@@ -23,42 +20,28 @@ class DelayedVehicle:
     def __init__(self, vehicle: Vehicle, robot: Robot) -> None:
         self._vehicle, self._robot = vehicle, robot
         self.input: Array = np.zeros(robot.action_dim)
+        self.initial_period, self.alter = vehicle.initial_period, vehicle.alter
 
     @property
     def true(self) -> Array:
-        """The true state (n,)."""
         return self._vehicle.true
 
     @property
     def measured(self) -> Array:
-        """The measured state (n,)."""
         return self._vehicle.measured
 
     def step(self, input: Array) -> Period:
-        """Carry out the input in force for one period, then put the argument (m,), clipped, in force.
-
-        Raises:
-            BadInput: the input is not m finite numbers.
-        """
+        """Carry out the input in force for one period, then put the argument (m,), clipped, in force."""
         following = clip_input(self._robot, input, self.input)
         period = self._vehicle.step(self.input)
         self.input = following
         return period
 
-    def initial_period(self) -> Period:
-        return self._vehicle.initial_period()
-
-    def alter(self, **changes: float) -> None:
-        self._vehicle.alter(**changes)
-
 
 def delayed(make: MakeVehicle, robot: Robot) -> MakeVehicle:
     """Return a function that makes the same vehicles with the delay of real time."""
 
-    def make_delayed(arena: Arena, rng: np.random.Generator) -> DelayedVehicle:
-        return DelayedVehicle(make(arena, rng), robot)
-
-    return make_delayed
+    return lambda arena, rng: DelayedVehicle(make(arena, rng), robot)
 
 
 def simulated_vehicle(robot: RobotWithTask, conditions: Conditions, tap: object = None) -> MakeVehicle:

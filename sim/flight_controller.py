@@ -59,18 +59,16 @@ class Gains:
 class MovingAverage:
     """The moving average `value` of the last samples."""
 
-    __slots__ = ("_samples", "_share", "_sum", "value")
+    __slots__ = ("_samples", "_share", "_size", "_sum", "value")
 
     def __init__(self, samples: int) -> None:
-        self._samples = deque([0.0] * samples)
-        self._share = 1.0 / samples
+        self._size, self._share = samples, 1.0 / samples
         self.fill(0.0)
 
     def fill(self, value: float) -> None:
         """Set all samples to one value."""
-        samples = len(self._samples)
-        self._samples = deque([value] * samples)
-        self._sum, self.value = value * samples, value
+        self._samples = deque([value] * self._size)
+        self._sum, self.value = value * self._size, value
 
     def push(self, value: float) -> float:
         """Add a sample; return the change of the average."""
@@ -109,11 +107,8 @@ class VelocityAxis:
             lag: time until the vehicle reaches a commanded acceleration [s].
         """
         self._gains, self._period = gains, period
-        self._ramped, self._rounded = (
-            MovingAverage(round(gains.ramp / period)),
-            MovingAverage(round(gains.round / period)),
-        )
-        self._eased, self._jerk = MovingAverage(round(gains.ease / period)), MovingAverage(round(gains.ease / period))
+        times = (gains.ramp, gains.round, gains.ease, gains.ease)
+        self._ramped, self._rounded, self._eased, self._jerk = (MovingAverage(round(t / period)) for t in times)
         self._late = deque([0.0] * max(round(lag / period), 1))
         self.integral = 0.0
         self.reset(0.0)
@@ -166,16 +161,14 @@ class FlightController:
         yaw_rate: rad/s; if not zero, the reference turns at this rate.
     """
 
-    def __init__(
-        self, period: float, outer_every: int, gains: Gains | None = None, body: Airframe | None = None
-    ) -> None:
+    def __init__(self, period: float, outer_every: int) -> None:
         """Start at rest.
 
         Args:
             period: time between two updates [s].
             outer_every: updates of the attitude loop for each update of the velocity loop.
         """
-        self.gains, self.body = gains or Gains(), body or Airframe()
+        self.gains, self.body = Gains(), Airframe()
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every
         g = self.gains

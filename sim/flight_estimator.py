@@ -40,11 +40,7 @@ class FlightEstimator:
     """
 
     def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
-        """Draw the first errors.
-
-        Args:
-            steps: number of calls of `advance` in a period.
-        """
+        """Draw the first errors. steps: number of calls of `advance` in a period."""
         self.noise, self._rng, self._steps = noise, rng, steps
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
         self.errors = self._next = self._draw()

@@ -31,11 +31,14 @@ class FloorPhysics:
         Args:
             mjcf: the robot, with a body `base` that has a free joint, and the floor as its first geom.
             height: height of the origin of the base above the floor [m].
-            arena: the arena; the robot stands at its start.
             sample_time: time that each call of `advance` simulates [s].
             period: time for the robot to settle on its wheels before the episode starts at time 0 [s].
         """
-        self.model = _compile(mjcf, height, arena)
+        spec = mujoco.MjSpec.from_string(mjcf)
+        add_obstacles(spec, arena)
+        add_movers(spec, arena.crowd)
+        place_base(spec.body("base"), arena, height)
+        self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.movers = MoverBodies(self.model, self.data, arena.crowd)
         self._time = -period
@@ -71,14 +74,6 @@ class FloorPhysics:
         if self.movers:
             first = first * ~self.movers.note_contacts(moving)
         return bool(np.count_nonzero(first)) and not self.movers.pushed
-
-
-def _compile(mjcf: str, height: float, arena: Arena) -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_string(mjcf)
-    add_obstacles(spec, arena)
-    add_movers(spec, arena.crowd)
-    place_base(spec.body("base"), arena, height)
-    return spec.compile()
 
 
 def place_base(base: mujoco.MjsBody, arena: Arena, height: float) -> None:

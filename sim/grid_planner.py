@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle import Array, Obstacle, Shapes
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
-
-Array = NDArray[np.float64]
 
 CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
 MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms have larger cells
@@ -48,7 +46,7 @@ class ClearanceMap:
         self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
         plan = np.stack(np.meshgrid(*axes[:2], indexing="ij"), axis=-1).reshape(-1, 2)
         shapes = Shapes.of(obstacles, dim=self.dim)
-        self.clearance: Array = _nearest(shapes, plan, *axes[2:]).reshape(self.shape)
+        self.clearance: Array = nearest_distances(shapes, plan, *axes[2:]).reshape(self.shape)
 
     def index(self, points: Array) -> NDArray[np.intp]:
         """Return the cells (..., d) of points (..., d); points beyond the walls belong to the outermost cells."""
@@ -94,7 +92,7 @@ class ClearanceMap:
         return bool(not to_reach[last])
 
 
-def _nearest(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
+def nearest_distances(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
     """Return the distances (p,) to the nearest shape from points (p, 2), or (p, q) from all points at heights (q,).
 
     This is `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so the distances

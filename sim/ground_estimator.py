@@ -7,12 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.sim.sim_conditions import NoiseLevels as NoiseLevels
-
-Array = NDArray[np.float64]
-
 
 CUT = 2.0  # standard deviations at which every sensor error is cut off
 

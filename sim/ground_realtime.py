@@ -6,35 +6,26 @@ The robot accepts a command at any sample and measures at every sample.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
-from brakeline.sim.ground_robot import GROUND, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
+from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.vehicle import clip_input
-
-Array = NDArray[np.float64]
 
 
 class RealtimeEstimator(Estimator):
     """`Estimator`, one sample at a time: between two pose fixes it returns its dead reckoning."""
 
-    def __init__(
-        self,
-        noise: NoiseLevels,
-        rng: np.random.Generator,
-        pose: Array,
-        wheels: Array,
-        wheel_radius: float,
-        sample_time: float,
-    ) -> None:
-        super().__init__(noise, rng, pose, wheels, wheel_radius, sample_time)
-        self._distances: list[float] = []  # m, since the last fix
-        self._rates: list[float] = []  # rad/s, since the last fix
+    def __init__(self, noise: NoiseLevels, rng: np.random.Generator, pose: Array, *wheels: Any) -> None:
+        super().__init__(noise, rng, pose, *wheels)
+        self._moves: list[
+            tuple[float, float]
+        ] = []  # distance [m] and turn rate [rad/s] of each sample since the last fix
         self._recent: list[tuple[float, float]] = []
 
     def add_sample(self, wheels: Array, turn_rate: float, pose: Array) -> Array:
@@ -48,13 +39,12 @@ class RealtimeEstimator(Estimator):
         distance = float(self._wheel_distances(wheels[None])[0])
         noise = self.noise.scale * self.noise.gyro * float(np.clip(self._rng.standard_normal(), -2.0, 2.0))
         rate = turn_rate + self._bias + noise
-        self._distances.append(distance)
-        self._rates.append(rate)
+        self._moves.append((distance, rate))
         self._recent = [*self._recent, (distance, rate)][-self.RECENT :]
-        path, turned = self._dead_reckon(np.array(self._distances), np.array(self._rates))
-        if len(self._distances) == SAMPLES:
+        path, turned = self._dead_reckon(*np.array(self._moves).T)
+        if len(self._moves) == SAMPLES:
             self._correct(path[-1], turned, pose)
-            self._distances, self._rates = [], []
+            self._moves = []
             x, y, heading = self.pose
         else:
             x, y, heading = self._moved(path[-1], turned)
@@ -80,20 +70,16 @@ class RealtimeGroundRobot(GroundRobot):
             physics: `payload_kg` and `floor_friction`, as for `GroundRobot`.
         """
         super().__init__(arena, rng, noise, **physics)
-        self.realtime_estimator = RealtimeEstimator(
-            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME
-        )
+        noise = noise or NoiseLevels()
+        pose, wheels = self._true_pose(), self._wheels()
+        self.realtime_estimator = RealtimeEstimator(noise, rng, pose, wheels, WHEEL_RADIUS, SAMPLE_TIME)
         self.collisions, self._touches = 0, False
-        self.closest = float(self._clearance(self.true[:2]))
+        self.closest = float(self.clearance(self.true[:2]))
         self.distance_driven = 0.0
 
     def drive(self, input: Array) -> None:
-        """Drive at (speed [m/s], turn rate [rad/s]) from now on, clipped to the robot's bounds.
-
-        Raises:
-            BadInput: the input is not two finite numbers.
-        """
-        self.input = clip_input(GROUND, input, self.input)
+        """Drive at an input (2,) from now on, clipped as by `set_input`."""
+        self.set_input(input)
         self._set_wheels(self.input)
 
     def advance(self) -> None:
@@ -107,7 +93,7 @@ class RealtimeGroundRobot(GroundRobot):
         self.true = self._true_state()
         turn_rate = wrap(pose[2] - before[2]) / SAMPLE_TIME
         self.measured = self.realtime_estimator.add_sample(self._wheels(), turn_rate, pose)
-        self.closest = min(self.closest, float(self._clearance(pose[:2])))
+        self.closest = min(self.closest, float(self.clearance(pose[:2])))
 
 
 class SpinningLidar:
@@ -131,11 +117,7 @@ class SpinningLidar:
         farthest: float = 3.5,
         mount: float = -0.032,
     ) -> None:
-        """Start the first turn.
-
-        Args:
-            noise: standard deviation of a range [m].
-        """
+        """Start the first turn. noise: standard deviation of a range [m]."""
         self.nearest, self.farthest, self.mount = nearest, farthest, mount
         self.gap = 2.0 * math.pi / beams
         angles = self.gap * np.arange(beams)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.vehicle import MakeVehicle, Period, clip_input
-
-Array = NDArray[np.float64]
+from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle, clip_input
 
 GROUND = robot_named("ground")
 MODEL = Path(__file__).with_name("ground.xml").read_text()
@@ -31,7 +30,7 @@ SAMPLE_TIME = GROUND.period / SAMPLES  # s
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of the payload
 
 
-class TurtleBot:
+class TurtleBot(SimulatedVehicle):
     """One TurtleBot3 of a world that somebody else advances.
 
     Attributes:
@@ -40,13 +39,10 @@ class TurtleBot:
         input: (2,) input executed last (speed [m/s], turn rate [rad/s]).
     """
 
-    def __init__(self, arena: Arena, data: mujoco.MjData, number: int = 0) -> None:
-        """Use one robot of a compiled model.
+    robot, samples = GROUND, SAMPLES
 
-        Args:
-            data: data of a model whose first bodies are TurtleBots.
-            number: index of this robot among them.
-        """
+    def __init__(self, arena: Arena, data: mujoco.MjData, number: int = 0) -> None:
+        """Use robot `number` of a compiled model whose first bodies are TurtleBots."""
         q, v, u = COORDINATES * number, SPEEDS * number, GROUND.action_dim * number
         self.arena = arena
         self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
@@ -54,12 +50,19 @@ class TurtleBot:
 
     def start_estimation(self, noise: NoiseLevels | None, rng: np.random.Generator) -> None:
         """Start to measure, once the robot has settled on its wheels."""
-        self.estimator = Estimator(
-            noise or NoiseLevels(), rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME
-        )
+        noise = noise or NoiseLevels()
+        self.estimator = Estimator(noise, rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME)
         self.true = self._true_state()
         self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
         self.input = np.zeros(GROUND.action_dim)
+
+    def step(self, input: Array) -> Period:
+        """Refuse to step one robot alone.
+
+        Raises:
+            RuntimeError: always; the robot's world advances all robots together.
+        """
+        raise RuntimeError("step the robot's world: it advances all robots together")
 
     def set_input(self, input: Array) -> None:
         """Set the input (2,) of the next period, clipped to the robot's bounds.
@@ -81,35 +84,12 @@ class TurtleBot:
         self._positions[i], self._angles[i] = self._qpos[:2], self._wheels()
         self._headings[i + 1] = self._true_heading()
 
-    def end_period(
-        self, collision: bool, contact_moving: bool = False, contact_standing: bool = False, contact_robot: bool = False
-    ) -> Period:
-        """Return the report of the period."""
+    def end_period(self, collision: bool, *contacts: bool) -> Period:
+        """Return the report of the period. contacts: moving, standing and with another robot, as in `Period`."""
         rates = np.diff(np.unwrap(self._headings)) * (SAMPLES / GROUND.period)
         reading = self.estimator.update(self._angles, rates, self._true_pose())
         self.true, self.measured = self._true_state(), reading.measured
-        distances = self._clearance(self._positions)
-        return Period(
-            self.measured,
-            self.true,
-            collision,
-            float(distances.min()),
-            float(distances[-1]),
-            reading.path,
-            reading.turned,
-            contact_moving,
-            contact_standing,
-            contact_robot,
-        )
-
-    def initial_period(self) -> Period:
-        """Return the report of a period in which nothing happened, at the present state."""
-        clearance = float(self._clearance(self.true[:2]))
-        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
-
-    def _clearance(self, positions: Array) -> Array:
-        """Return the distance from the footprint at positions (..., 2) to the nearest obstacle [m]."""
-        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - GROUND.footprint)
+        return self._report(collision, self._positions, reading.path, reading.turned, *contacts)
 
     def _set_wheels(self, input: Array) -> None:
         """Set the wheels' speeds for an input (speed [m/s], turn rate [rad/s])."""
@@ -151,44 +131,31 @@ class GroundRobot(TurtleBot):
         self._bare_mass = float(self._model.body_mass[self._base])
         self._bare_inertia = self._model.body_inertia[self._base].copy()
         self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
-        self.set_payload(payload_kg)
-        self.set_friction(floor_friction)
+        self.alter(payload_kg=payload_kg, floor_friction=floor_friction)
         mujoco.mj_forward(self._model, self._physics.data)
         self._run(np.zeros(GROUND.action_dim))
         self.start_estimation(noise, rng)
 
-    def alter(self, **changes: float) -> None:
-        """Change `payload_kg`, `floor_friction` or both, from now on.
-
-        Raises:
-            ValueError: the name is another one.
-        """
-        setters = {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
-        if unknown := changes.keys() - setters.keys():
-            raise ValueError(f"a ground robot has no {', '.join(sorted(unknown))}; it has: {', '.join(setters)}")
-        for name, value in changes.items():
-            setters[name](value)
+    def setters(self) -> dict[str, Callable[[float], None]]:
+        return {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
 
     def set_payload(self, kg: float) -> None:
         """Add a payload [kg] to the bare robot, at its centre of mass."""
-        if not (math.isfinite(kg) and kg >= 0.0):
-            raise ValueError(f"a payload is 0 kg or more, not {kg}")
         self._model.body_mass[self._base] = self._bare_mass + kg
         self._model.body_inertia[self._base] = self._bare_inertia + kg * PAYLOAD_GYRATION**2
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
 
     def set_friction(self, coefficient: float) -> None:
-        """Set the friction between wheels and floor (1: rubber on a dry floor; 0.1: ice)."""
-        if not (math.isfinite(coefficient) and coefficient > 0.0):
-            raise ValueError(f"a friction coefficient is positive, not {coefficient}")
+        """Set the friction between wheels and floor (1: rubber on a dry floor; 0.1: ice).
+
+        Raises:
+            ValueError: the coefficient is zero.
+        """
+        if coefficient == 0.0:
+            raise ValueError("floor_friction is positive, not 0")
         self._model.geom_friction[self._wheel_geoms, 0] = coefficient
 
     def step(self, input: Array) -> Period:
-        """Drive one period at (speed [m/s], turn rate [rad/s]), clipped to the robot's bounds.
-
-        Raises:
-            BadInput: the input is not two finite numbers.
-        """
         self.set_input(input)
         return self.end_period(self._run(self.input), *self._physics.movers.contacts)
 

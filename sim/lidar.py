@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.obstacle import Array, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import cut_normal
 from brakeline.sim.mujoco_obstacles import HEIGHT, MoverBodies, map_model
-
-Array = NDArray[np.float64]
 
 
 class Lidar:

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
-from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.obstacle import Array, Obstacle
 from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
@@ -25,12 +25,15 @@ from brakeline.sim.top_view import Image, TopView, Window
 from brakeline.sim.traffic import Crowd, CrowdSensor
 from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle
 
-Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Info = dict[str, Any]
 StepResult = tuple[Observation, float, bool, bool, Info]
 DrawArena = Callable[[str, np.random.Generator, RobotWithTask], Arena]
 
+REPORTED = (  # fields of a `Period` that `info` has too
+    *("collision", "contact_moving", "contact_standing", "contact_robot"),
+    *("clearance", "subsamples", "turned"),
+)
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
 
@@ -98,14 +101,11 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         Args:
             robot: a robot with its task, or its name (`"ground"`), or the path of its file.
             arena: the name of one of the task's arenas.
-            make_vehicle: puts a vehicle at the start of an arena, for one episode. Defaults to the task's simulator
-                under `conditions`.
-            conditions: sensor noise, payload, friction, wind, and the source of free space (`perception`).
+            make_vehicle: puts a vehicle at the start of an arena. Defaults to the task's simulator under `conditions`.
             lidar_noise: standard deviation of a range [m]. Defaults to the conditions' value for this robot.
             seed_key: a number that is 0 or more; environments with different keys have different episodes.
             reward: replaces the task's reward.
             draw: draws the arena of an episode.
-            render_mode: None, "rgb_array" or "human".
 
         Raises:
             UnknownRobot: no robot has this name.
@@ -126,8 +126,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self.observation_space = Box(-limit, limit, dtype=np.float32)
         self._make_observation_model = self.task.code(self.task.senses)
         self._make_vehicle = make_vehicle or simulated_vehicle(self.robot, self.conditions)
-        flies = self.robot.position_dim == 3
-        self._lidar_noise = self.conditions.lidar_noise(flies) if lidar_noise is None else lidar_noise
+        if lidar_noise is None:
+            lidar_noise = self.conditions.lidar_noise(flies=self.robot.position_dim == 3)
+        self._lidar_noise = lidar_noise
         self._draw = draw
         self._measurement_bound = np.asarray(self.robot.measurement_bound)
         self._changes: dict[str, float] = {}
@@ -156,8 +157,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         super().reset(seed=seed)
         options = options or {}
         self.arena_name = options.get("arena", self.arena_name)
-        episode_seed = options["episode_seed"] if "episode_seed" in options else self.np_random.integers(2**31)
-        self._episode_seed = int(episode_seed)
+        given = "episode_seed" in options
+        self._episode_seed = int(options["episode_seed"] if given else self.np_random.integers(2**31))
         rng = np.random.default_rng((self.seed_key, self._episode_seed))
         self._arena = self._draw(self.arena_name, rng, self.robot)
         self._vehicle = self._make_vehicle(self._arena, rng)
@@ -189,10 +190,9 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         before, self._distance = self._distance, self._goal_distance(period.true)
         at_goal = self._at_goal(period)
         reward = self.reward.progress * (before - self._distance)
-        hit = period.collision or period.contact_moving or period.contact_robot
-        reward += self.reward.goal * at_goal + self.reward.collision * hit
+        reward += self.reward.goal * at_goal + self.reward.collision * period.at_fault
         reward += self.reward.run_into * period.contact_standing
-        terminated = at_goal or hit or (period.contact_standing and self._crowd_pushes)
+        terminated = at_goal or period.at_fault or (period.contact_standing and self._crowd_pushes)
         truncated = not terminated and self._steps >= self._arena.step_limit
         result = self._observe(), float(reward), terminated, truncated, self._info(period)
         self._show()
@@ -216,9 +216,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             self._window.show(self._image())
 
     def _image(self) -> Image:
-        vehicle = self.vehicle
         self._view = self._view or TopView(self.robot, self._arena)
-        return self._view.draw(vehicle.true, self._time)
+        return self._view.draw(self.vehicle.true, self._time)
 
     @property
     def _time(self) -> float:
@@ -229,9 +228,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         return math.dist(self._arena.goal, state[: self.robot.position_dim])
 
     def _at_goal(self, period: Period) -> bool:
-        return self._distance <= self._arena.goal_radius and not (
-            period.collision or period.contact_moving or period.contact_standing or period.contact_robot
-        )
+        return self._distance <= self._arena.goal_radius and not (period.at_fault or period.contact_standing)
 
     def _observe(self) -> Observation:
         vehicle = self.vehicle
@@ -255,11 +252,11 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         return [measured[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:
-        position = period.measured[: self.robot.position_dim]
         obstacles, scan = [], {}
         if self._scanner is not None:
             scan["scan"] = self._scanner.scan(period.true, period.measured, self._time)
         else:
+            position = period.measured[: self.robot.position_dim]
             near = self._arena.shapes.distance(position) <= self.robot.sight
             obstacles = [self._arena.obstacles[i] for i in np.flatnonzero(near)] + self._moving_obstacles(position)
         return {
@@ -273,14 +270,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             "arena": self._arena,
             "goal": self._arena.goal,
             "time": self._time,
-            "collision": period.collision,
-            "contact_moving": period.contact_moving,
-            "contact_standing": period.contact_standing,
-            "contact_robot": period.contact_robot,
+            **{name: getattr(period, name) for name in REPORTED},
             "at_goal": self._at_goal(period),
-            "clearance": period.clearance,
             "speed": self._observation_model.speed(period.true),
-            "subsamples": period.subsamples,
-            "turned": period.turned,
             "episode_seed": self._episode_seed,
         }

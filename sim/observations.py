@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.traffic import Crowd, CrowdSensor, OtherRobots
 
-Array = NDArray[np.float64]
-
 GOAL_DISTANCE_SCALE = 5.0  # m, the distance to the goal that a robot in the plane observes as 1
 
 
-class ObservationModel(Protocol):
+class ObservationModel(ABC):
     """The observations of one robot in one episode."""
 
+    LIDAR_X = 0.0  # m, the lidar's position on the robot's x axis, from the position in the state
+
+    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
+        self._robot, self._goal = robot, arena.goal
+        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
+
+    @abstractmethod
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         """Return the observation after a period, not yet clipped. Call it once a period: a model may have memory.
 
@@ -32,24 +36,16 @@ class ObservationModel(Protocol):
             time: s, to place moving obstacles.
         """
 
+    @abstractmethod
     def speed(self, state: Array) -> float:
         """Return the speed in a state (n,), m/s."""
 
-
-@dataclass
-class TurnMemory:
-    """A first-order low-pass filter of the measured turn rate: the only memory in an observation.
-
-    A policy without memory dithers in front of an obstacle that it can pass on both sides: once it has turned a
-    little to one side, noise makes the other side look better. With this value the policy knows in which direction
-    it has turned for about `TIME` seconds, and can go on turning that way.
-    """
-
-    TIME = 2.0  # s
-    value: float = 0.0  # rad/s
-
-    def update(self, turn_rate: float, period: float) -> None:
-        self.value += (1.0 - math.exp(-period / self.TIME)) * (turn_rate - self.value)
+    def _shares(self, origin: Array, heading: float, time: float) -> Array:
+        """Return the lidar's ranges (R,) from a point (d,), as shares of its largest range."""
+        self._lidar.move_obstacles(time)
+        if self.LIDAR_X:
+            origin = origin + self.LIDAR_X * np.array([math.cos(heading), math.sin(heading)])
+        return self._lidar.ranges(origin, heading) / self._lidar.max_range
 
 
 def goal_in_polar(measured: Array, goal: tuple[float, ...]) -> tuple[float, float, float]:
@@ -59,15 +55,19 @@ def goal_in_polar(measured: Array, goal: tuple[float, ...]) -> tuple[float, floa
     return math.hypot(dx, dy) / GOAL_DISTANCE_SCALE, math.sin(bearing), math.cos(bearing)
 
 
-class GroundObservation:
-    """18 lidar ranges ahead, the goal in polar coordinates, speeds, the last input, and `TurnMemory`."""
+class GroundObservation(ObservationModel):
+    """18 lidar ranges ahead, the goal in polar coordinates, speeds, the last input, and the turn memory.
 
-    LIDAR_X = -0.032  # m, the lidar's position on the robot's x axis, from the middle of the axle
+    The turn memory is the measured turn rate after a low-pass filter, and the only memory in an observation. A policy
+    without memory dithers in front of an obstacle that it can pass on both sides: once it has turned a little to one
+    side, noise makes the other side look better. With the turn memory it knows in which direction it has turned for
+    about `MEMORY_TIME` seconds, and can go on turning that way.
+    """
 
-    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
-        self._robot, self._goal = robot, arena.goal
-        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
-        self._memory = TurnMemory()
+    MEMORY_TIME = 2.0  # s
+    LIDAR_X = -0.032  # m from the middle of the axle
+
+    _turn_memory = 0.0  # rad/s
 
     def speed(self, state: Array) -> float:
         return float(state[3])
@@ -75,17 +75,16 @@ class GroundObservation:
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         largest = self._robot.high()
         _, _, _, speed, turn_rate = measured
-        self._memory.update(float(turn_rate), self._robot.period)
+        share = 1.0 - math.exp(-self._robot.period / self.MEMORY_TIME)
+        self._turn_memory += share * (float(turn_rate) - self._turn_memory)
         own = (
             *goal_in_polar(measured, self._goal),
             speed / largest[0],
             turn_rate / largest[1],
             *(input / largest),
-            self._memory.value / largest[1],
+            self._turn_memory / largest[1],
         )
-        self._lidar.move_obstacles(time)
-        mount = true[:2] + self.LIDAR_X * np.array([math.cos(true[2]), math.sin(true[2])])
-        return np.concatenate((self._lidar.ranges(mount, true[2]) / self._lidar.max_range, own))
+        return np.concatenate((self._shares(true[:2], true[2], time), own))
 
 
 class TrackingObservation(GroundObservation):
@@ -147,7 +146,7 @@ class TrackingObservation(GroundObservation):
         return tracks.ravel()
 
 
-class PlanarObservation:
+class PlanarObservation(ObservationModel):
     """The observation of any robot with a heading.
 
     It consists of lidar ranges from the robot's position, the goal in polar coordinates, the state entries after the
@@ -155,8 +154,7 @@ class PlanarObservation:
     """
 
     def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
-        self._robot, self._goal = robot, arena.goal
-        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
+        super().__init__(robot, arena, rng, lidar_noise)
         self._largest = np.maximum(np.abs(robot.low()), robot.high())
         full = robot.state_at_inputs(self._largest)[3:]
         self._scales = np.where(full > 0.0, full, 1.0)
@@ -167,11 +165,10 @@ class PlanarObservation:
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         own = (*goal_in_polar(measured, self._goal), *(measured[3:] / self._scales), *(input / self._largest))
-        self._lidar.move_obstacles(time)
-        return np.concatenate((self._lidar.ranges(true[:2], float(true[2])) / self._lidar.max_range, own))
+        return np.concatenate((self._shares(true[:2], float(true[2]), time), own))
 
 
-class QuadrotorObservation:
+class QuadrotorObservation(ObservationModel):
     """180 lidar ranges all around, from a levelled lidar; the offset to the goal, the velocity, and the last input.
 
     The offset o is observed as o / (|o| + `GOAL_SCALE`): its direction is exact at any distance, and near the goal a
@@ -180,17 +177,11 @@ class QuadrotorObservation:
 
     GOAL_SCALE = 5.0  # m
 
-    def __init__(self, robot: RobotWithTask, arena: Arena, rng: np.random.Generator, lidar_noise: float) -> None:
-        self._robot, self._goal = robot, np.asarray(arena.goal)
-        self._lidar = Lidar(arena, robot.task.rays, lidar_noise, rng)
-
     def speed(self, state: Array) -> float:
         return math.hypot(*state[3:6])
 
     def observe(self, true: Array, measured: Array, input: Array, time: float = 0.0) -> Array:
         largest = self._robot.high()
-        offset = self._goal - measured[:3]
+        offset = np.asarray(self._goal) - measured[:3]
         goal = offset / (math.hypot(*offset) + self.GOAL_SCALE)
-        self._lidar.move_obstacles(time)
-        ranges = self._lidar.ranges(true[:3])
-        return np.concatenate((ranges / self._lidar.max_range, goal, measured[3:6] / largest, input / largest))
+        return np.concatenate((self._shares(true[:3], 0.0, time), goal, measured[3:6] / largest, input / largest))

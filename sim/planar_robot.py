@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.obstacle import Array, rotate
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import NoiseLevels, cut_normal, heading_of, wrap
-from brakeline.sim.vehicle import Period, clip_input
-
-Array = NDArray[np.float64]
+from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
 
 SAMPLES = 10  # of the position in a period
 SCALE_ERROR = 0.003  # standard deviation of odometry's relative error, constant over an episode
 HEADING_ERROR = 0.002  # rad, standard deviation of odometry's error of the change of heading in a period
 
 
-class PlanarRobot:
-    """One robot in one arena (`brakeline.sim.vehicle.Vehicle`); see `FloorPhysics` for its model.
+class PlanarRobot(SimulatedVehicle):
+    """One robot in one arena; see `FloorPhysics` for its model.
 
     The state is (x [m], y [m], heading [rad]) of the base's origin, then `speeds()`. The measured state has a normal
     error, cut off at the bounds of the robot's description.
@@ -31,6 +28,8 @@ class PlanarRobot:
         input: (m,) input executed last.
         model, data: MuJoCo's.
     """
+
+    samples = SAMPLES
 
     def __init__(
         self, robot: Robot, model: str, height: float, arena: Arena, rng: np.random.Generator, noise: NoiseLevels
@@ -65,43 +64,14 @@ class PlanarRobot:
         raise NotImplementedError
 
     def step(self, input: Array) -> Period:
-        """Carry out an input (m,) for one period.
-
-        Raises:
-            BadInput: the input is not m finite numbers.
-        """
         self.input = clip_input(self.robot, input, self.input)
         before = self.true
         poses, collision = self._run()
         self.true = self._state()
         self.measured = self._measure()
-        distances = self._clearance(poses)
         path = self._odometry_scale * rotate(poses[:, :2] - before[:2], -float(before[2]))
         turned = wrap(float(self.true[2] - before[2])) + float(cut_normal(self._rng, self._noise * HEADING_ERROR, ()))
-        return Period(
-            self.measured,
-            self.true,
-            collision,
-            float(distances.min()),
-            float(distances[-1]),
-            path,
-            turned,
-            *self._physics.movers.contacts,
-        )
-
-    def initial_period(self) -> Period:
-        """Return the report of a period in which nothing happened, at the present state."""
-        clearance = float(self._clearance(self.true[:3]))
-        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 2)), 0.0)
-
-    def alter(self, **changes: float) -> None:
-        """Refuse every change; a subclass may allow some.
-
-        Raises:
-            ValueError: always.
-        """
-        if changes:
-            raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(changes))}")
+        return self._report(collision, poses, path, turned, *self._physics.movers.contacts)
 
     def body_velocity(self) -> Array:
         """Return the velocity (2,) of the base's origin in its own frame, m/s."""
@@ -130,8 +100,8 @@ class PlanarRobot:
         measured[2] = wrap(float(measured[2]))
         return np.asarray(measured)
 
-    def _clearance(self, poses: Array) -> Array:
-        """Return the distance from the nearest disc of the body at poses (..., 3) to the nearest obstacle [m]."""
-        turned = rotate(np.broadcast_to(self._discs, (*poses.shape[:-1], *self._discs.shape)), poses[..., 2, None])
-        centres = poses[..., None, :2] + turned
+    def clearance(self, states: Array) -> Array:
+        """Return the distance [m] from the nearest disc of the body at poses (..., 3) to the nearest obstacle."""
+        turned = rotate(np.broadcast_to(self._discs, (*states.shape[:-1], *self._discs.shape)), states[..., 2, None])
+        centres = states[..., None, :2] + turned
         return np.asarray((self.arena.shapes.distance(centres).min(axis=0) - self._radii).min(axis=-1))

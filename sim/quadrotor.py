@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
-from brakeline.sim.flight_controller import GRAVITY, Airframe, FlightController, Gains, Vector
-from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, rotate
+from brakeline.sim.flight_controller import GRAVITY, FlightController, Vector
+from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, Quaternion, rotate
 from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
-from brakeline.sim.vehicle import Period, clip_input
+from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
 from brakeline.sim.wind import Wind, WindProcess
-
-Array = NDArray[np.float64]
 
 QUADROTOR = robot_named("quadrotor")
 MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
@@ -31,7 +31,7 @@ STANDING = 0.15  # m/s; below this speed, and at the setpoint zero, it hovers in
 SETTLE = 5  # periods of hovering before the episode starts
 
 
-class Quadrotor:
+class Quadrotor(SimulatedVehicle):
     """One quadrotor in one arena, hovering at its start, or standing on the floor with its motors off.
 
     `controller` holds the heading at zero (east) by default.
@@ -44,13 +44,14 @@ class Quadrotor:
         on_floor: whether the vehicle touched the floor in the last physics step.
     """
 
+    robot, samples = QUADROTOR, SAMPLES
+
     def __init__(
         self,
         arena: Arena,
         rng: np.random.Generator,
         noise: QuadrotorNoise | None = None,
         wind: Wind | None = None,
-        gains: Gains | None = None,
         floor: float | None = None,
     ) -> None:
         """Place the vehicle at the start of an arena.
@@ -63,8 +64,8 @@ class Quadrotor:
         self._data = mujoco.MjData(self._model)
         self.timestep: float = self._model.opt.timestep
         self._steps_per_sample = round(QUADROTOR.period / SAMPLES / self.timestep)
-        self._body = Airframe()
-        self.controller = FlightController(self.timestep, OUTER_EVERY, gains, self._body)
+        self.controller = FlightController(self.timestep, OUTER_EVERY)
+        self._body = self.controller.body
         steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
         self._rng, self._wind = rng, wind or Wind()
@@ -87,11 +88,6 @@ class Quadrotor:
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:
-        """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and to the slew from the one before.
-
-        Raises:
-            BadInput: the input is not three finite numbers.
-        """
         self.input = clip_input(QUADROTOR, input, self.input)
         x, y, z = self.input.tolist()
         self.controller.setpoint = (x, y, z)
@@ -100,8 +96,7 @@ class Quadrotor:
         for i in range(SAMPLES):
             self.advance(self._steps_per_sample)
             path[i] = self.position_and_velocity()[0]
-        self.measured = self.estimated_state(self.estimate())
-        return self.end_period(self.measured, path - start)
+        return self.end_period(self.estimated_state(self.estimate()), path - start)
 
     def begin_period(self) -> None:
         """Begin to record contacts and positions."""
@@ -116,33 +111,20 @@ class Quadrotor:
             measured: (9,) measured state at the end.
             path: (S, 3) m, estimated positions from the start of the period.
         """
-        self.true = self.state()
-        distances = self.clearance(np.array(self._path))
-        closest, clearance = float(distances.min()), float(distances[-1])
-        return Period(measured, self.true, self.collided, closest, clearance, path, 0.0, *self._movers.contacts)
+        self.true, self.measured = self.state(), measured
+        return self._report(self.collided, np.array(self._path), path, 0.0, *self._movers.contacts)
 
-    def initial_period(self) -> Period:
-        """Return the report of a period in which nothing happened, at the present state."""
-        clearance = float(self.clearance(self.true[:3]))
-        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
+    def setters(self) -> dict[str, Callable[[float], None]]:
+        speed, gust = partial(self._set_wind, "speed"), partial(self._set_wind, "gust")
+        return {"payload_kg": self._set_payload, "wind_speed": speed, "gust": gust}
 
-    def alter(self, **changes: float) -> None:
-        """Change `payload_kg` (at the centre of mass), `wind_speed` or `gust` [m/s], from now on.
+    def _set_payload(self, kg: float) -> None:
+        self._model.body_mass[self._model.body("base").id] = self._body.mass + kg
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
 
-        Raises:
-            ValueError: the name is another one, or the value is negative or not finite.
-        """
-        for name, value in changes.items():
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} is 0 or more, not {value}")
-            if name == "payload_kg":
-                self._model.body_mass[self._model.body("base").id] = self._body.mass + value
-                mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
-            elif name in ("wind_speed", "gust"):
-                self._wind = replace(self._wind, **{"speed" if name == "wind_speed" else name: value})
-                self._wind_process = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
-            else:
-                raise ValueError(f"a quadrotor has no {name}; it has: payload_kg, wind_speed, gust")
+    def _set_wind(self, name: str, value: float) -> None:
+        self._wind = replace(self._wind, **{name: value})
+        self._wind_process = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
 
     def advance(self, steps: int) -> None:
         """Advance by some physics steps, each with the rotors' thrusts from the controller."""
@@ -211,17 +193,20 @@ class Quadrotor:
 
     def estimate(self) -> Estimate:
         """Return the full estimate now."""
-        px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
-        vx, vy, vz, p, q, r = self._data.qvel.tolist()
-        return self._estimator.read((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), self._acceleration)
+        return self._estimator.read(*self._motion(), self._acceleration)
 
     def true_reading(self) -> Estimate:
         """Return the estimate that sensors without errors would give now."""
+        position, velocity, attitude, rates = self._motion()
+        w, x, y, z = attitude
+        ax, ay, az = self._acceleration
+        return Estimate(position, velocity, attitude, rates, rotate((w, -x, -y, -z), (ax, ay, az + GRAVITY)))
+
+    def _motion(self) -> tuple[Vector, Vector, Quaternion, Vector]:
+        """Return the true position, velocity, attitude and body rates."""
         px, py, pz, qw, qx, qy, qz = self._data.qpos.tolist()
         vx, vy, vz, p, q, r = self._data.qvel.tolist()
-        ax, ay, az = self._acceleration
-        force = rotate((qw, -qx, -qy, -qz), (ax, ay, az + GRAVITY))
-        return Estimate((px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r), force)
+        return (px, py, pz), (vx, vy, vz), (qw, qx, qy, qz), (p, q, r)
 
     def state(self) -> Array:
         """Return the true state (9,); its acceleration is the mean over the last physics step."""
@@ -231,12 +216,6 @@ class Quadrotor:
     def estimated_state(estimate: Estimate) -> Array:
         """Return the state (9,) of an estimate."""
         return np.array([*estimate.position, *estimate.velocity, *estimate.acceleration])
-
-    def clearance(self, positions: Array) -> Array:
-        """Return the distance [m] from the footprint at positions (..., 3) to the nearest obstacle; inf without any."""
-        if not len(self.arena.shapes):
-            return np.full(positions.shape[:-1], math.inf)
-        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - QUADROTOR.footprint)
 
     def _hover(self) -> None:
         """Start in steady hover: rotors at hovering thrust, tilted against the mean wind, holding the start."""

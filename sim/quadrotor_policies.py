@@ -7,14 +7,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 from brakeline.sim.grid_planner import Routes
 from brakeline.sim.scripted_policies import Observation, ScriptedPolicy, vector_to_nearest
-
-Array = NDArray[np.float64]
 
 
 def full_speed(robot: Robot, direction: Array) -> Array:

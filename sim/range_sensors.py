@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot
@@ -24,32 +24,34 @@ from brakeline.sim.lidar import Lidar
 from brakeline.sim.sim_conditions import Perception as Perception
 from brakeline.sim.traffic import Crowd
 
-Array = NDArray[np.float64]
 S = TypeVar("S", Scan, RangeImage)
 
 
 class Scanner(ABC, Generic[S]):
     """One robot's range sensor in one episode."""
 
+    DIRECTIONS: Array  # (R, d) unit vectors of the beams
+    NEAR: float  # m; nearer ranges are reported as 0
+    FAR: float  # m, largest range
+    LEAST_WIDTH: float  # m, of every obstacle in the arenas
+
     def __init__(
-        self,
-        robot: Robot,
-        arena: Arena,
-        rays: LidarRays,
-        least_range: float,
-        rng: np.random.Generator,
-        noise: float,
-        perception: Perception,
+        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
     ) -> None:
-        """least_range: m, nearer ranges are reported as 0; noise: standard deviation of a range [m]."""
-        self._faults, self._rng, self._noise, self._least_range = perception.faults, rng, noise, least_range
-        self._lidar = Lidar(arena, rays, noise, rng)
-        self._azimuths = np.arctan2(rays.directions[:, 1], rays.directions[:, 0])
-        self._position_error = math.hypot(*robot.measurement_bound[: robot.position_dim])
-        self._period = robot.period
+        """noise: standard deviation of a range [m]."""
+        self._robot, self._faults, self._rng = robot, perception.faults, rng
+        self._lidar = Lidar(arena, LidarRays(self.DIRECTIONS, self.FAR), noise, rng)
+        self._azimuths = np.arctan2(self.DIRECTIONS[:, 1], self.DIRECTIONS[:, 0])
         movers = arena.crowd.kind if isinstance(arena.crowd, Crowd) else None
-        self._speed = movers.speed if movers else 0.0
         self._tracked = movers if perception.tracks else None
+        self._limits: dict[str, Any] = {
+            "far": self.FAR,
+            "range_error": CUT * noise,
+            "position_error": math.hypot(*robot.measurement_bound[: robot.position_dim]),
+            "least_width": self.LEAST_WIDTH,
+            "doubt": int(self._faults.far > 0.0),
+            "speed": movers.speed if movers else 0.0,
+        }
         self._queue: list[S] = []
 
     def scan(self, true: Array, measured: Array, time: float) -> S:
@@ -63,7 +65,7 @@ class Scanner(ABC, Generic[S]):
         self._queue.append(self._take_scan(true, measured))
         if len(self._queue) > self._faults.late + 1:
             self._queue.pop(0)
-        return replace(self._queue[0], age=self._period * (len(self._queue) - 1))
+        return replace(self._queue[0], age=self._robot.period * (len(self._queue) - 1))
 
     @abstractmethod
     def _take_scan(self, true: Array, measured: Array) -> S:
@@ -72,11 +74,11 @@ class Scanner(ABC, Generic[S]):
     def _faulty(self, ranges: Array) -> Array:
         """Return ranges with the sensor's faults."""
         faults, draw, count = self._faults, self._rng.random, len(ranges)
-        ranges = np.where(ranges < self._least_range, 0.0, ranges)
+        ranges = np.where(ranges < self.NEAR, 0.0, ranges)
         if faults.far:
             ranges = np.where((draw(count) < faults.far) & (ranges > 0.0), self._lidar.max_range, ranges)
         if faults.ghosts:
-            ghosts = np.maximum(self._least_range, ranges * draw(count))
+            ghosts = np.maximum(self.NEAR, ranges * draw(count))
             ranges = np.where((draw(count) < faults.ghosts) & (ranges > 0.0), ghosts, ranges)
         if faults.dropped:
             ranges = np.where(draw(count) < faults.dropped, 0.0, ranges)
@@ -88,62 +90,37 @@ class Scanner(ABC, Generic[S]):
 class FanScanner(Scanner[Scan]):
     """A scanner in the plane, as the LDS-01."""
 
-    BEAMS, FAR, NEAR = 360, 3.5, 0.12  # number of beams; m, largest and least range
+    ANGLES = np.linspace(-math.pi, math.pi, 360, endpoint=False)
+    DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+    NEAR, FAR, LEAST_WIDTH = 0.12, 3.5, 0.1
     MOUNT = (-0.032, 0.0)  # m in the robot's frame
-    LEAST_WIDTH = 0.1  # m, of every obstacle in the arenas
-
-    def __init__(
-        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
-    ) -> None:
-        """Raises ValueError: the robot has no heading."""
-        if robot.heading is None:
-            raise ValueError(f"{robot.name} has no heading, so it cannot carry a scanner; use --perception map")
-        self._angles = np.linspace(-math.pi, math.pi, self.BEAMS, endpoint=False)
-        rays = LidarRays(np.stack([np.cos(self._angles), np.sin(self._angles)], axis=1), self.FAR)
-        super().__init__(robot, arena, rays, self.NEAR, rng, noise, perception)
-        self._heading, self._heading_error = robot.heading, robot.measurement_bound[robot.heading]
 
     def _take_scan(self, true: Array, measured: Array) -> Scan:
-        x, y, heading = float(true[0]), float(true[1]), float(true[self._heading])
+        index = self._robot.heading
+        assert index is not None
+        x, y, heading = float(true[0]), float(true[1]), float(true[index])
         cos, sin, (mx, my) = math.cos(heading), math.sin(heading), self.MOUNT
         origin = np.array([x + cos * mx - sin * my, y + sin * mx + cos * my])
         return Scan(
             self._faulty(self._lidar.ranges(origin, heading)),
-            self._angles,
-            (float(measured[0]), float(measured[1]), float(measured[self._heading])),
+            self.ANGLES,
+            (float(measured[0]), float(measured[1]), float(measured[index])),
             self.MOUNT,
-            far=self.FAR,
-            range_error=CUT * self._noise,
-            position_error=self._position_error,
-            heading_error=self._heading_error,
-            least_width=self.LEAST_WIDTH,
-            doubt=int(self._faults.far > 0.0),
-            speed=self._speed,
+            heading_error=self._robot.measurement_bound[index],
             acceleration=self._tracked.acceleration if self._tracked else 0.0,
             least_radius=self._tracked.radius if self._tracked else 0.0,
+            **self._limits,
         )
 
 
 class DomeScanner(Scanner[RangeImage]):
     """A scanner in all directions. It reports beams in the world's frame, turned back by an inexact attitude."""
 
-    RINGS, COLUMNS, FAR, NEAR = 90, 180, 20.0, 0.2  # one beam every 2°; m, largest and least range
+    RINGS, COLUMNS = 90, 180  # one beam every 2°
     LOW = -0.5 * math.pi * (1.0 - 1.0 / RINGS)  # rad, elevation of the lowest ring
-    LEAST_WIDTH = 0.8  # m, of every obstacle in the arenas
+    DIRECTIONS = directions(np.linspace(LOW, -LOW, RINGS), COLUMNS).reshape(-1, 3)
+    NEAR, FAR, LEAST_WIDTH = 0.2, 20.0, 0.8
     TILT_ERROR = 0.01  # rad, largest error of the attitude
-
-    def __init__(
-        self, robot: Robot, arena: Arena, rng: np.random.Generator, noise: float, perception: Perception
-    ) -> None:
-        """Make a scanner without tracks.
-
-        Raises:
-            ValueError: the conditions ask for tracks.
-        """
-        if perception.tracks:
-            raise ValueError("no tracker works in space: leave out --tracks")
-        beams = directions(np.linspace(self.LOW, -self.LOW, self.RINGS), self.COLUMNS)
-        super().__init__(robot, arena, LidarRays(beams.reshape(-1, 3), self.FAR), self.NEAR, rng, noise, perception)
 
     def _take_scan(self, true: Array, measured: Array) -> RangeImage:
         ranges = self._faulty(self._lidar.ranges(true[:3], _random_rotation(self._rng, self.TILT_ERROR)))
@@ -152,13 +129,8 @@ class DomeScanner(Scanner[RangeImage]):
             (float(measured[0]), float(measured[1]), float(measured[2])),
             low=self.LOW,
             high=-self.LOW,
-            far=self.FAR,
-            range_error=CUT * self._noise,
-            position_error=self._position_error,
             angle_error=self.TILT_ERROR,
-            least_width=self.LEAST_WIDTH,
-            doubt=int(self._faults.far > 0.0),
-            speed=self._speed,
+            **self._limits,
         )
 
 
@@ -177,6 +149,12 @@ def make_scanner(
     """Return the scanner of a robot in the plane or in space.
 
     Raises:
-        ValueError: the robot cannot carry a scanner.
+        ValueError: the robot cannot carry a scanner, or the conditions ask for tracks in space.
     """
-    return (FanScanner if robot.position_dim == 2 else DomeScanner)(robot, arena, rng, noise, perception)
+    if robot.position_dim == 3:
+        if perception.tracks:
+            raise ValueError("no tracker works in space: leave out --tracks")
+        return DomeScanner(robot, arena, rng, noise, perception)
+    if robot.heading is None:
+        raise ValueError(f"{robot.name} has no heading, so it cannot carry a scanner; use --perception map")
+    return FanScanner(robot, arena, rng, noise, perception)

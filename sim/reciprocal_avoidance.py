@@ -9,12 +9,10 @@ resolves the deadlock of a symmetric situation.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.grid_planner import ClearanceMap
-
-Array = NDArray[np.float64]
 
 OFFSETS = np.radians(np.array([0, -12, 12, -24, 24, -36, 36, -50, 50, -70, 70, -95, 95, -130, 130, 180], dtype=float))
 LEFT_COST = 0.08  # rad, extra cost of a turn to the left

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import UnknownPolicy
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import Array, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
@@ -21,7 +21,6 @@ from brakeline.sim.grid_planner import Routes
 from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.reciprocal_avoidance import ReciprocalAvoidance
 
-Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Policy = Callable[[Observation, dict[str, Any]], Array]  # (observation, info) -> input in physical units
 

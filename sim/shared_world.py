@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import NoFleet
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, same_room
 from brakeline.sim.arena_generator import arena_kind, draw_fleet
@@ -19,8 +20,6 @@ from brakeline.sim.navigation_env import Info, NavigationEnv, StepResult
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.traffic import OtherRobots
 from brakeline.sim.vehicle import Period
-
-Array = NDArray[np.float64]
 
 ROBOT_BIT = 4  # the contact bit with which robots touch each other
 FLOOR, OBSTACLE = -1, -2  # owners of a geom that belongs to no robot
@@ -43,27 +42,6 @@ def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditi
         raise NoFleet("a fleet drives by the map (--perception map): a scan shows other robots as walls")
 
 
-class FleetRobot(TurtleBot):
-    """One robot of a world; only the world advances it."""
-
-    def step(self, input: Array) -> Period:
-        """Refuse to step one robot alone; step the world instead.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError("step the robot's world: it advances all robots together")
-
-    def alter(self, **changes: float) -> None:
-        """Refuse every change, since the world fixes the conditions of its fleet.
-
-        Raises:
-            ValueError: always.
-        """
-        if changes:
-            raise ValueError(f"a robot of a fleet cannot change {', '.join(sorted(changes))} during a run")
-
-
 class GroundWorld:
     """Several robots in one room, each at the start of its arena.
 
@@ -73,15 +51,10 @@ class GroundWorld:
     """
 
     def __init__(self, arenas: Sequence[Arena], rngs: Sequence[np.random.Generator], conditions: Conditions) -> None:
-        """Place a robot at the start of each arena.
-
-        Args:
-            arenas: the same room with different starts and goals.
-            rngs: the sources of each robot's sensor errors.
-        """
+        """Place a robot at the start of each arena: the same room with different starts and goals."""
         self._model = _build(arenas, conditions)
         self._data = mujoco.MjData(self._model)
-        self.robots = [FleetRobot(arena, self._data, i) for i, arena in enumerate(arenas)]
+        self.robots = [TurtleBot(arena, self._data, i) for i, arena in enumerate(arenas)]
         self._owner = _owners(self._model, len(arenas))
         self._physics_steps = round(SAMPLE_TIME / self._model.opt.timestep)
         self._touching: set[tuple[int, int]] = set()
@@ -92,15 +65,11 @@ class GroundWorld:
             robot.start_estimation(conditions.noise, rng)
 
     def step(self, inputs: Sequence[Array]) -> list[Period]:
-        """Advance all robots by one period, each with its input (2,).
-
-        Raises:
-            BadInput: an input is not two finite numbers.
-        """
+        """Advance all robots by one period, each with its input (2,). Raises as `TurtleBot.set_input`."""
         for robot, input in zip(self.robots, inputs, strict=True):
             robot.set_input(input)
         collided, met = self._run([robot.input for robot in self.robots])
-        return [robot.end_period(i in collided, contact_robot=i in met) for i, robot in enumerate(self.robots)]
+        return [robot.end_period(i in collided, False, False, i in met) for i, robot in enumerate(self.robots)]
 
     def _run(self, inputs: Sequence[Array]) -> tuple[set[int], set[int]]:
         """Run one period; return which robots touched an obstacle, and which began to touch another robot."""
@@ -139,12 +108,7 @@ class FleetEnv:
     def __init__(
         self, robot: RobotWithTask, arena: str, size: int, seed: int, conditions: Conditions | None = None
     ) -> None:
-        """seed: environments with different seeds have different episodes.
-
-        Raises:
-            NoFleet: the robots cannot share a world (`check_fleet`).
-            UnknownArena: the robot has no arena of that name.
-        """
+        """seed: environments with different seeds have different episodes. Raises as `check_fleet`."""
         self.robot, self.arena_name, self.size, self.seed = robot, arena, size, seed
         self.conditions = conditions or Conditions()
         check_fleet(robot, arena, size, self.conditions)
@@ -174,25 +138,25 @@ class _Member(NavigationEnv):
     """The environment of the i-th robot. `info` also has `others`, their measured states (size - 1, n)."""
 
     def __init__(self, fleet: FleetEnv, i: int) -> None:
-        def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
-            robots = fleet.world.robots
-
-            def positions() -> Array:
-                return np.array([other.true[:2] for j, other in enumerate(robots) if j != i])
-
-            def reported() -> tuple[Array, Array]:
-                states = fleet.other_states(i)
-                return states[:, :2], states[:, 3:4] * np.column_stack([np.cos(states[:, 2]), np.sin(states[:, 2])])
-
-            return same_room(robots[i].arena, crowd=OtherRobots(positions, robot.footprint, reported))
-
-        def make(arena: Arena, rng: np.random.Generator) -> FleetRobot:
-            return fleet.world.robots[i]
-
-        super().__init__(
-            fleet.robot, fleet.arena_name, make, conditions=fleet.conditions, seed_key=fleet.seed, draw=draw
-        )
         self._fleet, self._number = fleet, i
+        super().__init__(
+            fleet.robot,
+            fleet.arena_name,
+            lambda arena, rng: fleet.world.robots[i],
+            conditions=fleet.conditions,
+            seed_key=fleet.seed,
+            draw=lambda name, rng, robot: same_room(fleet.world.robots[i].arena, crowd=self._others()),
+        )
+
+    def _others(self) -> OtherRobots:
+        """Return the other robots of the present world as moving obstacles."""
+        robots = [robot for j, robot in enumerate(self._fleet.world.robots) if j != self._number]
+
+        def reported() -> tuple[Array, Array]:
+            states = self._fleet.other_states(self._number)
+            return states[:, :2], states[:, 3:4] * np.column_stack([np.cos(states[:, 2]), np.sin(states[:, 2])])
+
+        return OtherRobots(lambda: np.array([robot.true[:2] for robot in robots]), self.robot.footprint, reported)
 
     def _info(self, period: Period) -> Info:
         return super()._info(period) | {"others": self._fleet.other_states(self._number)}

@@ -7,22 +7,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Shapes, rotate
+from brakeline.messaging.obstacle import Array, Shapes, rotate
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
+from brakeline.sim.grid_planner import nearest_distances
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PIXELS = 360  # along the longer side of the room
-FREE, OBSTACLE, GOAL, MOVER, ROBOT, HEADING = (
-    (255, 255, 255),
-    (110, 110, 110),
-    (150, 210, 150),
-    (230, 140, 30),
-    (40, 90, 200),
-    (255, 255, 255),
-)
+FREE, OBSTACLE, GOAL = (255, 255, 255), (110, 110, 110), (150, 210, 150)
+MOVER, ROBOT, HEADING = (230, 140, 30), (40, 90, 200), (255, 255, 255)
 
 
 class TopView:
@@ -65,11 +59,9 @@ class TopView:
         return image
 
     def _paint(self, image: Image, colour: tuple[int, int, int], shapes: Shapes, height: float) -> None:
-        if len(shapes):
-            points = self._points
-            if self._arena.dim == 3:
-                points = np.concatenate([points, np.full((*points.shape[:2], 1), height)], axis=-1)
-            image[shapes.distance(points).min(axis=0) <= 0.0] = colour
+        heights = (np.array([height]),) if self._arena.dim == 3 else ()
+        distances = nearest_distances(shapes, self._points.reshape(-1, 2), *heights)
+        image[distances.reshape(image.shape[:2]) <= 0.0] = colour
 
     def _distance_to(self, point: Array) -> Array:
         return np.asarray(np.linalg.norm(self._points - point, axis=-1))

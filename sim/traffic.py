@@ -12,11 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import CYLINDER, SPHERE, Obstacle, Shapes
+from brakeline.messaging.obstacle import CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.messaging.task import MoverKind
-
-Array = NDArray[np.float64]
 
 TICK = 0.05  # s; the acceleration of a moving obstacle is constant between two ticks
 MEAN_WISH_TIME = 2.0  # s, mean time until it chooses another velocity

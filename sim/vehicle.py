@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import BadInput
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
-
-Array = NDArray[np.float64]
 
 
 def clip_input(robot: Robot, input: Array, before: Array) -> Array:
@@ -43,6 +42,11 @@ class Period:
     contact_moving: bool = False  # the robot touched a moving obstacle while it was moving itself
     contact_standing: bool = False  # a moving obstacle touched the robot while the robot stood
     contact_robot: bool = False  # the robot began to touch another robot of its world
+
+    @property
+    def at_fault(self) -> bool:
+        """Whether the robot touched something, and is responsible for it."""
+        return self.collision or self.contact_moving or self.contact_robot
 
 
 class Vehicle(Protocol):
@@ -79,3 +83,50 @@ class Vehicle(Protocol):
 
 
 MakeVehicle = Callable[[Arena, np.random.Generator], Vehicle]  # the generator is the source of all sensor errors
+
+
+class SimulatedVehicle:
+    """A base of vehicles in MuJoCo: their reports, and the changes of their physics."""
+
+    robot: Robot
+    samples: int  # of the position in a period
+    arena: Arena
+    true: Array
+    measured: Array
+    input: Array
+
+    def clearance(self, states: Array) -> Array:
+        """Return the distance [m] from the footprint in states (..., d or more) to the nearest obstacle, or inf."""
+        if not len(self.arena.shapes):
+            return np.full(states.shape[:-1], math.inf)
+        positions = states[..., : self.robot.position_dim]
+        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - self.robot.footprint)
+
+    def initial_period(self) -> Period:
+        """Return the report of a period in which nothing happened, at the present state."""
+        return self._report(False, self.true[None], np.zeros((self.samples, self.robot.position_dim)), 0.0)
+
+    def _report(self, collision: bool, states: Array, subsamples: Array, turned: float, *contacts: bool) -> Period:
+        """Return the report of a period, with the true states (K, d or more) at its samples."""
+        distances = self.clearance(states)
+        closest, clearance = float(distances.min()), float(distances[-1])
+        return Period(self.measured, self.true, collision, closest, clearance, subsamples, turned, *contacts)
+
+    def setters(self) -> dict[str, Callable[[float], None]]:
+        """Return what `alter` can change, by name."""
+        return {}
+
+    def alter(self, **changes: float) -> None:
+        """Change `setters` from now on.
+
+        Raises:
+            ValueError: the name is another one, or the value is negative or not finite.
+        """
+        setters = self.setters()
+        if unknown := changes.keys() - setters.keys():
+            names = ", ".join(setters) or "nothing that can change"
+            raise ValueError(f"a {self.robot.kind} has no {', '.join(sorted(unknown))}; it has: {names}")
+        for name, value in changes.items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} is 0 or more, not {value}")
+            setters[name](value)

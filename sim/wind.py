@@ -21,11 +21,7 @@ class WindProcess:
     """
 
     def __init__(self, wind: Wind, rng: np.random.Generator, timestep: float) -> None:
-        """Draw the mean wind and the first gust.
-
-        Args:
-            timestep: time between two calls of `advance` [s].
-        """
+        """Draw the mean wind and the first gust. timestep: time between two calls of `advance` [s]."""
         self._wind, self._rng = wind, rng
         direction = float(rng.uniform(-math.pi, math.pi)) if wind.direction is None else wind.direction
         self.mean = (wind.speed * math.cos(direction), wind.speed * math.sin(direction), 0.0)

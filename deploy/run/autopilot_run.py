@@ -13,14 +13,12 @@ from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.stop_signals import stop_on_signals
-from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.autopilot_server import ServerStats, TruthSender, serve
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise
-from brakeline.sim.lidar import Lidar
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.wind import Wind
 
@@ -63,14 +61,12 @@ def fly(settings: AutopilotSettings, on_start: Callable[[Arena], Any] = lambda a
 def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot:
     """Return the MAVLink endpoint of one vehicle."""
     rng = np.random.default_rng((settings.seed, system))
-    noise = QuadrotorNoise()
-    quadrotor = Quadrotor(arena, rng, noise, settings.wind, floor=None if settings.airborne else PAD)
-    lidar = Lidar(arena, robot_with_task("quadrotor").task.rays, noise.scale * noise.lidar, rng)
+    quadrotor = Quadrotor(arena, rng, QuadrotorNoise(), settings.wind, floor=None if settings.airborne else PAD)
     timeout = settings.setpoint_timeout
     parameters = dict(AT_ONCE[settings.rules]) if settings.at_once else {}
     if timeout is not None:
         parameters[SETPOINT_TIMEOUT[settings.rules]] = timeout
-    return Autopilot(quadrotor, settings.rules, system, parameters, lidar)
+    return Autopilot(quadrotor, settings.rules, system, parameters)
 
 
 def arena_or_field(name: str, seed: int) -> Arena:

@@ -119,21 +119,17 @@ class AutopilotRules:
 
         A setpoint must have the whole velocity and nothing else but a yaw or a yaw rate.
         """
-        if not self.reports_bad_setpoints and flight.mode is not Mode.OFFBOARD:
-            return
-        velocity = (target.vx, target.vy, target.vz)
         fault = self._fault(target)
-        if fault is None and not all(math.isfinite(v) and abs(v) <= LARGEST_VELOCITY for v in velocity):
-            if not self.reports_bad_setpoints:
-                return flight.receive_setpoint(Setpoint(STILL))
-            fault = "invalid velocity"
-        if fault is not None:
-            if self.reports_bad_setpoints:
-                raise RequestRefused(f"SET_POSITION_TARGET_LOCAL_NED {fault}")
-            return None  # the vehicle follows the setpoint before, until its timeout
-        if flight.limits.lifts_off_by_setpoint or flight.landed is not LandedState.ON_GROUND:
+        invalid = not all(abs(v) <= LARGEST_VELOCITY for v in (target.vx, target.vy, target.vz))  # NaN too
+        if self.reports_bad_setpoints:
+            if fault or invalid:
+                raise RequestRefused(f"SET_POSITION_TARGET_LOCAL_NED {fault or 'invalid velocity'}")
+        elif flight.mode is not Mode.OFFBOARD or fault:
+            return  # the vehicle follows the setpoint before, until its timeout
+        if invalid:
+            flight.receive_setpoint(Setpoint(STILL))
+        elif flight.limits.lifts_off_by_setpoint or flight.landed is not LandedState.ON_GROUND:
             flight.receive_setpoint(self._converted(target, heading))
-        return None
 
     def _fault(self, target: Target) -> str | None:
         """Return the error in the frame or the mask of a setpoint, or None if they are valid."""
@@ -197,6 +193,11 @@ def _ardupilot_limits(p: Parameters) -> FlightLimits:
     )
 
 
+def _messages(names: str) -> tuple[int, ...]:
+    """Return the ids of messages, named with spaces between."""
+    return tuple(getattr(m, f"MAVLINK_MSG_ID_{name}") for name in names.split())
+
+
 def _delay(parameter: float) -> float:
     """Return a delay [s]; a negative parameter switches it off."""
     return parameter if parameter >= 0.0 else math.inf
@@ -229,29 +230,17 @@ PX4 = AutopilotRules(
     local_frames=(m.MAV_FRAME_LOCAL_NED,),
     body_frames=(m.MAV_FRAME_BODY_NED,),
     rates={
-        m.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-        m.MAVLINK_MSG_ID_BATTERY_STATUS: 0.5,
-        m.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
-        m.MAVLINK_MSG_ID_ATTITUDE: 25.0,
-        m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 25.0,
-        m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 25.0,
-        m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
-        m.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
-        m.MAVLINK_MSG_ID_HIGHRES_IMU: 25.0,
-        m.MAVLINK_MSG_ID_ODOMETRY: 10.0,
-        m.MAVLINK_MSG_ID_VFR_HUD: 10.0,
-        m.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-        m.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: 5.0,
+        kind: rate
+        for rate, names in (
+            (25.0, "ATTITUDE ATTITUDE_QUATERNION LOCAL_POSITION_NED HIGHRES_IMU"),
+            (10.0, "GLOBAL_POSITION_INT ODOMETRY VFR_HUD"),
+            (5.0, "EXTENDED_SYS_STATE GPS_RAW_INT"),
+            (1.0, "SYS_STATUS"),
+            (0.5, "HOME_POSITION"),
+        )
+        for kind in _messages(names)
     },
 )
-
-ARDUPILOT_GROUPS: dict[int, tuple[int, ...]] = {
-    m.MAV_DATA_STREAM_RAW_SENSORS: (m.MAVLINK_MSG_ID_SCALED_IMU,),
-    m.MAV_DATA_STREAM_EXTENDED_STATUS: (m.MAVLINK_MSG_ID_SYS_STATUS, m.MAVLINK_MSG_ID_GPS_RAW_INT),
-    m.MAV_DATA_STREAM_POSITION: (m.MAVLINK_MSG_ID_LOCAL_POSITION_NED, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
-    m.MAV_DATA_STREAM_EXTRA1: (m.MAVLINK_MSG_ID_ATTITUDE,),
-    m.MAV_DATA_STREAM_EXTRA2: (m.MAVLINK_MSG_ID_VFR_HUD,),
-}
 
 ARDUPILOT = AutopilotRules(
     name="ardupilot",
@@ -274,12 +263,17 @@ ARDUPILOT = AutopilotRules(
     local_frames=(m.MAV_FRAME_LOCAL_NED, m.MAV_FRAME_LOCAL_OFFSET_NED),
     body_frames=(m.MAV_FRAME_BODY_NED, m.MAV_FRAME_BODY_OFFSET_NED),
     takeoff_frames=(m.MAV_FRAME_GLOBAL_RELATIVE_ALT,),
-    # as ArduCopter 4.0
-    unsupported=frozenset(
-        (m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, m.MAVLINK_MSG_ID_HIGHRES_IMU, m.MAVLINK_MSG_ID_ODOMETRY)
-    ),
-    stream_groups=ARDUPILOT_GROUPS
-    | {m.MAV_DATA_STREAM_ALL: tuple(kind for kinds in ARDUPILOT_GROUPS.values() for kind in kinds)},
+    unsupported=frozenset(_messages("ATTITUDE_QUATERNION HIGHRES_IMU ODOMETRY")),  # as ArduCopter 4.0
+    stream_groups={
+        m.MAV_DATA_STREAM_RAW_SENSORS: _messages("SCALED_IMU"),
+        m.MAV_DATA_STREAM_EXTENDED_STATUS: _messages("SYS_STATUS GPS_RAW_INT"),
+        m.MAV_DATA_STREAM_POSITION: _messages("LOCAL_POSITION_NED GLOBAL_POSITION_INT"),
+        m.MAV_DATA_STREAM_EXTRA1: _messages("ATTITUDE"),
+        m.MAV_DATA_STREAM_EXTRA2: _messages("VFR_HUD"),
+        m.MAV_DATA_STREAM_ALL: _messages(
+            "SCALED_IMU SYS_STATUS GPS_RAW_INT LOCAL_POSITION_NED GLOBAL_POSITION_INT ATTITUDE VFR_HUD"
+        ),
+    },
 )
 
 RULES = {rules.name: rules for rules in (PX4, ARDUPILOT)}

@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import Any
 
 from brakeline.errors import BadParameter, RequestRefused, UnknownMode, UnknownRules
-from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.autopilot_rules import RULES
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.flight_modes import FlightStateMachine, Mode
 from brakeline.sim.autopilot.parameters import Parameters
-from brakeline.sim.autopilot.telemetry_sender import BUILDERS, StreamSchedule, TelemetryBuilder
-from brakeline.sim.ground_estimator import heading_of
-from brakeline.sim.lidar import Lidar
+from brakeline.sim.autopilot.telemetry_sender import MESSAGES, StreamSchedule, TelemetryBuilder
 from brakeline.sim.quadrotor import Quadrotor
 
 TICK = 0.02  # s between two updates of modes, timeouts and streams; the flight controller runs faster
 HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 FORCED = 21196.0  # param2 of an arming command that skips all checks
 ACCEPTED, DENIED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_DENIED)
-FAILED = int(mavlink.MAV_RESULT_FAILED)
-
-
-@dataclass(frozen=True)
-class Command:
-    """A COMMAND_LONG or COMMAND_INT."""
-
-    number: int
-    params: tuple[float, ...]  # 1 to 7
-    frame: int  # MAV_FRAME of the seventh
-
-
-class _SendBuffer(bytearray):
-    """The file that pymavlink writes to."""
-
-    def write(self, data: bytes) -> None:
-        self.extend(data)
+UNSUPPORTED = int(mavlink.MAV_RESULT_UNSUPPORTED)
 
 
 class Autopilot:
@@ -59,7 +41,6 @@ class Autopilot:
         rules: str = "px4",
         system: int = 1,
         parameters: dict[str, float] | None = None,
-        lidar: Lidar | None = None,
         quiet: bool = False,
     ) -> None:
         """Connect the autopilot to a vehicle.
@@ -68,7 +49,6 @@ class Autopilot:
             rules: `px4` or `ardupilot`.
             system: MAVLink system id.
             parameters: values that replace the defaults.
-            lidar: the source of OBSTACLE_DISTANCE.
             quiet: send only the heartbeat, and messages on request.
 
         Raises:
@@ -82,9 +62,9 @@ class Autopilot:
         for name, value in (parameters or {}).items():
             self.parameters.set(name, value)
         self.flight = FlightStateMachine(vehicle, self.rules.limits(self.parameters), self.rules.initial_mode)
-        self.telemetry = TelemetryBuilder(self.flight, lidar)
+        self.telemetry = TelemetryBuilder(self.flight)
         self._ticks = round(TICK / vehicle.timestep)
-        self._send_buffer = _SendBuffer()
+        self._send_buffer = io.BytesIO()
         self.mav = mavlink.MAVLink(self._send_buffer, srcSystem=system, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
         self.mav.robust_parsing = True
         self.schedule = StreamSchedule(TICK)
@@ -101,14 +81,15 @@ class Autopilot:
     def receive(self, data: bytes) -> None:
         """Handle bytes from the link, in pieces of any size."""
         for message in self.mav.parse_buffer(data) or ():
-            handler = HANDLERS.get(message.get_msgId())
+            handler = getattr(self, f"_on_{message.get_type().lower()}", None)
             if handler is not None and self._for_me(message):
-                handler(self, message)
+                handler(message)
 
     def take(self) -> bytes:
         """Return the bytes to send since the last call."""
-        data = bytes(self._send_buffer)
-        self._send_buffer.clear()
+        data = self._send_buffer.getvalue()
+        self._send_buffer.seek(0)
+        self._send_buffer.truncate()
         return data
 
     def advance(self, seconds: float) -> None:
@@ -123,12 +104,12 @@ class Autopilot:
             for kind in schedule.due(flight.time):
                 if kind == HEARTBEAT:
                     self._heartbeat()
-                elif (message := self.telemetry.build(kind)) is not None:
-                    send(message)
+                else:
+                    send(self.telemetry.build(kind))
 
     def can_send(self, kind: int) -> bool:
         """Return whether the autopilot knows this message."""
-        return kind == HEARTBEAT or (kind in BUILDERS and kind not in self.rules.unsupported)
+        return kind == HEARTBEAT or (kind in MESSAGES and kind not in self.rules.unsupported)
 
     def send_text(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
         """Send a STATUSTEXT, cut to its 50 bytes."""
@@ -156,56 +137,51 @@ class Autopilot:
             mavlink.MAV_STATE_ACTIVE if armed else mavlink.MAV_STATE_STANDBY,
         )
 
-    def _heading(self) -> float:
-        """Return the heading, rad from north."""
-        return ned_frames.yaw(heading_of(self.telemetry.estimate.attitude))
+    # `receive` calls the method `_on_` + name of the message.
 
-    def _on_setpoint(self, message: mavlink.MAVLink_set_position_target_local_ned_message) -> None:
+    def _on_set_position_target_local_ned(self, message: Any) -> None:
         try:
-            self.rules.setpoint(self.flight, message, self._heading())
+            self.rules.setpoint(self.flight, message, self.telemetry.heading())
         except RequestRefused as refusal:
             self.send_text(str(refusal), mavlink.MAV_SEVERITY_CRITICAL)
 
-    def _on_command_long(self, message: mavlink.MAVLink_command_long_message) -> None:
+    def _on_command_long(self, message: Any) -> None:
         m = message
-        params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
-        self._command(message, Command(m.command, params, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT))
+        self._command(m, m.param1, m.param2, m.param3, m.param7, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT)
 
-    def _on_command_int(self, message: mavlink.MAVLink_command_int_message) -> None:
+    def _on_command_int(self, message: Any) -> None:
         m = message
-        params = (m.param1, m.param2, m.param3, m.param4, float(m.x), float(m.y), m.z)
-        self._command(message, Command(m.command, params, m.frame))
+        self._command(m, m.param1, m.param2, m.param3, m.z, m.frame)
 
-    def _command(self, message: mavlink.MAVLink_message, command: Command) -> None:
-        """Carry out a command and acknowledge it."""
-        action = ACTIONS.get(command.number)
+    def _command(self, message: Any, *params: float) -> None:
+        """Carry out a command and acknowledge it. params: 1, 2, 3 and 7, and the MAV_FRAME of the last."""
+        action = ACTIONS.get(message.command)
         try:
-            result = mavlink.MAV_RESULT_UNSUPPORTED if action is None else action(self, command)
+            result = mavlink.MAV_RESULT_UNSUPPORTED if action is None else action(self, *params)
         except RequestRefused as refusal:
             unknown = isinstance(refusal, UnknownMode)
             result = mavlink.MAV_RESULT_UNSUPPORTED if unknown else self.rules.refusal
             self.send_text(str(refusal))
-        self.mav.command_ack_send(command.number, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
+        self.mav.command_ack_send(message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent())
         self._send_announcements()
 
-    def _on_set_mode(self, message: mavlink.MAVLink_set_mode_message) -> None:
+    def _on_set_mode(self, message: Any) -> None:
         try:
             if message.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
                 self.rules.change(self.flight, message.custom_mode)
         except RequestRefused as refusal:
             self.send_text(str(refusal))
 
-    def _on_data_stream(self, message: mavlink.MAVLink_request_data_stream_message) -> None:
+    def _on_request_data_stream(self, message: Any) -> None:
         for kind in self.rules.stream_groups.get(message.req_stream_id, ()):
             rate = message.req_message_rate if message.start_stop else 0
             self.schedule.set(kind, 1.0 / rate if rate else 0.0, self.flight.time)
 
-    def _on_list(self, _: mavlink.MAVLink_message) -> None:
-        parameters = self.parameters
-        for index in range(len(parameters.table)):
-            self.mav.send(parameters.message(index))
+    def _on_param_request_list(self, _: Any) -> None:
+        for index in range(len(self.parameters.table)):
+            self.mav.send(self.parameters.message(index))
 
-    def _on_read(self, message: mavlink.MAVLink_param_request_read_message) -> None:
+    def _on_param_request_read(self, message: Any) -> None:
         parameters = self.parameters
         try:
             index = message.param_index if message.param_index >= 0 else parameters.index(message.param_id)
@@ -213,7 +189,7 @@ class Autopilot:
         except (BadParameter, IndexError):
             self.send_text(f"unknown parameter {message.param_id or message.param_index}")
 
-    def _on_set(self, message: mavlink.MAVLink_param_set_message) -> None:
+    def _on_param_set(self, message: Any) -> None:
         """Set a parameter, and answer with its value: the new one, or the old one if the new one is refused."""
         parameters, name = self.parameters, message.param_id
         try:
@@ -221,106 +197,77 @@ class Autopilot:
             self.flight.limits = self.rules.limits(self.parameters)
         except BadParameter as error:
             self.send_text(str(error))
-        try:
+        with suppress(BadParameter):
             self.mav.send(parameters.message(parameters.index(name)))
-        except BadParameter:
-            return
 
-    def _on_time(self, message: mavlink.MAVLink_timesync_message) -> None:
+    def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
             self.mav.timesync_send(round(1e9 * self.flight.time), message.ts1)
 
+    # `ACTIONS` has the commands of these methods. They return a MAV_RESULT.
 
-HANDLERS: dict[int, Callable[[Autopilot, Any], None]] = {
-    mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED: Autopilot._on_setpoint,
-    mavlink.MAVLINK_MSG_ID_COMMAND_LONG: Autopilot._on_command_long,
-    mavlink.MAVLINK_MSG_ID_COMMAND_INT: Autopilot._on_command_int,
-    mavlink.MAVLINK_MSG_ID_SET_MODE: Autopilot._on_set_mode,
-    mavlink.MAVLINK_MSG_ID_REQUEST_DATA_STREAM: Autopilot._on_data_stream,
-    mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: Autopilot._on_list,
-    mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ: Autopilot._on_read,
-    mavlink.MAVLINK_MSG_ID_PARAM_SET: Autopilot._on_set,
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: Autopilot._on_time,
-}
+    def _arm_disarm(self, switch: float, force: float, *_: float) -> int:
+        if switch not in (0.0, 1.0):
+            return UNSUPPORTED
+        if switch:
+            self.rules.arm(self.flight)
+        else:
+            self.flight.disarm(force == FORCED)
+        return ACCEPTED
 
+    def _take_off(self, _: float, __: float, ___: float, altitude: float, frame: int) -> int:
+        if self.rules.takeoff_frames is not None and frame not in self.rules.takeoff_frames:
+            return DENIED
+        self.rules.take_off(self.flight, altitude)
+        return ACCEPTED
 
-def _arm_disarm(autopilot: Autopilot, command: Command) -> int:
-    switch, force = command.params[0], command.params[1] == FORCED
-    if switch not in (0.0, 1.0):
-        return int(mavlink.MAV_RESULT_UNSUPPORTED)
-    if switch:
-        autopilot.rules.arm(autopilot.flight)
-    else:
-        autopilot.flight.disarm(force)
-    return ACCEPTED
+    def _land(self, *_: float) -> int:
+        self.flight.change(Mode.LAND)
+        return ACCEPTED
 
+    def _set_mode(self, *params: float) -> int:
+        base, main, sub = (round(p) if math.isfinite(p) else 0 for p in params[:3])
+        if not base & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return DENIED
+        self.rules.change(self.flight, self.rules.mode_number(main, sub))
+        return ACCEPTED
 
-def _take_off(autopilot: Autopilot, command: Command) -> int:
-    frames = autopilot.rules.takeoff_frames
-    if frames is not None and command.frame not in frames:
-        return DENIED
-    autopilot.rules.take_off(autopilot.flight, command.params[6])
-    return ACCEPTED
+    def _set_interval(self, kind: float, microseconds: float, *_: float) -> int:
+        """Set the interval of a message [µs]: 0 for the default rate, -1 to stop."""
+        kind, rates = round(kind), self.rules.rates
+        if not self.can_send(kind):
+            self.send_text(f"message {kind} is not known")
+            return int(mavlink.MAV_RESULT_FAILED)
+        interval = 1e-6 * microseconds
+        if microseconds == 0.0:
+            interval = 1.0 / rates[kind] if kind in rates else 0.0
+        elif 0.0 < interval < TICK - 1e-9:
+            interval = TICK
+        self.schedule.set(kind, interval, self.flight.time)
+        return ACCEPTED
 
+    def _get_interval(self, kind: float, *_: float) -> int:
+        kind = round(kind)
+        if not self.can_send(kind):
+            return DENIED
+        interval = self.schedule.interval(kind)
+        self.mav.message_interval_send(kind, round(1e6 * interval) if interval else -1)
+        return ACCEPTED
 
-def _land(autopilot: Autopilot, _: Command) -> int:
-    autopilot.flight.change(Mode.LAND)
-    return ACCEPTED
-
-
-def _set_mode(autopilot: Autopilot, command: Command) -> int:
-    base, main, sub = (round(p) if math.isfinite(p) else 0 for p in command.params[:3])
-    if not base & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-        return DENIED
-    autopilot.rules.change(autopilot.flight, autopilot.rules.mode_number(main, sub))
-    return ACCEPTED
-
-
-def _set_interval(autopilot: Autopilot, command: Command) -> int:
-    """Set the interval of a message. param1: message id; param2: µs, 0 for the default rate, -1 to stop."""
-    kind, microseconds = round(command.params[0]), command.params[1]
-    if not autopilot.can_send(kind):
-        autopilot.send_text(f"message {kind} is not known")
-        return FAILED
-    interval = 1e-6 * microseconds
-    if microseconds == 0.0:
-        interval = 1.0 / autopilot.rules.rates[kind] if kind in autopilot.rules.rates else 0.0
-    elif 0.0 < interval < TICK - 1e-9:
-        interval = TICK
-    autopilot.schedule.set(kind, interval, autopilot.flight.time)
-    return ACCEPTED
+    def _request_message(self, kind: float, *_: float) -> int:
+        kind = round(kind)
+        if kind == HEARTBEAT or not self.can_send(kind):
+            return UNSUPPORTED
+        self.mav.send(self.telemetry.build(kind))
+        return ACCEPTED
 
 
-def _get_interval(autopilot: Autopilot, command: Command) -> int:
-    kind = round(command.params[0])
-    if not autopilot.can_send(kind):
-        return DENIED
-    interval = autopilot.schedule.interval(kind)
-    autopilot.mav.message_interval_send(kind, round(1e6 * interval) if interval else -1)
-    return ACCEPTED
-
-
-def _request_message(autopilot: Autopilot, command: Command) -> int:
-    kind = round(command.params[0])
-    message = autopilot.telemetry.build(kind) if kind in BUILDERS and autopilot.can_send(kind) else None
-    if message is None:
-        return int(mavlink.MAV_RESULT_UNSUPPORTED)
-    autopilot.mav.send(message)
-    return ACCEPTED
-
-
-def _request_capabilities(autopilot: Autopilot, _: Command) -> int:
-    autopilot.mav.send(autopilot.telemetry.autopilot_version())
-    return ACCEPTED
-
-
-ACTIONS: dict[int, Callable[[Autopilot, Command], int]] = {
-    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
-    mavlink.MAV_CMD_NAV_TAKEOFF: _take_off,
-    mavlink.MAV_CMD_NAV_LAND: _land,
-    mavlink.MAV_CMD_DO_SET_MODE: _set_mode,
-    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
-    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: _get_interval,
-    mavlink.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _request_capabilities,
+ACTIONS: dict[int, Callable[..., int]] = {
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: Autopilot._arm_disarm,
+    mavlink.MAV_CMD_NAV_TAKEOFF: Autopilot._take_off,
+    mavlink.MAV_CMD_NAV_LAND: Autopilot._land,
+    mavlink.MAV_CMD_DO_SET_MODE: Autopilot._set_mode,
+    mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: Autopilot._set_interval,
+    mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: Autopilot._get_interval,
+    mavlink.MAV_CMD_REQUEST_MESSAGE: Autopilot._request_message,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, IntEnum
 
 from brakeline.errors import RequestRefused
 from brakeline.sim.flight_controller import STILL, Vector
@@ -30,13 +30,13 @@ class Mode(Enum):
     OFFBOARD = "offboard"  # by setpoints; ArduCopter's guided mode
 
 
-class LandedState(Enum):
+class LandedState(IntEnum):
     """The states of MAV_LANDED_STATE."""
 
-    ON_GROUND = "on the ground"
-    TAKING_OFF = "taking off"
-    IN_AIR = "in the air"
-    LANDING = "landing"
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKING_OFF = 3
+    LANDING = 4
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class FlightStateMachine:
         armed, mode, landed: its state.
         home: (x, y, z) m, where it armed last.
         setpoint: the newest setpoint in offboard mode.
-        last_setpoint: s, when the newest setpoint came; None before the first.
+        last_setpoint: s, when the newest setpoint came; -inf before the first.
         announcements: texts for the ground station.
     """
 
@@ -88,7 +88,7 @@ class FlightStateMachine:
         self.mode = Mode.HOLD if vehicle.flying else mode
         self.home = vehicle.position_and_velocity()[0]
         self.setpoint = Setpoint(STILL)
-        self.last_setpoint: float | None = None
+        self.last_setpoint = -math.inf
         self.announcements: list[str] = []
         self._mode_before_landing = mode
         self._flown_velocity = STILL  # m/s, the setpoint after the limits of acceleration
@@ -99,16 +99,10 @@ class FlightStateMachine:
     @property
     def streaming(self) -> bool:
         """Whether setpoints come in within their timeout."""
-        if self.last_setpoint is None:
-            return False
         return self.time - self.last_setpoint <= self.limits.setpoint_timeout + ROUNDING
 
     def arm(self) -> None:
-        """Arm the vehicle.
-
-        Raises:
-            RequestRefused: the estimate is not ready yet.
-        """
+        """Arm the vehicle. Raises RequestRefused: the estimate is not ready yet."""
         if self.armed:
             return
         if self.time < READY_AFTER:
@@ -120,11 +114,7 @@ class FlightStateMachine:
             self._leave_floor(LandedState.TAKING_OFF)
 
     def disarm(self, force: bool = False) -> None:
-        """Stop the rotors.
-
-        Raises:
-            RequestRefused: the vehicle is in the air, and `force` is false.
-        """
+        """Stop the rotors. Raises RequestRefused: the vehicle is in the air, and `force` is false."""
         if self.landed is not LandedState.ON_GROUND and not force:
             raise RequestRefused("not landed")
         if self.armed:
@@ -174,19 +164,22 @@ class FlightStateMachine:
             return
         if self.mode is Mode.OFFBOARD and not self.streaming:
             self._lose_setpoints()
+        descends = self.mode is Mode.LAND or (self.mode is Mode.OFFBOARD and self.setpoint.velocity[2] < 0.0)
         if self.landed is LandedState.ON_GROUND:
             self._rest()
-        elif not (self.vehicle.on_floor and self._wants_down()):
+        elif not (self.vehicle.on_floor and descends):
             self._since = self.time
         elif self.time - self._since > TOUCHDOWN_TIME:
-            self._land()
+            self.landed, self._since = LandedState.ON_GROUND, self.time
+            self.vehicle.cut_rotors()
+            self.announcements.append("Landing detected")
         self.steer()
 
     def steer(self, seconds: float = 0.0) -> None:
         """Set the controller's setpoint for the mode, for the next `seconds`."""
         controller, wanted = self.vehicle.controller, self.setpoint
         if self.mode is Mode.OFFBOARD and self.landed is not LandedState.TAKING_OFF:
-            self._flown_velocity = controller.setpoint = self._followed(self._limited(wanted.velocity), seconds)
+            self._flown_velocity = controller.setpoint = self._followed(wanted.velocity, seconds)
             controller.yaw_rate = wanted.yaw_rate or 0.0
             if wanted.yaw is not None:
                 controller.yaw_goal = wanted.yaw
@@ -197,25 +190,22 @@ class FlightStateMachine:
             left = self._takeoff_height - position[2]
             controller.setpoint = (0.0, 0.0, min(max(left, 0.3), TAKEOFF_CLIMB))
             if left < TAKEOFF_TOLERANCE:
-                self._complete_takeoff()
+                self.landed, controller.setpoint = LandedState.IN_AIR, STILL
+                self.mode = Mode.HOLD if self.mode is Mode.TAKEOFF else self.mode
         elif self.mode is Mode.LAND:
             controller.setpoint = (0.0, 0.0, -self.limits.land_speed)
         else:
             controller.setpoint = STILL
 
-    def _limited(self, velocity: Vector) -> Vector:
-        """Return a velocity within the limits of speed."""
-        x, y, z = velocity
-        level = (x * x + y * y) ** 0.5
-        share = min(1.0, self.limits.speed / level) if level > 0.0 else 1.0
-        return (x * share, y * share, min(max(z, -self.limits.sink), self.limits.climb))
-
     def _followed(self, wanted: Vector, seconds: float) -> Vector:
-        """Return the velocity that the limits of acceleration allow after `seconds`, on the way to a wanted one."""
-        limits = self.limits
+        """Return the velocity that the limits of speed and acceleration allow after `seconds`, towards a wanted one."""
+        limits, (u, v, w) = self.limits, wanted
+        level = (u * u + v * v) ** 0.5
+        share = min(1.0, limits.speed / level) if level > 0.0 else 1.0
+        u, v, w = u * share, v * share, min(max(w, -limits.sink), limits.climb)
         if math.isinf(limits.horizontal_acceleration):
-            return wanted
-        (x, y, z), (u, v, w) = self._flown_velocity, wanted
+            return (u, v, w)
+        x, y, z = self._flown_velocity
         away, most_up = math.hypot(u - x, v - y), limits.vertical_acceleration * seconds
         share = min(1.0, limits.horizontal_acceleration * seconds / away) if away > 0.0 else 1.0
         return (x + share * (u - x), y + share * (v - y), z + min(max(w - z, -most_up), most_up))
@@ -235,12 +225,6 @@ class FlightStateMachine:
         self.vehicle.start_rotors()
         self.landed = landed
 
-    def _complete_takeoff(self) -> None:
-        self.landed = LandedState.IN_AIR
-        self.vehicle.controller.setpoint = STILL
-        if self.mode is Mode.TAKEOFF:
-            self.mode = Mode.HOLD
-
     def _rest(self) -> None:
         """Stand armed on the floor: lift off by a setpoint, or disarm after a delay."""
         rested = self.time - self._since
@@ -249,11 +233,3 @@ class FlightStateMachine:
             self._leave_floor(LandedState.IN_AIR)
         elif rested > (self.limits.disarm_landed if self.mode is Mode.LAND else self.limits.disarm_unused):
             self.disarm()
-
-    def _wants_down(self) -> bool:
-        return self.mode is Mode.LAND or (self.mode is Mode.OFFBOARD and self.setpoint.velocity[2] < 0.0)
-
-    def _land(self) -> None:
-        self.landed, self._since = LandedState.ON_GROUND, self.time
-        self.vehicle.cut_rotors()
-        self.announcements.append("Landing detected")

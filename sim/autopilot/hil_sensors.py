@@ -24,6 +24,7 @@ MAGNETIC_FIELD: Vector = (
     FIELD * math.cos(INCLINATION) * math.sin(DECLINATION),
     FIELD * math.sin(INCLINATION),
 )  # NED
+RATES = (50.0, 25.0, 10.0)  # Hz, of magnetometer, barometer and GPS; the IMU reads at every physics step
 DRAWS_AT_ONCE = 256  # one draw alone takes as long as many
 DRAW_SIZE = 16  # random numbers for one reading of all sensors
 GPS_DRAWS = slice(10, 16)
@@ -50,29 +51,13 @@ class SensorNoise:
     gps_velocity: float = 0.02  # m/s
 
 
-@dataclass(frozen=True)
-class SensorRates:
-    """Sampling rates of the sensors [Hz]. The IMU reads at every physics step."""
-
-    magnetometer: float = 50.0
-    barometer: float = 25.0
-    gps: float = 10.0
-
-
 class HilSensors:
     """The sensors of one vehicle. The generator determines all errors, so a run can be repeated."""
 
-    def __init__(
-        self, noise: SensorNoise, rng: np.random.Generator, period: float, rates: SensorRates | None = None
-    ) -> None:
-        """Draw the biases.
-
-        Args:
-            period: time between two readings of the IMU [s].
-        """
-        rates = rates or SensorRates()
+    def __init__(self, noise: SensorNoise, rng: np.random.Generator, period: float) -> None:
+        """Draw the biases. period: time between two readings of the IMU [s]."""
         self.noise, self._rng = noise, rng
-        self._every = [round(1.0 / rate / period) for rate in (rates.magnetometer, rates.barometer, rates.gps)]
+        self._every = [round(1.0 / rate / period) for rate in RATES]
         n = noise
         sigma = n.scale * np.repeat((n.accelerometer_bias, n.gyro_bias, n.magnetometer_bias, n.barometer_bias), 3)
         bias: list[float] = (sigma * rng.standard_normal(12)).tolist()
@@ -120,15 +105,12 @@ class HilSensors:
     ) -> mavlink.MAVLink_hil_gps_message:
         where, fast = self.noise.gps_position, self.noise.gps_velocity
         x, y, z = position
-        latitude, longitude, altitude = ned_frames.globe(
-            (x + where * draw[0], y + where * draw[1], z + where * draw[2])
-        )
+        place = ned_frames.globe_integers((x + where * draw[0], y + where * draw[1], z + where * draw[2]))
         vx, vy, vz = truth.velocity
         vn, ve, vd = ned_frames.world((vx + fast * draw[3], vy + fast * draw[4], vz + fast * draw[5]))
         accuracy = max(round(100.0 * self.noise.scale * where), 1)
         course = math.degrees(math.atan2(ve, vn)) % 360.0
         return mavlink.MAVLink_hil_gps_message(
-            microseconds, FIX, round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude),
-            accuracy, accuracy, round(100.0 * math.hypot(vn, ve)), round(100.0 * vn), round(100.0 * ve),
-            round(100.0 * vd), round(100.0 * course) % 36000, 14,
+            microseconds, FIX, *place, accuracy, accuracy, round(100.0 * math.hypot(vn, ve)),
+            *(round(100.0 * v) for v in (vn, ve, vd)), round(100.0 * course) % 36000, 14,
         )  # fmt: skip

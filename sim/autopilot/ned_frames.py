@@ -58,3 +58,9 @@ def globe(position: Vector) -> tuple[float, float, float]:
         LONGITUDE + east * DEGREES / math.cos(math.radians(LATITUDE)),
         ALTITUDE + up,
     )
+
+
+def globe_integers(position: Vector) -> tuple[int, int, int]:
+    """Return `globe` as messages carry it: latitude and longitude [deg·1e7], altitude [mm]."""
+    latitude, longitude, altitude = globe(position)
+    return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)

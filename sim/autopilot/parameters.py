@@ -31,9 +31,7 @@ class Parameter:
 
 PX4_PARAMETERS: tuple[Parameter, ...] = (
     Parameter("COM_DISARM_LAND", 2.0, -1.0, 20.0, "s after a landing until the vehicle disarms"),
-    Parameter(
-        "COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s after arming until the vehicle disarms if it stays on the ground"
-    ),
+    Parameter("COM_DISARM_PRFLT", 10.0, -1.0, 60.0, "s on the ground after arming until the vehicle disarms"),
     Parameter("COM_OBL_RC_ACT", 0, 0, 5, "setpoints lost: 0 to 3 position, 4 land, 5 hold", integer=True),
     Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0, "s without a setpoint until the vehicle leaves offboard mode"),
     Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0, "m above home to take off to"),
@@ -45,15 +43,11 @@ PX4_PARAMETERS: tuple[Parameter, ...] = (
 )
 
 ARDUPILOT_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter(
-        "DISARM_DELAY", 10, 0, 127, "s after arming until the vehicle disarms if it stays on the ground", integer=True
-    ),
+    Parameter("DISARM_DELAY", 10, 0, 127, "s on the ground after arming until the vehicle disarms", integer=True),
     Parameter("FRAME_CLASS", 1, 0, 15, "1: quadrotor", integer=True),
     Parameter("GUID_TIMEOUT", 3.0, 0.1, 5.0, "s without a setpoint until the vehicle stops"),
     Parameter("LAND_SPEED", 70, 30, 200, "cm/s", integer=True),
-    Parameter(
-        "WPNAV_ACCEL", 100.0, 1.0, 1e6, "cm/s², horizontal acceleration with which the flown velocity follows setpoints"
-    ),
+    Parameter("WPNAV_ACCEL", 100.0, 1.0, 1e6, "cm/s², with which the flown velocity follows setpoints, horizontal"),
     Parameter("WPNAV_ACCEL_Z", 100.0, 1.0, 1e6, "cm/s², the vertical acceleration"),
     Parameter("WPNAV_SPEED", 500.0, 20.0, 2000.0, "cm/s, horizontal"),
     Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "cm/s"),
@@ -75,12 +69,7 @@ class Parameters:
     """The parameters of one vehicle, by name."""
 
     def __init__(self, table: tuple[Parameter, ...], bitwise: bool) -> None:
-        """Start with the defaults.
-
-        Args:
-            bitwise: whether a message has an integer's 32 bits in place of the float's (PX4), or its value as a float
-                (ArduPilot).
-        """
+        """bitwise: a message has an integer's 32 bits in place of the float's (PX4); else its value (ArduPilot)."""
         self.table, self.bitwise = table, bitwise
         self._values = {parameter.name: parameter.value for parameter in table}
 
@@ -88,15 +77,10 @@ class Parameters:
         return self._values[name]
 
     def index(self, name: str) -> int:
-        """Return the index of a parameter in the table.
-
-        Raises:
-            BadParameter: the parameter does not exist.
-        """
-        for index, parameter in enumerate(self.table):
-            if parameter.name == name:
-                return index
-        raise BadParameter(f"no parameter {name}")
+        """Return the index of a parameter in the table. Raises BadParameter: the parameter does not exist."""
+        if name not in self._values:
+            raise BadParameter(f"no parameter {name}")
+        return list(self._values).index(name)
 
     def set(self, name: str, value: float) -> None:
         """Set a value.

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.flight_modes import FlightStateMachine, LandedState
+from brakeline.sim.autopilot.flight_modes import FlightStateMachine
 from brakeline.sim.flight_estimator import Estimate
 from brakeline.sim.ground_estimator import heading_of
-from brakeline.sim.lidar import Lidar
 
-BINS = 72  # of OBSTACLE_DISTANCE, clockwise from straight ahead
 UNKNOWN = 65535  # the value of a field without a measurement
 SENSORS = (
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -28,44 +21,23 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_AHRS
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
-VOLTAGE, CHARGE = 16.2, 100  # V, %; the simulation has no battery
+CAPABILITIES = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+)
+MILLIVOLTS, CHARGE = 16200, 100  # mV, %; the simulation has no battery
 MILLIGRAVITY = 9.80665e-3  # m/s²
+IMU_UPDATED = 0x3F  # bits of HIGHRES_IMU: accelerometer and gyro
 NO_COVARIANCE = [math.nan, *[0.0] * 20]
-LANDED_STATES = {
-    LandedState.ON_GROUND: mavlink.MAV_LANDED_STATE_ON_GROUND,
-    LandedState.TAKING_OFF: mavlink.MAV_LANDED_STATE_TAKEOFF,
-    LandedState.IN_AIR: mavlink.MAV_LANDED_STATE_IN_AIR,
-    LandedState.LANDING: mavlink.MAV_LANDED_STATE_LANDING,
-}
 Message = Any  # pymavlink is untyped
 
 
-def obstacle_bins(ranges: NDArray[np.float64], directions: NDArray[np.float64], farthest: float) -> list[int]:
-    """Return the distances [cm] in `BINS` sectors around the vehicle.
-
-    The distance of a sector is the least horizontal part of its beams. A sector without a beam takes the lesser of its
-    neighbours. `farthest` + 1 cm means that a sector is free.
-
-    Args:
-        ranges: (R,) m.
-        directions: (R, 3) unit vectors, forward-left-up.
-        farthest: m.
-    """
-    top = round(100.0 * farthest)
-    sector = np.round(-np.arctan2(directions[:, 1], directions[:, 0]) * (BINS / math.tau)).astype(int) % BINS
-    level = np.hypot(directions[:, 0], directions[:, 1])
-    distances = np.where(ranges < farthest, np.floor(100.0 * ranges * level), top + 1)
-    bins = np.full(BINS, UNKNOWN)
-    np.minimum.at(bins, sector, distances.astype(int))
-    between = np.minimum(np.roll(bins, 1), np.roll(bins, -1))
-    return [int(value) for value in np.where(bins == UNKNOWN, between, bins)]
-
-
 class TelemetryBuilder:
-    """Builds messages about one vehicle; `BUILDERS` lists them by message id."""
+    """Builds messages about one vehicle. `MESSAGES` has the message ids of its methods."""
 
-    def __init__(self, flight: FlightStateMachine, lidar: Lidar | None) -> None:
-        self._flight, self._lidar = flight, lidar
+    def __init__(self, flight: FlightStateMachine) -> None:
+        self._flight = flight
         self._estimate: tuple[float, Estimate] | None = None  # with its time
 
     @property
@@ -76,151 +48,116 @@ class TelemetryBuilder:
             self._estimate = (now, self._flight.vehicle.estimate())
         return self._estimate[1]
 
-    @property
-    def milliseconds(self) -> int:
+    def build(self, kind: int) -> Message:
+        """Return the message with this id, one of `MESSAGES`."""
+        message: Message = getattr(self, MESSAGES[kind])()
+        return message
+
+    def heading(self) -> float:
+        """Return the heading, rad from north."""
+        return ned_frames.yaw(heading_of(self.estimate.attitude))
+
+    def _milliseconds(self) -> int:
         return round(1e3 * self._flight.time)
 
-    @property
-    def microseconds(self) -> int:
+    def _microseconds(self) -> int:
         return round(1e6 * self._flight.time)
 
-    def build(self, kind: int) -> Message | None:
-        """Return the message with this id; None if the vehicle has no such sensor."""
-        return BUILDERS[kind](self)
+    def _motion(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the estimated position [m] and velocity [m/s] in NED."""
+        position, velocity = self._flight.vehicle.position_and_velocity()
+        return ned_frames.world(position), ned_frames.world(velocity)
+
+    def _globe(self) -> tuple[int, int, int]:
+        """Return the estimated latitude and longitude [deg·1e7] and altitude [mm]."""
+        return ned_frames.globe_integers(self._flight.vehicle.position_and_velocity()[0])
+
+    def _imu(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the specific force [m/s²] and the turn rates [rad/s], forward-right-down."""
+        return ned_frames.body(self.estimate.specific_force), ned_frames.body(self.estimate.rates)
 
     def sys_status(self) -> Message:
         return mavlink.MAVLink_sys_status_message(
-            SENSORS, SENSORS, SENSORS, 200, round(1e3 * VOLTAGE), -1, CHARGE, 0, 0, 0, 0, 0, 0
+            SENSORS, SENSORS, SENSORS, 200, MILLIVOLTS, -1, CHARGE, 0, 0, 0, 0, 0, 0
         )
-
-    def battery_status(self) -> Message:
-        cells = [round(1e3 * VOLTAGE / 4.0)] * 4 + [UNKNOWN] * 6
-        return mavlink.MAVLink_battery_status_message(0, 0, 3, 32767, cells, -1, -1, -1, CHARGE)
 
     def extended_sys_state(self) -> Message:
-        return mavlink.MAVLink_extended_sys_state_message(0, LANDED_STATES[self._flight.landed])
+        return mavlink.MAVLink_extended_sys_state_message(0, self._flight.landed)
 
     def attitude(self) -> Message:
-        roll, pitch, yaw = ned_frames.euler(ned_frames.attitude(self.estimate.attitude))
-        return mavlink.MAVLink_attitude_message(
-            self.milliseconds, roll, pitch, yaw, *ned_frames.body(self.estimate.rates)
-        )
+        angles = ned_frames.euler(ned_frames.attitude(self.estimate.attitude))
+        return mavlink.MAVLink_attitude_message(self._milliseconds(), *angles, *ned_frames.body(self.estimate.rates))
 
     def attitude_quaternion(self) -> Message:
         q, rates = ned_frames.attitude(self.estimate.attitude), ned_frames.body(self.estimate.rates)
-        return mavlink.MAVLink_attitude_quaternion_message(self.milliseconds, *q, *rates)
+        return mavlink.MAVLink_attitude_quaternion_message(self._milliseconds(), *q, *rates)
 
     def local_position_ned(self) -> Message:
-        position, velocity = self._flight.vehicle.position_and_velocity()
-        return mavlink.MAVLink_local_position_ned_message(
-            self.milliseconds, *ned_frames.world(position), *ned_frames.world(velocity)
-        )
+        position, velocity = self._motion()
+        return mavlink.MAVLink_local_position_ned_message(self._milliseconds(), *position, *velocity)
 
     def global_position_int(self) -> Message:
-        position, velocity = self._flight.vehicle.position_and_velocity()
-        latitude, longitude, altitude = ned_frames.globe(position)
-        vx, vy, vz = (round(100.0 * v) for v in ned_frames.world(velocity))
-        heading = math.degrees(ned_frames.yaw(heading_of(self.estimate.attitude))) % 360.0
-        above_home = position[2] - self._flight.home[2]
+        position, velocity = self._motion()
+        above_home = -position[2] - self._flight.home[2]
+        heading = round(100.0 * (math.degrees(self.heading()) % 360.0)) % 36000
+        speeds = (round(100.0 * v) for v in velocity)
         return mavlink.MAVLink_global_position_int_message(
-            self.milliseconds, round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude),
-            round(1e3 * above_home), vx, vy, vz, round(100.0 * heading) % 36000,
-        )  # fmt: skip
+            self._milliseconds(), *self._globe(), round(1e3 * above_home), *speeds, heading
+        )
 
     def gps_raw_int(self) -> Message:
-        position, velocity = self._flight.vehicle.position_and_velocity()
-        latitude, longitude, altitude = ned_frames.globe(position)
-        speed = round(100.0 * math.hypot(velocity[0], velocity[1]))
+        speed = round(100.0 * math.hypot(*self._motion()[1][:2]))
         return mavlink.MAVLink_gps_raw_int_message(
-            self.microseconds, mavlink.GPS_FIX_TYPE_3D_FIX, round(1e7 * latitude), round(1e7 * longitude),
-            round(1e3 * altitude), 70, 80, speed, UNKNOWN, 14,
-        )  # fmt: skip
+            self._microseconds(), mavlink.GPS_FIX_TYPE_3D_FIX, *self._globe(), 70, 80, speed, UNKNOWN, 14
+        )
 
     def highres_imu(self) -> Message:
-        acceleration, rates = ned_frames.body(self.estimate.specific_force), ned_frames.body(self.estimate.rates)
-        updated = 0x3F  # accelerometer and gyro
-        return mavlink.MAVLink_highres_imu_message(
-            self.microseconds, *acceleration, *rates, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, updated
-        )
+        force, rates = self._imu()
+        return mavlink.MAVLink_highres_imu_message(self._microseconds(), *force, *rates, *[0.0] * 7, IMU_UPDATED)
 
     def scaled_imu(self) -> Message:
         """Return SCALED_IMU: thousandths of g and of rad/s."""
-        acceleration, rates = ned_frames.body(self.estimate.specific_force), ned_frames.body(self.estimate.rates)
-        force, turning = (round(value / MILLIGRAVITY) for value in acceleration), (round(1e3 * rate) for rate in rates)
-        return mavlink.MAVLink_scaled_imu_message(self.milliseconds, *force, *turning, 0, 0, 0)
+        force, rates = self._imu()
+        scaled = (*(round(value / MILLIGRAVITY) for value in force), *(round(1e3 * rate) for rate in rates))
+        return mavlink.MAVLink_scaled_imu_message(self._milliseconds(), *scaled, 0, 0, 0)
 
     def odometry(self) -> Message:
         """Return ODOMETRY as PX4 sends it: position in NED, velocity along the body's axes."""
-        position, velocity = self._flight.vehicle.position_and_velocity()
+        position, velocity = self._motion()
         q = ned_frames.attitude(self.estimate.attitude)
-        along = ned_frames.into_body(q, ned_frames.world(velocity))
+        along = ned_frames.into_body(q, (velocity[0], velocity[1], velocity[2]))
         return mavlink.MAVLink_odometry_message(
-            self.microseconds, mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD, *ned_frames.world(position), q,
+            self._microseconds(), mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD, *position, q,
             *along, *ned_frames.body(self.estimate.rates), NO_COVARIANCE, NO_COVARIANCE,
         )  # fmt: skip
 
     def vfr_hud(self) -> Message:
-        position, velocity = self._flight.vehicle.position_and_velocity()
-        heading = round(math.degrees(ned_frames.yaw(heading_of(self.estimate.attitude)))) % 360
-        speed = math.hypot(velocity[0], velocity[1])
+        position, velocity = self._motion()
+        heading = round(math.degrees(self.heading())) % 360
+        speed = math.hypot(*velocity[:2])
         throttle = 50 if self._flight.vehicle.flying else 0
-        return mavlink.MAVLink_vfr_hud_message(
-            speed, speed, heading, throttle, ned_frames.ALTITUDE + position[2], velocity[2]
-        )
+        altitude = ned_frames.ALTITUDE - position[2]
+        return mavlink.MAVLink_vfr_hud_message(speed, speed, heading, throttle, altitude, -velocity[2])
 
     def home_position(self) -> Message:
-        latitude, longitude, altitude = ned_frames.globe(self._flight.home)
+        home = self._flight.home
         return mavlink.MAVLink_home_position_message(
-            round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude), *ned_frames.world(self._flight.home),
-            [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0,
-        )  # fmt: skip
-
-    def obstacle_distance(self) -> Message | None:
-        if self._lidar is None:
-            return None
-        rays = self._lidar.rays
-        ranges = self._lidar.ranges(self._flight.vehicle.state()[:3], heading_of(self.estimate.attitude))
-        bins = obstacle_bins(ranges, rays.directions, rays.range)
-        return mavlink.MAVLink_obstacle_distance_message(
-            self.microseconds, mavlink.MAV_DISTANCE_SENSOR_LASER, bins, 0, 20, round(100.0 * rays.range),
-            360.0 / BINS, 0.0, mavlink.MAV_FRAME_BODY_FRD,
-        )  # fmt: skip
+            *ned_frames.globe_integers(home), *ned_frames.world(home), [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
+        )
 
     def autopilot_version(self) -> Message:
-        capabilities = (
-            mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-            | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-            | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
-        )
         none = [0] * 8
-        return mavlink.MAVLink_autopilot_version_message(capabilities, 1 << 24, 0, 0, 0, none, none, none, 0, 0, 1)
+        return mavlink.MAVLink_autopilot_version_message(CAPABILITIES, 1 << 24, 0, 0, 0, none, none, none, 0, 0, 1)
 
 
-BUILDERS: dict[int, Callable[[TelemetryBuilder], Message | None]] = {
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: TelemetryBuilder.sys_status,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: TelemetryBuilder.battery_status,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: TelemetryBuilder.extended_sys_state,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: TelemetryBuilder.attitude,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: TelemetryBuilder.attitude_quaternion,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: TelemetryBuilder.local_position_ned,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: TelemetryBuilder.global_position_int,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: TelemetryBuilder.gps_raw_int,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: TelemetryBuilder.highres_imu,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: TelemetryBuilder.scaled_imu,
-    mavlink.MAVLINK_MSG_ID_ODOMETRY: TelemetryBuilder.odometry,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: TelemetryBuilder.vfr_hud,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: TelemetryBuilder.home_position,
-    mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE: TelemetryBuilder.obstacle_distance,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: TelemetryBuilder.autopilot_version,
-}
-
-
-@dataclass
-class Stream:
-    """The stream of one message."""
-
-    interval: float  # s
-    due: float  # s, time of the next message
+MESSAGES = {
+    getattr(mavlink, f"MAVLINK_MSG_ID_{name.upper()}"): name
+    for name in (
+        "sys_status", "extended_sys_state", "attitude", "attitude_quaternion", "local_position_ned",
+        "global_position_int", "gps_raw_int", "highres_imu", "scaled_imu", "odometry", "vfr_hud", "home_position",
+        "autopilot_version",
+    )
+}  # fmt: skip
 
 
 class StreamSchedule:
@@ -228,24 +165,22 @@ class StreamSchedule:
 
     def __init__(self, tick: float) -> None:
         self._slack = 0.5 * tick
-        self._streams: dict[int, Stream] = {}
+        self._intervals: dict[int, float] = {}  # s, by message id
+        self._due: dict[int, float] = {}  # s, time of the next message
 
     def set(self, kind: int, interval: float, now: float) -> None:
         """Send a message every `interval` seconds from now on; 0 or less stops it."""
-        self._streams.pop(kind, None)
+        self._intervals.pop(kind, None)
         if interval > 0.0:
-            self._streams[kind] = Stream(interval, now + interval)
+            self._intervals[kind], self._due[kind] = interval, now + interval
 
     def interval(self, kind: int) -> float:
         """Return the interval of a message [s]; 0 if it is not sent."""
-        stream = self._streams.get(kind)
-        return 0.0 if stream is None else stream.interval
+        return self._intervals.get(kind, 0.0)
 
     def due(self, now: float) -> list[int]:
         """Return the messages to send now."""
-        kinds = []
-        for kind, stream in self._streams.items():
-            if now >= stream.due - self._slack:
-                stream.due = max(stream.due + stream.interval, now)
-                kinds.append(kind)
+        kinds = [kind for kind in self._intervals if now >= self._due[kind] - self._slack]
+        for kind in kinds:
+            self._due[kind] = max(self._due[kind] + self._intervals[kind], now)
         return kinds

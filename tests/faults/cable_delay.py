@@ -1,4 +1,4 @@
-"""PROCESS: a long cable: passes a TCP port on to another host, each byte later than it came (kernels without netem).
+"""PROCESS: a long cable. It passes a TCP port on to another host, with a delay (for kernels without netem).
 
 python -m tests.faults.cable_delay 0.0.0.0:7447=10.0.0.1:7447 --delay 0.02 --jitter 0.01
 """
@@ -9,13 +9,14 @@ import asyncio
 import contextlib
 import sys
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 from typing import Annotated
 
 import tyro
 
 CHUNK = 2**16  # bytes read at a time
-UNDER_WAY = 64  # chunks on the cable in each direction; then the sender waits, as on one that is full
+UNDER_WAY = 64  # chunks on the cable in each direction; then the sender waits
 
 
 @dataclass(frozen=True)
@@ -23,27 +24,26 @@ class Delay:
     """Pass ports on, with a delay each way."""
 
     ports: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """LISTEN_HOST:PORT=TO_HOST:PORT, of each."""
+    """LISTEN_HOST:PORT=TO_HOST:PORT of each port."""
     delay: float = 0.02
-    """s each way."""
+    """Delay each way [s]."""
     jitter: float = 0.0
-    """s more, at the most; the order stays as it was."""
-    seed: int = 0
+    """Largest additional delay, drawn for each chunk [s]. The order of the chunks stays."""
 
 
 async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, given: Delay, random: Random) -> None:
-    """Whatever comes until one end closes, each chunk `delay` later and none before the one before it."""
+    """Pass chunks on until one end closes, each `delay` later and none before its predecessor."""
     clock = asyncio.get_running_loop().time
     cable: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(UNDER_WAY)
 
-    async def put_in() -> None:
+    async def fill() -> None:
         due = 0.0
         while chunk := await reader.read(CHUNK):
             due = max(due, clock() + given.delay + random.uniform(0.0, given.jitter))
             await cable.put((due, chunk))
         await cable.put((due, b""))
 
-    filling = asyncio.create_task(put_in())
+    filling = asyncio.create_task(fill())
     try:
         while True:
             due, chunk = await cable.get()
@@ -59,9 +59,9 @@ async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, given
 
 
 async def join(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, to: str, given: Delay) -> None:
-    """One connection: both ways, until either ends."""
+    """Serve one connection both ways, until either end closes it."""
     host, _, port = to.rpartition(":")
-    random = Random(given.seed)
+    random = Random(0)
     with contextlib.suppress(OSError):
         there, here = await asyncio.open_connection(host, int(port))
         ways = [asyncio.create_task(pump(*way, given, random)) for way in ((reader, here), (there, writer))]
@@ -76,17 +76,12 @@ async def join(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, to: s
 
 
 async def serve(given: Delay) -> None:
-    """All ports, for ever."""
-    async with contextlib.AsyncExitStack() as stack:
-        for words in given.ports:
-            listen, _, to = words.partition("=")
-            host, _, port = listen.rpartition(":")
-
-            async def one(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, to: str = to) -> None:
-                await join(reader, writer, to, given)
-
-            await stack.enter_async_context(await asyncio.start_server(one, host, int(port)))
-        await asyncio.Event().wait()
+    """Serve all ports, for ever."""
+    for words in given.ports:
+        listen, _, to = words.partition("=")
+        host, _, port = listen.rpartition(":")
+        await asyncio.start_server(partial(join, to=to, given=given), host, int(port))
+    await asyncio.Event().wait()
 
 
 if __name__ == "__main__":

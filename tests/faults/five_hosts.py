@@ -1,18 +1,17 @@
-"""A run over five hosts: what runs where, each started by its one command, with keys, and started again when it dies.
+"""A run over five hosts, with keys: each process is started by its own command, and started again when it dies.
 
 host 1   router-0  safety-0  recorder-0         host 4   actors of the second robot
 host 2   router-1  safety-1  recorder-1         host 5   learners
 host 3   actors of the first robot
 
-Everybody knows both routers and goes to the other when its own is gone; the routers have a cable between them besides
-the switch. The clocks of three hosts are hours off. With a delay, the actors' cables to the routers are long ones.
+Every process knows both routers and uses the other one when its own is gone. The routers have a cable between them
+besides the switch. The clocks of three hosts are hours off. A delay applies between the actors and the routers.
 """
 
 from __future__ import annotations
 
 import signal
 import subprocess
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +24,7 @@ from brakeline.logs.metrics import Metrics
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_with_task
-from brakeline.messaging.topics import LEARNER, RECORDED
+from brakeline.messaging.topics import RECORDED
 from brakeline.safety.methods import DDPC, load
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.service.plan_token import write_key
@@ -36,9 +35,9 @@ CABLE = Path(__file__).with_name("cable_delay.py")  # a program: nothing install
 PORT = 7447
 CLOCKS = {2: -7.0, 3: 5.0, 4: -3.0}  # h ahead of the others
 LEARNERS, MOVED = 5, 2  # the hosts that learners alternate between
-PATIENCE = 60.0  # s until something that was started is there: two cores that others use too
+PATIENCE = 60.0  # s until a process is there
 TURN = 0.05  # s
-# Networks too small to learn much: it is about who lives and what is lost.
+# Networks too small to learn much: the run shows which processes live and what is lost.
 SMALL = ("--learner.td3.hidden", 32, 32, "--learner.td3.batch", 32, "--learner.td3.warmup", 200)
 
 
@@ -50,7 +49,6 @@ class Spot:
     host: int
     words: tuple[str, ...]
     popen: subprocess.Popen[bytes] | None = None
-    starts: int = 0
 
     @property
     def alive(self) -> bool:
@@ -58,13 +56,18 @@ class Spot:
 
     @property
     def done(self) -> bool:
-        """It ended by itself, its work being done."""
+        """Whether it ended by itself, without an error."""
         return self.popen is not None and self.popen.poll() == 0
 
 
 @dataclass
 class Fleet:
-    """Made in a folder: keys, signed models, logs, checkpoints. `metrics` is what a looker-on hears."""
+    """The processes, with their keys, signed models, logs and checkpoints in a folder.
+
+    Attributes:
+        delay: s each way between actors and routers, and up to as much again, at random.
+        metrics: what a viewer on the bus hears.
+    """
 
     folder: Path
     hosts: Hosts
@@ -72,14 +75,13 @@ class Fleet:
     steps: int = 100_000  # of each robot
     seed: int = 0
     recorders: int = 2
-    delay: float = 0.0  # s each way between actors and routers, and as much again at the most, at random
+    delay: float = 0.0
     learning: tuple[object, ...] = SMALL
     metrics: Metrics = field(default_factory=Metrics)
     spots: dict[str, Spot] = field(default_factory=dict)
-    learners: Counter[str] = field(default_factory=Counter)  # LearnerMetrics heard
 
     def __post_init__(self) -> None:
-        """The models are made, and their data recorded, if they are not there."""
+        """Make the models, and record their data, if they are not there."""
         self._prepare()
         for i in (1, 2):
             link = () if i == 1 else ("--connect", f"tls/{self.hosts.joined(1)}:{PORT}")
@@ -99,11 +101,11 @@ class Fleet:
             self._add(f"actor-{robot}-0", 3 + i, "actor", robot, "--seed", self.seed, *to)
 
     def log(self, recorder: int) -> Path:
-        """Where a recorder writes."""
+        """Return the log of a recorder."""
         return self.folder / f"recorder-{recorder}" / "run.mcap"
 
     def start(self) -> None:
-        """Everything, and look on."""
+        """Start every process, and the viewer."""
         for host in range(3, 3 + len(self.robots)) if self.delay else ():
             ports = [f"0.0.0.0:{PORT + i}={self.hosts.address(1 + i)}:{PORT}" for i in (0, 1)]
             delay = str(self.delay)
@@ -119,7 +121,6 @@ class Fleet:
         """Start a process, on another host if one is given."""
         spot = self.spots[name]
         spot.host = host or spot.host
-        spot.starts += 1
         self.log(0).parent.mkdir(exist_ok=True)
         data = str(self.folder / "data")
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "BRAKELINE_DATA": data}
@@ -132,37 +133,35 @@ class Fleet:
         popen.wait(PATIENCE)
 
     def keep(self) -> None:
-        """As an engine does: start again what has died. What is done stays so."""
+        """Start processes again that have died, as a container engine does."""
         for spot in self.spots.values():
             if not spot.alive and not spot.done:
                 self.launch(spot.name)
 
     def living(self) -> frozenset[str]:
-        """Who is alive as far as the looker-on hears."""
+        """Return the processes that the viewer hears."""
         return self._bus.living()
 
     def taken(self, robot: str) -> int:
-        """Steps of a robot that the looker-on heard of."""
+        """Return the number of a robot's steps that the viewer has heard."""
         tallies = self.metrics.actors.copy()
         return sum(tally.steps for name, tally in tallies.items() if name.startswith(f"actor-{robot}"))
 
     def learned(self, robot: str) -> int:
-        """Steps that its learner has taken in, as it last said."""
+        """Return the number of steps that a robot's learner has received, by its latest message."""
         known = self.metrics.learners.get(robot)
         return 0 if known is None else int(known.steps)
 
     def said(self, process: str) -> dict[str, float]:
-        """What a process last said of itself."""
+        """Return the latest figures of a process."""
         known = self.metrics.processes.get(process)
         return {} if known is None else dict(known.figures)
 
     def end(self) -> None:
-        """In order: the recorders last."""
-        later = [name for name in self.spots if name.startswith(("recorder", "router"))]
-        for group in ([name for name in self.spots if name not in later], sorted(later)):  # recorders before routers
-            for name in group:
-                if self.spots[name].alive:
-                    self.kill(name, signal.SIGTERM)
+        """End the processes: first the others, then the recorders, then the routers."""
+        for name in sorted(self.spots, key=lambda name: ("recorder" in name) + 2 * ("router" in name)):
+            if self.spots[name].alive:
+                self.kill(name, signal.SIGTERM)
 
     def close(self) -> None:
         if hasattr(self, "_bus"):
@@ -175,10 +174,7 @@ class Fleet:
         self.close()
 
     def _hear(self, sample: Sample) -> None:
-        message = sample.message()
-        self.metrics.add(sample.key, message)
-        if sample.topic is LEARNER:
-            self.learners[message.robot] += 1
+        self.metrics.add(sample.key, sample.message())
 
     def _prepare(self) -> None:
         keys = self.folder / "keys"
@@ -202,11 +198,11 @@ class Fleet:
         self.spots[name] = Spot(name, host, (*PYTHON, "-m", "brakeline.deploy.cli", *map(str, (*words, *common))))
 
     def _to(self, first: int) -> tuple[str, ...]:
-        """Both routers, the one that is to be asked first in front."""
+        """Return the options to connect to both routers, `first` first."""
         return ("--connect", *self._endpoints(first))
 
     def _far(self, host: int, first: int) -> tuple[str, ...]:
-        """The same, at the far end of a host's long cables."""
+        """Return the same options, through the delays of a host."""
         return ("--connect", *(f"tls/{self.hosts.address(host)}:{PORT + i - 1}" for i in (first, 3 - first)))
 
     def _endpoints(self, first: int) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
-"""Several hosts on one machine: network namespaces, each with a stack of its own, a cable to one switch, and a clock.
+"""Several hosts on one machine: network namespaces, each with its own stack, a cable to one switch, and a clock.
 
-Cables can be pulled; between two hosts there may be one besides the switch. The machine itself has a cable too, to look
-on. It takes Linux, root and iproute2; clocks that differ take gcc.
+Cables can be pulled; two hosts may have a cable besides the switch. The machine itself has a cable too, to look on.
+It takes Linux, root and iproute2; clocks that differ take gcc.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
-CLOCK = Path(__file__).with_name("clock.c")  # what a host whose clock is off loads first
+CLOCK = Path(__file__).with_name("clock.c")  # the library that a host with a shifted clock loads first
 MACHINE = 254  # the machine's own number on the switch
 
 
@@ -23,27 +23,22 @@ class NoHosts(RuntimeError):
     """Namespaces can't be made here; the message says why."""
 
 
-def ip(*words: object) -> None:
-    """Raises NoHosts with what `ip` says."""
+def ip(words: str) -> None:
+    """Run `ip`. Raises NoHosts with its message."""
     if shutil.which("ip") is None:
         raise NoHosts("there is no `ip` (Debian: iproute2)")
-    done = subprocess.run(["ip", *map(str, words)], check=False, capture_output=True, text=True)
+    done = subprocess.run(["ip", *words.split()], check=False, capture_output=True, text=True)
     if done.returncode:
-        raise NoHosts(f"ip {' '.join(map(str, words))}: {done.stderr.strip()}")
+        raise NoHosts(f"ip {words}: {done.stderr.strip()}")
 
 
 class Hosts:
     """`count` hosts, numbered from 1, until the end of the block."""
 
     def __init__(self, count: int, clocks: Mapping[int, float] | None = None) -> None:
-        """clocks: hours that a host's clock is ahead, where there is gcc.
-
-        Raises:
-            NoHosts: they can't be made here.
-        """
+        """clocks: hours that a host's clock is ahead, if there is gcc. Raises NoHosts."""
         self.count, self._clocks = count, dict(clocks or {})
         self._name = f"bl{os.getpid()}"
-        self._net = f"10.213.{os.getpid() % 250}"
         self._started: list[subprocess.Popen[bytes]] = []
         self._folder = tempfile.TemporaryDirectory(prefix=self._name)
         self.clock = self._compiled() if self._clocks else None
@@ -54,65 +49,46 @@ class Hosts:
             raise
 
     def address(self, host: int) -> str:
-        return f"{self._net}.{host}"
+        return f"10.213.{os.getpid() % 250}.{host}"
 
     def joined(self, host: int) -> str:
-        """A host's address on the cable that `join` laid."""
+        """Return a host's address on the cable that `join` laid."""
         return f"10.214.{os.getpid() % 250}.{host}"
 
     def join(self, one: int, other: int) -> None:
-        """A cable between two hosts, besides the switch."""
-        ip(
-            "-n",
-            self._ns(one),
-            "link",
-            "add",
-            "direct",
-            "type",
-            "veth",
-            "peer",
-            "name",
-            "direct",
-            "netns",
-            self._ns(other),
-        )
+        """Lay a cable between two hosts, besides the switch."""
+        ip(f"-n {self._ns(one)} link add direct type veth peer name direct netns {self._ns(other)}")
         for host in (one, other):
-            ip("-n", self._ns(host), "address", "add", f"{self.joined(host)}/24", "dev", "direct")
-            ip("-n", self._ns(host), "link", "set", "direct", "up")
+            ip(f"-n {self._ns(host)} address add {self.joined(host)}/24 dev direct")
+            ip(f"-n {self._ns(host)} link set direct up")
 
     def unjoin(self, host: int, joined: bool = False) -> None:
         """Pull the cable between the two hosts, or put it in again."""
-        ip("-n", self._ns(host), "link", "set", "direct", "up" if joined else "down")
+        ip(f"-n {self._ns(host)} link set direct {'up' if joined else 'down'}")
 
     def cut(self, host: int) -> None:
         """Pull a host's cable out of the switch."""
-        ip("-n", self._ns("switch"), "link", "set", f"port{host}", "down")
+        ip(f"-n {self._ns('switch')} link set port{host} down")
 
     def heal(self, host: int) -> None:
         """Put it in again."""
-        ip("-n", self._ns("switch"), "link", "set", f"port{host}", "up")
+        ip(f"-n {self._ns('switch')} link set port{host} up")
 
     def start(self, host: int, words: list[str], output: Path, **environment: str) -> subprocess.Popen[bytes]:
-        """A process on a host, with the host's clock; what it says is appended to `output`."""
+        """Start a process on a host, with the host's clock; append its output to a file."""
         if self.clock is not None and host in self._clocks:
             ahead = round(3600 * self._clocks[host])
             environment |= {"LD_PRELOAD": str(self.clock), "BRAKELINE_AHEAD": str(ahead)}
+        command, env = ["ip", "netns", "exec", self._ns(host), *words], os.environ | environment
         with output.open("ab") as out:
-            popen = subprocess.Popen(
-                ["ip", "netns", "exec", self._ns(host), *words],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=out,
-                env=os.environ | environment,
-            )
+            popen = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env)
         self._started.append(popen)
         return popen
 
     def close(self) -> None:
-        """End what runs there, and take everything down."""
+        """End the processes, and take everything down."""
         for popen in self._started:
-            if popen.poll() is None:
-                popen.kill()
+            popen.kill()
             popen.wait()
         for host in (*range(1, self.count + 1), "switch"):  # the cables go with them
             subprocess.run(["ip", "netns", "delete", self._ns(host)], check=False, capture_output=True)
@@ -125,7 +101,7 @@ class Hosts:
         self.close()
 
     def _compiled(self) -> Path | None:
-        """The library that sets a process's clock, if there is a compiler."""
+        """Compile the library that sets a process's clock, if there is a compiler."""
         library, gcc = Path(self._folder.name) / "clock.so", shutil.which("gcc")
         if gcc is None:
             return None
@@ -134,23 +110,23 @@ class Hosts:
 
     def _build(self) -> None:
         switch = self._ns("switch")
-        ip("netns", "add", switch)
-        ip("-n", switch, "link", "add", "bridge", "type", "bridge")
-        ip("-n", switch, "link", "set", "bridge", "up")
+        ip(f"netns add {switch}")
+        ip(f"-n {switch} link add bridge type bridge")
+        ip(f"-n {switch} link set bridge up")
         for host in range(1, self.count + 1):
-            ip("netns", "add", self._ns(host))
-            ip("-n", self._ns(host), "link", "set", "lo", "up")
-            self._plug(host, "eth0", "-n", self._ns(host))
-        self._plug(MACHINE, self._name)
+            ip(f"netns add {self._ns(host)}")
+            ip(f"-n {self._ns(host)} link set lo up")
+            self._plug(host, "eth0", f"-n {self._ns(host)}")
+        self._plug(MACHINE, self._name, "")
 
-    def _plug(self, host: int, interface: str, *there: Any) -> None:
-        """A cable from an interface to the switch."""
+    def _plug(self, host: int, interface: str, there: str) -> None:
+        """Lay a cable from an interface to the switch."""
         switch, port = self._ns("switch"), f"port{host}"
-        ip(*there, "link", "add", interface, "type", "veth", "peer", "name", port, "netns", switch)
-        ip(*there, "address", "add", f"{self.address(host)}/24", "dev", interface)
-        ip(*there, "link", "set", interface, "up")
-        ip("-n", switch, "link", "set", port, "master", "bridge")
-        ip("-n", switch, "link", "set", port, "up")
+        ip(f"{there} link add {interface} type veth peer name {port} netns {switch}")
+        ip(f"{there} address add {self.address(host)}/24 dev {interface}")
+        ip(f"{there} link set {interface} up")
+        ip(f"-n {switch} link set {port} master bridge")
+        ip(f"-n {switch} link set {port} up")
 
     def _ns(self, host: int | str) -> str:
         return f"{self._name}-{host}"

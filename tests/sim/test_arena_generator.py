@@ -13,7 +13,7 @@ from brakeline.errors import UnknownArena
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import arena_kind, bounds_of, draw_arena, gaps
+from brakeline.sim.arena_generator import arena_kind, draw_arena, gaps
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 
 ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in ROBOTS[robot].task.arenas]
@@ -126,9 +126,9 @@ def test_the_default_arenas_have_their_documented_numbers() -> None:
     assert (kind.half_width, kind.goal_distance, kind.goal_radius, kind.step_limit) == (2.5, 1.5, 0.25, 300)
     assert kind.path_clearance == 0.05
     kind = arena_kind(QUADROTOR, "default")
-    assert bounds_of(kind) == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
+    assert arena("default", 0, QUADROTOR).bounds == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
     assert (kind.goal_distance, kind.goal_radius, kind.step_limit) == (12.0, 1.0, 200)
-    assert bounds_of(arena_kind(QUADROTOR, "tall"))[2] == (0.0, 30.0)
+    assert arena("tall", 0, QUADROTOR).bounds[2] == (0.0, 30.0)
 
 
 def test_the_generator_determines_the_arena() -> None:

@@ -157,13 +157,13 @@ def test_the_vehicle_follows_velocities_in_the_body_frame(flying: Station) -> No
     assert flying.fly(2, 0, 0, frame=BODY, seconds=3.0) == pytest.approx(np.array([0, 2, 0]), abs=0.1)
     assert flying.fly(0, 2, -1, frame=BODY, seconds=3.0) == pytest.approx(np.array([-2, 0, -1]), abs=0.1)
     flying.fly(0, 0, 0, mask=VELOCITY_YAW, yaw=0.0, seconds=4.0)  # turn to the north
-    assert flying.autopilot._heading() == pytest.approx(0.0, abs=0.05)
+    assert flying.autopilot.telemetry.heading() == pytest.approx(0.0, abs=0.05)
     assert flying.fly(2, 0, 0, frame=BODY, seconds=3.0) == pytest.approx(np.array([2, 0, 0]), abs=0.15)
 
 
 def test_a_yaw_rate_turns_clockwise(flying: Station) -> None:
     flying.fly(0, 0, 0, mask=VELOCITY_RATE, rate=0.5, seconds=2.0)
-    assert flying.autopilot._heading() == pytest.approx(0.5 * math.pi + 1.0, abs=0.1)
+    assert flying.autopilot.telemetry.heading() == pytest.approx(0.5 * math.pi + 1.0, abs=0.1)
 
 
 @pytest.mark.parametrize(

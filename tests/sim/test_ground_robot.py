@@ -118,11 +118,10 @@ def test_an_input_that_is_not_two_finite_numbers_is_refused(bad: list[float]) ->
         robot().step(np.array(bad))
 
 
-def test_impossible_payload_and_friction_are_refused() -> None:
-    with pytest.raises(ValueError, match="payload"):
-        robot().set_payload(-1.0)
-    with pytest.raises(ValueError, match="friction"):
-        robot().set_friction(0.0)
+@pytest.mark.parametrize("change", [{"payload_kg": -1.0}, {"floor_friction": 0.0}, {"wings": 2.0}])
+def test_an_impossible_change_is_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(change))):
+        robot().alter(**change)
 
 
 def test_inputs_are_clipped_to_the_bounds() -> None:

@@ -10,7 +10,7 @@ from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
 from brakeline.sim.arena import same_room, staged_arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation, TurnMemory
+from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.traffic import Crowd
 from tests.robots import GROUND, QUADROTOR
@@ -39,6 +39,9 @@ def test_the_ground_robots_observation_is_in_the_documented_order() -> None:
     assert observation[:18] == pytest.approx(Lidar(arena, GROUND.task.rays).cast(mount, 0.5) / 3.5)
     assert observation[:18].min() < 0.3
     assert model.speed(true) == 0.1
+    for _ in range(9):  # 2 s in all: the turn memory is a low-pass filter
+        observation = model.observe(true, measured, input)
+    assert observation[-1] == pytest.approx((1.0 - np.exp(-1.0)) * 0.19 / 0.5)
 
 
 def test_the_quadrotors_observation_is_in_the_documented_order() -> None:
@@ -58,13 +61,6 @@ def test_the_quadrotors_observation_is_in_the_documented_order() -> None:
     assert observation[:180] == pytest.approx(Lidar(arena, QUADROTOR.task.rays).cast(true[:3]) / 12.0)
     assert named["ray 2 [range/12 m]"] == pytest.approx(2.0 / 12.0)  # level, straight ahead
     assert model.speed(true) == pytest.approx(3.0)
-
-
-def test_the_turn_memory_is_a_low_pass_filter() -> None:
-    memory = TurnMemory()
-    for _ in range(10):  # 2 s
-        memory.update(0.5, 0.2)
-    assert memory.value == pytest.approx(0.5 * (1.0 - np.exp(-1.0)))
 
 
 TRACKS = read_task(ROBOTS_FOLDER / "ground+tracks.task.toml")

@@ -9,21 +9,11 @@ import numpy as np
 import pytest
 
 from brakeline.errors import BadParameter, UnknownRules
-from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
-from brakeline.sim.autopilot.endpoint import TICK
 from brakeline.sim.autopilot.flight_modes import Mode
-from brakeline.sim.autopilot.telemetry_sender import BINS, obstacle_bins
-from brakeline.sim.lidar import Lidar
-from tests.robots import QUADROTOR
-from tests.sim.station import (
-    ACCEPTED,
-    FAILED,
-    UNSUPPORTED,
-    Station,
-    field,
-)
+from brakeline.sim.autopilot.telemetry_sender import MESSAGES
+from tests.sim.station import ACCEPTED, FAILED, UNSUPPORTED, Station
 
 
 def test_messages_have_the_requested_rates(station: Station) -> None:
@@ -45,15 +35,10 @@ def test_messages_have_the_requested_rates(station: Station) -> None:
 
 
 def test_every_message_can_be_requested() -> None:
-    lidar = Lidar(field(), QUADROTOR.task.rays)
-    station = Station("px4", airborne=True, lidar=lidar)
-    for name in (
-        "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU", "OBSTACLE_DISTANCE", "SYS_STATUS",
-        "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "SCALED_IMU", "GPS_RAW_INT", "HOME_POSITION", "BATTERY_STATUS",
-        "ODOMETRY", "VFR_HUD", "AUTOPILOT_VERSION",
-    ):  # fmt: skip
-        assert station.command(512, getattr(mavlink, f"MAVLINK_MSG_ID_{name}")) == ACCEPTED
-        assert station.last(name)
+    station = Station("px4", airborne=True)
+    for kind, name in MESSAGES.items():
+        assert station.command(512, kind) == ACCEPTED
+        assert station.last(name.upper())
 
 
 def test_arducopter_refuses_unsupported_messages() -> None:
@@ -101,22 +86,6 @@ def test_frame_conversions_are_inverse_to_each_other() -> None:
     assert ned_frames.yaw(ned_frames.yaw(0.3)) == pytest.approx(0.3)
 
 
-def test_obstacle_distance_is_the_least_of_each_sector() -> None:
-    pillar = Obstacle(
-        CYLINDER, (0.0, -4.0, 10.0), (0.5, 20.0)
-    )  # to the south: on the right of a vehicle that faces east
-    arena = field(pillar)
-    station = Station("px4", airborne=True, arena=arena, lidar=Lidar(arena, QUADROTOR.task.rays))
-    station.command(512, mavlink.MAVLINK_MSG_ID_OBSTACLE_DISTANCE)
-    distances = station.last("OBSTACLE_DISTANCE").distances
-    assert len(distances) == BINS
-    assert distances[BINS // 4] == pytest.approx(350, abs=2)
-    assert distances[0] == distances[BINS // 2] == 1201
-
-    directions = np.array([[1.0, 0.0, 0.0], [np.cos(0.5), 0.0, np.sin(0.5)]])
-    assert obstacle_bins(np.array([3.0, 2.0]), directions, 12.0)[0] == math.floor(200 * np.cos(0.5))
-
-
 def test_parameters_are_listed_read_and_set(station: Station) -> None:
     station.listen()
     station.received.clear()
@@ -144,13 +113,6 @@ def test_integers_travel_as_bits_in_px4_and_as_values_in_ardupilot() -> None:
     assert px4.flight.limits.on_loss is Mode.LAND
     ardupilot.mav.param_request_read_send(1, 1, b"FRAME_CLASS", -1)
     assert ardupilot.last("PARAM_VALUE").param_value == 1.0
-
-
-def test_time_advances_by_ticks() -> None:
-    station = Station("px4", airborne=True)
-    station.wait(1.0)
-    assert station.flight.time == pytest.approx(1.0)
-    assert round(1.0 / TICK) == 50
 
 
 def test_unknown_rules_and_parameters_are_refused() -> None:
