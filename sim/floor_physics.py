@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from brakeline.sim.arena import Arena
-from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
+from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
 
 STANDING = 0.02  # m/s; a robot at rest by its input stands below this speed
 
@@ -36,7 +36,6 @@ class FloorPhysics:
         """
         spec = mujoco.MjSpec.from_string(mjcf)
         add_obstacles(spec, arena)
-        add_movers(spec, arena.crowd)
         place_base(spec.body("base"), arena, height)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)

@@ -21,10 +21,10 @@ Geom = tuple[mujoco.mjtGeom, tuple[float, float, float], tuple[float, float, flo
 
 
 def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
-    """Add an arena's obstacles to the world body, in their order, named `obstacle 0`, `obstacle 1`, ...
+    """Add an arena's obstacles to the world body, in their order, named `obstacle 0`, `obstacle 1`, ..., then movers.
 
     In the plane they stand on the floor z = 0, which this function does not add. In space they have their true heights,
-    and floor and ceiling are among them.
+    and floor and ceiling are among them. `MoverBodies` moves the movers, which nothing pushes.
     """
     for i, obstacle in enumerate(arena.obstacles):
         kind, half, position = _geom(obstacle, arena)
@@ -37,23 +37,19 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
             contype=OBSTACLE_BIT,
             conaffinity=0,
         )
-
-
-def add_movers(spec: mujoco.MjSpec, crowd: Crowd | OtherRobots | None) -> None:
-    """Add moving obstacles as bodies that nothing pushes, named `mover 0`, `mover 1`, ...; `MoverBodies` moves them."""
+    crowd = arena.crowd
     for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
-        flat = len(mover.position) == 2
-        z = 0.5 * HEIGHT if flat else mover.position[2]
-        body = spec.worldbody.add_body(name=f"mover {i}", mocap=True, pos=(*mover.position[:2], z))
-        radius = mover.size[0]
+        kind, size, position = _geom(mover, arena)
+        depth = 0.0 if crowd is None or crowd.pushes else NO_PUSH_DEPTH
+        body = spec.worldbody.add_body(name=f"mover {i}", mocap=True, pos=position)
         body.add_geom(
             name=f"mover {i}",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=(radius, 0.5 * HEIGHT, 0.0) if flat else (radius, 0.0, 0.0),
+            type=kind,
+            size=size,
             contype=OBSTACLE_BIT,
             conaffinity=0,
-            margin=0.0 if crowd is None or crowd.pushes else -NO_PUSH_DEPTH,
-            gap=0.0 if crowd is None or crowd.pushes else NO_PUSH_DEPTH,
+            margin=-depth,
+            gap=depth,
         )
 
 
@@ -141,7 +137,6 @@ def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Compile the obstacles of an arena without a robot, to simulate a sensor on."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, arena)
-    add_movers(spec, arena.crowd)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

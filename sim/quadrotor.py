@@ -18,7 +18,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.flight_controller import GRAVITY, FlightController, Vector
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, Quaternion, rotate
 from brakeline.sim.ground_estimator import heading_of
-from brakeline.sim.mujoco_obstacles import MoverBodies, add_movers, add_obstacles
+from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
 from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
 from brakeline.sim.wind import Wind, WindProcess
 
@@ -257,16 +257,11 @@ def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
     """Compile the vehicle and the arena, with the vehicle at the start or on the floor below it."""
     spec = mujoco.MjSpec.from_string(MODEL)
     add_obstacles(spec, arena)
-    add_movers(spec, arena.crowd)
     x, y, z = arena.start[:3]
     if floor is not None:
+        plane, place = mujoco.mjtGeom.mjGEOM_PLANE, (0.0, 0.0, floor)
         spec.worldbody.add_geom(
-            name="floor",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=(0.0, 0.0, 1.0),
-            pos=(0.0, 0.0, floor),
-            contype=FLOOR_BIT,
-            conaffinity=0,
+            name="floor", type=plane, size=(0.0, 0.0, 1.0), pos=place, contype=FLOOR_BIT, conaffinity=0
         )
         z = floor + spec.geom("guard").size[1]
     spec.body("base").pos = (x, y, z)

@@ -27,14 +27,7 @@ class Crowd:
     """The moving obstacles of one arena in one episode; their positions are a function of the time alone."""
 
     def __init__(self, kind: MoverKind, positions: Array, static: Shapes, seed: int) -> None:
-        """Start at free positions (n, d) at time 0.
-
-        Args:
-            kind: their size, speed and acceleration.
-            positions: (n, d) m, free of `static`.
-            static: the obstacles that they avoid.
-            seed: determines all their motion.
-        """
+        """Start at positions (n, d) [m], which are free of the `static` obstacles, at time 0."""
         self.kind, self._static = kind, static
         self._rng = np.random.default_rng((seed, 7))
         self._wish = self._draw_wishes(positions)
@@ -65,8 +58,7 @@ class Crowd:
 
     def obstacles(self, time: float) -> tuple[Obstacle, ...]:
         """Return the crowd as obstacles at a time [s], without their motion."""
-        kind = SPHERE if self.dim == 3 else CYLINDER
-        return tuple(Obstacle(kind, tuple(position), (self.kind.radius,)) for position in self.at(time)[0].tolist())
+        return tuple(_mover(position, self.kind.radius) for position in self.at(time)[0].tolist())
 
     def _draw_wishes(self, positions: Array) -> Array:
         """Draw the desired velocities (n, d) [m/s]."""
@@ -114,7 +106,6 @@ class OtherRobots:
 
         Args:
             now: returns their true positions (n, 2) [m].
-            radius: radius of each robot [m].
             reported: returns the positions [m] and velocities [m/s] (n, 2) that they measure and report to each other.
         """
         self._now, self._radius, self.reported = now, radius, reported
@@ -129,7 +120,7 @@ class OtherRobots:
 
     def obstacles(self, time: float) -> tuple[Obstacle, ...]:
         """Return the robots as obstacles at their present positions."""
-        return tuple(Obstacle(CYLINDER, tuple(position), (self._radius,)) for position in self.at(time)[0].tolist())
+        return tuple(_mover(position, self._radius) for position in self.at(time)[0].tolist())
 
 
 class CrowdSensor:
@@ -142,7 +133,7 @@ class CrowdSensor:
 
     def measure(self, time: float) -> tuple[Obstacle, ...]:
         """Return the crowd with its motion, as measured at a time [s]."""
-        kind, shape = self._crowd.kind, SPHERE if self._crowd.dim == 3 else CYLINDER
+        kind = self._crowd.kind
         positions, velocities = self._crowd.at(time)
         positions = positions + self._errors(kind.position_error)
         velocities = velocities + self._errors(kind.velocity_error)
@@ -155,7 +146,7 @@ class CrowdSensor:
             motion = Motion(
                 tuple(velocity), kind.position_error, kind.velocity_error, acceleration=kind.acceleration, before=before
             )
-            obstacles.append(Obstacle(shape, tuple(position), (kind.radius,), motion=motion))
+            obstacles.append(_mover(position, kind.radius, motion))
         self._last_time = time
         return tuple(obstacles)
 
@@ -165,6 +156,10 @@ class CrowdSensor:
         length = np.maximum(np.linalg.norm(error, axis=1, keepdims=True), 1e-12)
         error *= most * self._rng.random((len(error), 1)) / length
         return np.asarray(error)
+
+
+def _mover(position: list[float], radius: float, motion: Motion | None = None) -> Obstacle:
+    return Obstacle(SPHERE if len(position) == 3 else CYLINDER, tuple(position), (radius,), motion=motion)
 
 
 def _shortened(vectors: Array, most: float) -> Array:

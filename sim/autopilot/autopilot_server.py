@@ -16,6 +16,7 @@ import json
 import math
 import socket
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from brakeline.messaging.byte_links import Link
@@ -35,14 +36,9 @@ class TruthSender:
         self._address = (host, port)
 
     def send(self, system: int, time: float, vehicle: Quadrotor, collisions: int) -> None:
-        """Send one datagram.
-
-        Args:
-            time: time since the autopilot started [s].
-            collisions: number of contacts that began since then.
-        """
+        """Send one datagram; without a listener it is lost. time: s; collisions: contacts that began so far."""
         state = vehicle.state()
-        clearance = float(vehicle.clearance(state[:3]))
+        clearance = float(vehicle.clearance(state))
         message = {
             "system": system,
             "time": round(time, 3),
@@ -50,10 +46,8 @@ class TruthSender:
             "collisions": collisions,
             "clearance": clearance if math.isfinite(clearance) else None,
         }
-        try:
+        with suppress(OSError):
             self._socket.sendto(json.dumps(message).encode(), self._address)
-        except OSError:
-            return  # without a listener the datagram is lost
 
     def close(self) -> None:
         self._socket.close()

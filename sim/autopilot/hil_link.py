@@ -13,7 +13,6 @@ import time
 from brakeline.errors import AutopilotGone
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_sensors import HilSensors
-from brakeline.sim.flight_controller import Vector
 from brakeline.sim.quadrotor import Quadrotor
 
 LOCKSTEP, ARMED = 0x1, int(mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -65,7 +64,7 @@ class HilLink:
         self._now += self._step
         truth, (dx, dy, dz) = vehicle.true_reading(), self.shift
         x, y, z = truth.position
-        position: Vector = (x + dx, y + dy, z + dz)
+        position = (x + dx, y + dy, z + dz)
         packets = [message.pack(self._packer) for message in self._sensors.read(truth, position, self._now)]
         try:
             self._connection.sendall(b"".join(packets))

@@ -94,21 +94,13 @@ def test_subsamples_are_the_path_within_the_period_in_the_robots_frame() -> None
 
 
 def test_payload_and_friction_change_the_motion_during_a_run() -> None:
-    vehicle = robot()
-    drive(vehicle, 0.25, 0.0, 3)
-    bare = moved(vehicle, 0.0, 0.0, 2)
-    vehicle.set_payload(2.0)
-    drive(vehicle, 0.25, 0.0, 3)
-    laden = moved(vehicle, 0.0, 0.0, 2)
-    vehicle.set_payload(0.0)
-    vehicle.set_friction(0.15)
-    drive(vehicle, 0.25, 0.0, 3)
-    slippery = moved(vehicle, 0.0, 0.0, 2)
-    vehicle.set_friction(1.0)
-    drive(vehicle, 0.25, 0.0, 3)
-    assert laden > 1.5 * bare
-    assert slippery > 2.0 * bare
-    assert moved(vehicle, 0.0, 0.0, 2) == pytest.approx(bare, rel=0.02)
+    vehicle, ways = robot(), []
+    for change in ({}, {"payload_kg": 2.0}, {"payload_kg": 0.0, "floor_friction": 0.15}, {"floor_friction": 1.0}):
+        vehicle.alter(**change)
+        drive(vehicle, 0.25, 0.0, 3)
+        ways.append(moved(vehicle, 0.0, 0.0, 2))
+    bare, laden, slippery, again = ways
+    assert laden > 1.5 * bare and slippery > 2.0 * bare and again == pytest.approx(bare, rel=0.02)
     assert moved(robot(payload_kg=2.0), 0.25, 0.0) < 0.85 * moved(robot(), 0.25, 0.0)
 
 
@@ -172,10 +164,9 @@ def test_collisions_agree_with_the_geometry() -> None:
     collisions = 0
     for episode in range(45):
         observation, info = env.reset(options={"episode_seed": episode})
-        policy = policies[episode % 3]
         done = False
         while not done:
-            observation, _, terminated, truncated, info = env.step(policy(observation, info))
+            observation, _, terminated, truncated, info = env.step(policies[episode % 3](observation, info))
             gap = body_gap(info["true_state"], info["arena"])
             # it may bounce back a little after touching; a touch a millimetre deep is never missed
             assert gap < 0.006 if info["collision"] else gap > 0.0

@@ -41,18 +41,18 @@ each_arena = pytest.mark.parametrize(
 Make = Callable[..., NavigationEnv]
 
 
-def episode(env: NavigationEnv, policy: str, options: dict[str, Any], steps: int = 60) -> tuple[list[Any], list[Any]]:
-    """Return observations and infos of the first steps of one episode."""
+def episode(env: NavigationEnv, policy: str, seed: int, steps: int = 60) -> list[tuple[Any, ...]]:
+    """Return (observation, reward, terminated, truncated, info) at the start, and after the first steps."""
     act = scripted(policy, env.robot, np.random.default_rng(0))
-    observation, info = env.reset(options=options)
-    observations, infos = [observation], [info]
-    for _ in range(steps):
-        observation, _, terminated, truncated, info = env.step(act(observation, info))
-        observations.append(observation)
-        infos.append(info)
-        if terminated or truncated:
-            break
-    return observations, infos
+    observation, info = env.reset(options={"episode_seed": seed})
+    results: list[tuple[Any, ...]] = [(observation, 0.0, False, False, info)]
+    while len(results) <= steps and not (results[-1][2] or results[-1][3]):
+        results.append(env.step(act(results[-1][0], results[-1][4])))
+    return results
+
+
+def observed(env: NavigationEnv, policy: str, seed: int) -> np.ndarray:
+    return np.array([result[0] for result in episode(env, policy, seed)])
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative
@@ -113,15 +113,12 @@ def test_the_image_shows_obstacles_the_goal_and_the_robot_from_above(make: Make)
 @each_robot
 def test_the_episode_seed_determines_the_episode(make: Make) -> None:
     env = make()
-    first, infos = episode(env, "random", {"episode_seed": 5})
-    episode(env, "greedy", {"episode_seed": 6})
-    again, _ = episode(env, "random", {"episode_seed": 5})
-    fresh, _ = episode(make(), "random", {"episode_seed": 5})
-    other, _ = episode(env, "random", {"episode_seed": 6})
-    keyed, _ = episode(make(seed_key=1), "random", {"episode_seed": 5})
-    assert np.array_equal(first, again) and np.array_equal(first, fresh)
-    assert not np.array_equal(first[0], other[0]) and not np.array_equal(first[0], keyed[0])
-    assert infos[0]["episode_seed"] == 5
+    first = observed(env, "random", 5)
+    observed(env, "greedy", 6)
+    assert np.array_equal(first, observed(env, "random", 5)) and np.array_equal(first, observed(make(), "random", 5))
+    for other in (observed(env, "random", 6), observed(make(seed_key=1), "random", 5)):
+        assert not np.array_equal(first[0], other[0])
+    assert env.reset(options={"episode_seed": 5})[1]["episode_seed"] == 5
 
 
 def test_the_seed_of_reset_determines_the_sequence_of_episodes() -> None:
@@ -135,7 +132,7 @@ def test_the_seed_of_reset_determines_the_sequence_of_episodes() -> None:
 def test_info_has_its_documented_keys_and_values(make: Make) -> None:
     env = make()
     robot, d = env.robot, env.robot.position_dim
-    _, infos = episode(env, "greedy", {"episode_seed": 1})
+    infos = [result[4] for result in episode(env, "greedy", 1)]
     for i, info in enumerate(infos):
         assert set(info) == INFO_KEYS
         assert info["time"] == pytest.approx(0.2 * i)
@@ -155,32 +152,20 @@ def test_info_has_its_documented_keys_and_values(make: Make) -> None:
 def test_the_reward_is_progress_and_the_goal(make: Make) -> None:
     env = make()
     d, paid = env.robot.position_dim, {"ground": 20.0, "quadrotor": 2.0}[env.robot.name]
-    act = scripted("astar", env.robot, np.random.default_rng(0))
-    observation, info = env.reset(options={"episode_seed": 4})
-    start = np.linalg.norm(np.array(info["goal"]) - info["true_state"][:d])
-    total, done = 0.0, False
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(act(observation, info))
-        total += reward
-        done = terminated or truncated
-    end = np.linalg.norm(np.array(info["goal"]) - info["true_state"][:d])
+    results = episode(env, "astar", 4, steps=300)
+    _, _, terminated, truncated, info = results[-1]
+    start, end = (np.linalg.norm(np.array(info["goal"]) - r[4]["true_state"][:d]) for r in (results[0], results[-1]))
     assert info["at_goal"] and terminated and not truncated and end <= info["arena"].goal_radius
-    assert total == pytest.approx(paid * (start - end) + 100.0)
+    assert sum(result[1] for result in results) == pytest.approx(paid * (start - end) + 100.0)
     assert info["state"] == pytest.approx(info["true_state"], abs=max(env.robot.measurement_bound))
 
 
 @each_robot
 def test_a_collision_is_penalised_and_terminates_the_episode(make: Make) -> None:
-    env = make(reward=Reward(progress=0.0))
-    act = scripted("adversary", env.robot, np.random.default_rng(0))
-    observation, info = env.reset(options={"episode_seed": 4})
-    rewards, done = [], False
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(act(observation, info))
-        rewards.append(reward)
-        done = terminated or truncated
+    results = episode(make(reward=Reward(progress=0.0)), "adversary", 4, steps=300)
+    _, reward, terminated, _, info = results[-1]
     assert info["collision"] and terminated and not info["at_goal"]
-    assert rewards[-1] == -100.0 and not any(rewards[:-1])
+    assert reward == -100.0 and not any(result[1] for result in results[:-1])
 
 
 @each_robot

@@ -28,15 +28,13 @@ each_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 
 
 class Episodes:
-    """Episodes of a scripted policy: of all steps the speeds, of each episode the last info and what happened."""
+    """Episodes of a scripted policy: the speeds of all steps, and the last info and the least clearance of each."""
 
     def __init__(self, robot: RobotWithTask, policy_name: str, arena: str, episodes: int) -> None:
         env = NavigationEnv(robot, arena, PointMass if robot is QUADROTOR else None)
         policy = scripted(policy_name, robot, np.random.default_rng(1))
-        self.last: list[dict[str, Any]] = []
-        self.steps: list[int] = []
-        self.least: list[float] = []  # clearance
-        self.clearances, self.speeds = list[float](), list[float]()
+        self.last, self.steps = list[dict[str, Any]](), list[int]()
+        self.least, self.clearances, self.speeds = list[float](), list[float](), list[float]()
         self.outside = 0  # steps before any touch
         for episode in range(episodes):
             observation, info = env.reset(options={"episode_seed": episode})
@@ -73,29 +71,21 @@ def test_the_ground_route_policy_reaches_every_goal_with_clearance() -> None:
     assert (np.array(episodes.clearances) < 0.04).mean() <= 0.01
 
 
-def test_the_quadrotor_route_policy_reaches_every_goal_fast_and_with_clearance() -> None:
-    episodes = Episodes(QUADROTOR, "astar", "default", 20)
-    assert episodes.share("at_goal") == 1.0
-    assert np.mean(episodes.speeds) > 4.0 and max(episodes.speeds) > 6.5
-    assert min(episodes.least) > 0.2
-
-
-def test_the_quadrotor_route_policy_works_among_many_obstacles() -> None:
-    episodes = Episodes(QUADROTOR, "astar", "dense", 15)
-    assert episodes.share("collision") == 0.0
-    assert episodes.share("at_goal") > 0.9
-
-
-def test_the_quadrotor_route_policy_is_fast_on_all_axes_at_once_in_a_tall_room() -> None:
-    episodes = Episodes(QUADROTOR, "astar", "tall", 10)
-    assert episodes.share("at_goal") == 1.0
-    assert max(episodes.speeds) > 8.0
-
-
-def test_the_careful_quadrotor_policy_arrives_among_many_obstacles() -> None:
-    episodes = Episodes(QUADROTOR, "careful", "dense", 15)
-    assert episodes.share("at_goal") == 1.0
-    assert np.mean(episodes.speeds) > 3.5
+@pytest.mark.parametrize(
+    ("policy", "arena", "episodes", "goals", "mean_speed", "top_speed", "clearance"),
+    [
+        ("astar", "default", 20, 1.0, 4.0, 6.5, 0.2),
+        ("astar", "dense", 15, 0.91, 0.0, 0.0, 0.0),
+        ("astar", "tall", 10, 1.0, 0.0, 8.0, 0.0),  # fast on all axes at once
+        ("careful", "dense", 15, 1.0, 3.5, 0.0, 0.0),
+    ],
+)
+def test_the_quadrotors_route_policies_reach_their_goals(
+    policy: str, arena: str, episodes: int, goals: float, mean_speed: float, top_speed: float, clearance: float
+) -> None:
+    flown = Episodes(QUADROTOR, policy, arena, episodes)
+    assert flown.share("at_goal") >= goals and flown.share("collision") == 0.0
+    assert np.mean(flown.speeds) > mean_speed and max(flown.speeds) > top_speed and min(flown.least) > clearance
 
 
 @pytest.mark.parametrize(("robot", "most_steps"), [(GROUND, 60), (QUADROTOR, 15)], ids=["ground", "quadrotor"])
@@ -148,20 +138,24 @@ def staged_info(
     return {"arena": arena, "goal": arena.goal, "state": state, "input_in_force": state[3:6], "time": 0.0}
 
 
+def flown_to_goal(arena: Arena, policy: QuadrotorRoutePolicy, most: int) -> np.ndarray:
+    """Return the true states (k, 9) of a point mass on its way to the goal, without a collision in `most` steps."""
+    vehicle, states = PointMass(arena, np.random.default_rng(0)), list[np.ndarray]()
+    while not states or np.linalg.norm(vehicle.true[:3] - arena.goal) >= 1.0:
+        assert len(states) < most, "the policy did not arrive"
+        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
+        assert not vehicle.step(policy(NO_OBSERVATION, info | {"time": 0.2 * len(states)})).collision
+        states.append(vehicle.true)
+    return np.array(states)
+
+
 def test_the_route_policy_brakes_in_time_before_a_narrow_passage() -> None:
     wall = Obstacle(BOX, (0.0, 0.0, 4.5), (1.0, 30.0, 9.0))  # 3 m are left above it
     arena = staged_arena(wall, start=(-12.0, 0.0, 2.0), goal=(12.0, 0.0, 2.0), half_width=15.0, height=12.0)
     policy = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
     assert policy(NO_OBSERVATION, staged_info(arena, (-12.0, 0.0, 2.0), (4.0, 0.0, 0.0)))[0] > 4.0
     assert policy(NO_OBSERVATION, staged_info(arena, (-5.0, 0.0, 2.0), (5.0, 0.0, 0.0)))[0] < 5.0
-    vehicle = PointMass(arena, np.random.default_rng(0))
-    policy = QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0))
-    for k in range(80):
-        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
-        assert not vehicle.step(policy(NO_OBSERVATION, info | {"time": 0.2 * k})).collision
-        if np.linalg.norm(vehicle.true[:3] - arena.goal) < 1.0:
-            break
-    assert k < 60
+    flown_to_goal(arena, QuadrotorRoutePolicy(QUADROTOR, np.random.default_rng(0)), 60)
 
 
 def test_the_route_policy_leaves_a_position_without_clearance() -> None:
@@ -176,18 +170,8 @@ def test_the_route_policy_leaves_a_position_without_clearance() -> None:
 def nearest_to(pillar: Obstacle, policy: type[QuadrotorRoutePolicy]) -> float:
     """Return how near the policy passes a pillar [m]."""
     arena = staged_arena(pillar, start=(-10.0, 0.0, 5.0), goal=(10.0, 0.0, 5.0), half_width=15.0, height=10.0)
-    vehicle, fly, least = (
-        PointMass(arena, np.random.default_rng(0)),
-        policy(QUADROTOR, np.random.default_rng(0)),
-        np.inf,
-    )
-    for k in range(60):
-        info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
-        vehicle.step(fly(NO_OBSERVATION, info | {"time": 0.2 * k}))
-        least = min(least, float(np.hypot(*(vehicle.true[:2] - pillar.position[:2]))) - pillar.size[0])
-        if np.linalg.norm(vehicle.true[:3] - arena.goal) < 1.0:
-            return least
-    raise AssertionError("the policy did not arrive")
+    states = flown_to_goal(arena, policy(QUADROTOR, np.random.default_rng(0)), 60)
+    return float(np.linalg.norm(states[:, :2] - pillar.position[:2], axis=1).min()) - pillar.size[0]
 
 
 def test_the_careful_policy_keeps_a_larger_distance() -> None:
