@@ -43,13 +43,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
         depth = 0.0 if crowd is None or crowd.pushes else NO_PUSH_DEPTH
         body = spec.worldbody.add_body(name=f"mover {i}", mocap=True, pos=position)
         body.add_geom(
-            name=f"mover {i}",
-            type=kind,
-            size=size,
-            contype=OBSTACLE_BIT,
-            conaffinity=0,
-            margin=-depth,
-            gap=depth,
+            name=f"mover {i}", type=kind, size=size, contype=OBSTACLE_BIT, conaffinity=0, margin=-depth, gap=depth
         )
 
 

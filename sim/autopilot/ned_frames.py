@@ -53,11 +53,7 @@ def into_body(q: Quaternion, vector: Vector) -> Vector:
 def globe(position: Vector) -> tuple[float, float, float]:
     """Return latitude [deg], longitude [deg] and altitude [m] of an ENU position [m]."""
     east, north, up = position
-    return (
-        LATITUDE + north * DEGREES,
-        LONGITUDE + east * DEGREES / math.cos(math.radians(LATITUDE)),
-        ALTITUDE + up,
-    )
+    return (LATITUDE + north * DEGREES, LONGITUDE + east * DEGREES / math.cos(math.radians(LATITUDE)), ALTITUDE + up)
 
 
 def globe_integers(position: Vector) -> tuple[int, int, int]:

@@ -24,10 +24,7 @@ LASTING: dict[str, dict[str, Upset]] = {  # by kind of autopilot
         "a motor at 80 %": Upset({"SIM_ENGINE_MUL": 0.8}),
         "GPS noise of 0.5 m": Upset({"SIM_GPS_NOISE": 0.5}),
     },
-    "px4": {
-        "20 % heavier": Upset({"SIH_MASS": 1.2}),
-        "motors at 80 %": Upset({"SIH_T_MAX": 4.0}),
-    },
+    "px4": {"20 % heavier": Upset({"SIH_MASS": 1.2}), "motors at 80 %": Upset({"SIH_T_MAX": 4.0})},
 }
 JUMPS = {"GPS off by 4.4 m for 10 s": Upset({"SIM_GPS_GLITCH_X": JUMP}, 150.0, 160.0, {"SIM_GPS_GLITCH_X": 0.0})}
 PASSING: dict[str, dict[str, Upset]] = {  # by setup

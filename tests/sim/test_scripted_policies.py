@@ -13,12 +13,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
-from brakeline.sim.quadrotor_policies import (
-    QuadrotorCarefulPolicy,
-    QuadrotorRoutePolicy,
-    StopPrediction,
-    full_speed,
-)
+from brakeline.sim.quadrotor_policies import QuadrotorCarefulPolicy, QuadrotorRoutePolicy, StopPrediction, full_speed
 from brakeline.sim.scripted_policies import scripted
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
