@@ -115,6 +115,7 @@ class Quadrotor(SimulatedVehicle):
         return self._report(self.collided, np.array(self._path), path, 0.0, *self._movers.contacts)
 
     def setters(self) -> dict[str, Callable[[float], None]]:
+        """Return what `alter` can change: a payload at the centre of mass, and the wind [m/s]."""
         speed, gust = partial(self._set_wind, "speed"), partial(self._set_wind, "gust")
         return {"payload_kg": self._set_payload, "wind_speed": speed, "gust": gust}
 

@@ -1,10 +1,10 @@
-"""A run over five hosts in which everything dies: processes and routers by `kill -9`, cables by being pulled.
+"""A run over five hosts with faults: processes and routers die by `kill -9`, and cables are pulled.
 
 python -m benchmarks chaos [--kills 100] [--seed 0] [--delay 0.01]
 
-One fault at a time, drawn at random; the next once everybody is back and both robots go on. Who died is started again,
-as an engine does; learners change their host each time. At the end the learners are told how far to go, and finish.
-What happened is read from the two recorders' logs, not from what the processes say.
+One random fault at a time; the next one comes when every process is back and both robots go on. A process that died is
+started again, as by a container engine; learners change their host each time. At the end the learners get a last number
+of steps, and finish. The outcome is read from the logs of the two recorders, not from the processes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LAST = 300  # steps more, at the end
 
 
 class Stuck(RuntimeError):
-    """After a fault the run did not go on; the message says who is missing."""
+    """After a fault the run did not go on; the message names the missing processes."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Chaos:
     unsaved: list[float] = field(default_factory=list)  # s that a killed recorder had heard and not saved
 
     def settle(self) -> None:
-        """Wait until everybody lives and each robot has taken some steps more. Raises Stuck."""
+        """Wait until every process lives and each robot has taken some more steps. Raises Stuck."""
         began = time.monotonic()
         before = {robot: self.fleet.taken(robot) for robot in ROBOTS}
         missing: set[str] = set()
@@ -61,7 +61,7 @@ class Chaos:
         raise Stuck(f"not within {PATIENCE:.0f} s: missing {sorted(missing)}, steps since then {taken}")
 
     def fault(self) -> str:
-        """Kill or cut something; says what."""
+        """Kill or cut something; return its description."""
         hosts = self.fleet.hosts
         what = self.random.choice([*self.fleet.spots, *(f"host {i}" for i in range(1, 6)), ROUTERS])
         self.counts["cuts" if " " in what else what.split("-")[0]] += 1
@@ -93,7 +93,7 @@ class Chaos:
         self.fleet.launch(name, move.get(spot.host))
 
     def finish(self) -> None:
-        """The learners learn so much that they end by themselves."""
+        """Let the learners reach their last step and end by themselves."""
         for robot in ROBOTS:
             name = f"learner-{robot}"
             self.fleet.kill(name, signal.SIGTERM)  # with a checkpoint
@@ -108,12 +108,12 @@ class Chaos:
                 raise Stuck("the learners did not finish")
             self.fleet.keep()
             time.sleep(TURN)
-        time.sleep(1.0)  # the last words
+        time.sleep(1.0)  # for the last messages
         self.fleet.end()
 
 
 def newest(log_file: Path) -> Path:
-    """The segment that is being written."""
+    """Return the segment that is being written."""
     return max(log_file.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
 
 
@@ -121,11 +121,11 @@ def newest(log_file: Path) -> Path:
 class Judged:
     """Both recorders' logs, read after the end."""
 
-    steps: int = 0  # in either
+    steps: int = 0  # in either log
     twice: int = 0  # in one log
     collisions: int = 0
-    lost: int = 0  # steps that were published and are in neither, between two that are
-    longest: int = 0  # of them in a row
+    lost: int = 0  # steps in neither log, between two that are in one
+    longest: int = 0  # most of them in a row
 
     def read(self, fleet: Fleet) -> None:
         seen: dict[tuple[str, int], set[int]] = defaultdict(set)
@@ -155,11 +155,7 @@ class Judged:
 
 
 def chaos(kills: int, seed: int, delay: float = 0.0) -> Figures:
-    """delay: s each way between actors and routers.
-
-    Raises:
-        NoHosts: namespaces can't be made here; Stuck: the run did not survive.
-    """
+    """Run with faults. delay: s each way between actors and routers. Raises NoHosts, and Stuck if the run ended."""
     with tempfile.TemporaryDirectory(prefix="chaos") as name, Hosts(5, CLOCKS) as hosts:
         folder = Path(name)
         hosts.join(1, 2)

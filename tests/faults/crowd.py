@@ -1,12 +1,11 @@
-"""A 50 Hz asker alone, and again while an authorised actor sends junk, sessions idle, and a listener has stopped.
+"""A 50 Hz client alone, and again while an authorised actor sends junk, sessions idle, and a listener has stopped.
 
 python -m benchmarks crowd [--rate 5000]
 
-The junk is noise, and requests that lack nearly everything: as many steps a second at one session as questions at
-another, both with an actor's certificate. The listener may hear steps, and its process is stopped (SIGSTOP). The asker
-drives one robot from the questions of a trained policy, each with its deadline. All share this machine's cores with the
-router and the service, as they would not where it matters; so that it is not only about who gets a core, who sends junk
-runs at a lower priority.
+The junk is noise, and requests that lack nearly all fields. One session sends as many steps a second as another one
+sends requests, both with an actor's certificate. The listener may hear steps, and its process is stopped (SIGSTOP). The
+client sends the requests of a trained policy, each with its deadline. All share this machine's cores with the router
+and the service, so the senders of junk run at a lower priority.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def _reported(pipe: Connection) -> float:
 
 
 def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, stop: Event) -> None:
-    """Send noise until told to stop; says how many messages a second."""
+    """Send noise until the event is set; report the number of messages a second."""
     os.nice(10)
     random = Random(question)
     noise = [random.randbytes(random.randrange(1, LARGEST)) for _ in range(256)]
@@ -93,7 +92,7 @@ def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, st
 
 
 def _idle(settings: BusSettings, sessions: int, up: Connection, stop: Event) -> None:
-    """Sessions that say nothing."""
+    """Open sessions that send nothing."""
     with ExitStack() as stack:
         for _ in range(sessions):
             stack.enter_context(open_session(settings, "actor-0"))
@@ -102,7 +101,7 @@ def _idle(settings: BusSettings, sessions: int, up: Connection, stop: Event) -> 
 
 
 def _listen(settings: BusSettings, up: Connection, _: Event) -> None:
-    """Who hears steps, and will be stopped; one that is can't be waited for, so it never ends by itself."""
+    """Subscribe to steps, for ever: the parent stops this process, and then kills it."""
     with Bus(settings, "recorder") as bus:
         bus.subscribe(STEP, lambda sample: None)
         _report(up, 1)
@@ -111,7 +110,7 @@ def _listen(settings: BusSettings, up: Connection, _: Event) -> None:
 
 @contextmanager
 def _crowd(settings: BusSettings, rate: int) -> Iterator[dict[str, float]]:
-    """All that would starve an asker; at the end what it came to."""
+    """Start everything that could starve a client; yield figures that are complete at the end."""
     spawn, said = spawning(), {"junk steps /s": 0.0, "junk questions /s": 0.0, "idle sessions": 0.0}
     stop, started = spawn.Event(), []
 
@@ -127,7 +126,7 @@ def _crowd(settings: BusSettings, rate: int) -> Iterator[dict[str, float]]:
         said["idle sessions"] = sum(_reported(pipe) for pipe in idle)
         os.kill(started[0].pid or 0, signal.SIGSTOP)
         senders = {"junk steps /s": begin(_junk, False, rate), "junk questions /s": begin(_junk, True, rate)}
-        time.sleep(3.0)  # until they are at it
+        time.sleep(3.0)  # until they send
         yield said
         stop.set()
         said |= {name: _reported(pipe) for name, pipe in senders.items()}
@@ -141,7 +140,7 @@ def _crowd(settings: BusSettings, rate: int) -> Iterator[dict[str, float]]:
 
 
 def _ask(settings: BusSettings, questions: list[pb.Request]) -> dict[str, float]:
-    """At 50 Hz, whatever comes."""
+    """Send requests at 50 Hz; return figures of the answers."""
     took: list[float] = []
     late = unanswered = 0
     with Bus(settings, "client") as bus:
@@ -158,18 +157,12 @@ def _ask(settings: BusSettings, questions: list[pb.Request]) -> dict[str, float]
             else:
                 took.append(time.perf_counter() - before)
     p50, p99, most = np.percentile(took or [np.nan], (50, 99, 100)) * 1e3
-    return {
-        "asked": SECONDS * RATE,
-        "late": late,
-        "no answer": unanswered,
-        "p50 ms": p50,
-        "p99 ms": p99,
-        "longest ms": most,
-    }
+    counts = {"asked": SECONDS * RATE, "late": late, "no answer": unanswered}
+    return counts | {"p50 ms": p50, "p99 ms": p99, "longest ms": most}
 
 
 def run(rate: int = JUNK) -> Figures:
-    """Junk messages of each kind at `rate` [1/s]."""
+    """Compare answers without and with junk messages of each kind at `rate` [1/s]."""
     with tempfile.TemporaryDirectory() as name:
         keys = Path(name) / "keys"
         authority = Authority(keys)

@@ -1,7 +1,7 @@
-"""Real autopilots that are not what they were: wind, weak motors, a load, noise; a GPS that jumps, cameras that go out.
+"""Real autopilots under changed conditions: wind, weak motors, a load, noise, a GPS that jumps, cameras that fail.
 
-After `flights`, whose folder it works in: A* flies among obstacles behind the model set that was made there, the model
-set is made again of that flight's log, and A* flies behind the new one. In real time: eight minutes for each.
+Run it after `flights`, in the same folder. A* flies among obstacles behind the model set from there; `certify` makes a
+new model set from that flight's log; A* flies behind the new one. In real time: eight minutes for each condition.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PASSING: dict[str, dict[str, Upset]] = {  # by setup
 
 
 def run(folder: Path) -> Words:
-    """Rows: what was changed, before the model set was made again, how that went, and after it."""
+    """Return rows for each change: the flight before, the new model set, and the flight behind it."""
     rows: Words = {}
     for name, setup in SETUPS.items():
         try:
@@ -60,7 +60,7 @@ def _upsets(flights: Flights, setup: str, lasting: dict[str, Upset], passing: di
 
 
 def _again(flights: Flights, setup: str, what: str, name: str, upset: Upset) -> Words:
-    """The model set of the flight's log, and a flight behind it."""
+    """Certify the flight's log, and fly behind the new model set."""
     renewed = Flights.beside(flights, name)
     shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
     found = flights.certify(name, renewed.data, "--few")

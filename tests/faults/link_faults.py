@@ -1,8 +1,8 @@
-"""Real autopilots whose companion fails in flight: its link is cut, its safety service or its actor killed.
+"""Real autopilots whose companion fails in flight: its link is cut, or its safety service or its actor is killed.
 
-After `flights`, whose model sets it flies behind. A* flies, for it is the fastest; one fault after the other, at
-moments drawn at random, with the timeouts that the autopilots have. A judge of its own hears the simulator's truth on
-another port, also while no actor lives. The next fault comes when it flies again. In real time: half a minute for each.
+Run it after `flights`: it needs their model sets. The policy is A*, the fastest. The faults come one after the other,
+at random times; the next one comes when the vehicle flies again. The autopilots keep their own timeouts. A judge hears
+the simulator's ground truth on another port, also while no actor lives. In real time: half a minute for each fault.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from brakeline.messaging.robot import robot_named
 T = TypeVar("T")
 
 ARENA, POLICY = "default", "astar"
-FAULTS = ("link", "safety-0", "actor-0")  # children of a run, and what is between them and the autopilot
-BETWEEN = (3.0, 12.0)  # s from when it flies again to the next fault
-AGAIN = 15  # steps by which it does
-ROOM = 0.3  # m that it then has around it: whoever was run into something has first to get out
+FAULTS = ("link", "safety-0", "actor-0")  # the link to the autopilot, and children of a run
+BETWEEN = (3.0, 12.0)  # s from when the vehicle flies again to the next fault
+AGAIN = 15  # steps after which it counts as flying again
+ROOM = 0.3  # m of clearance that it needs before the next fault: first it must leave what it ran into
 CUT = (0.3, 5.0)  # s that a link is cut
 PUMP = 0.002  # s
 FLIES_WITHIN = 180.0  # s
 LINE = re.compile(r"steps (\d+) ")
-OFTEN = 0.02  # s between two words of truth
+TRUTH_INTERVAL = 0.02  # s between two messages of ground truth
 
 
 def run(faults: int, seed: int, folder: Path) -> Words:
-    """Rows: what failed; columns: how often, and what was touched from then until the next fault."""
+    """Return rows of faults; columns: how often, and the collisions from then until the next fault."""
     rows: Words = {}
     for name, setup in SETUPS.items():
         try:
@@ -67,22 +67,22 @@ def run(faults: int, seed: int, folder: Path) -> Words:
             with tempfile.TemporaryDirectory() as place:
                 _flight(record, start, Path(place), folder / name, Random(seed + before))
             if record.done == before:
-                raise MavlinkError("it does not come to fly")
+                raise MavlinkError("the vehicle did not fly")
         rows |= record.rows()
     return rows
 
 
 @dataclass
 class Outcomes:
-    """Of one kind of fault."""
+    """The outcomes of one kind of fault."""
 
     count: int = 0
     collisions: int = 0
     nearest: float = float("inf")  # m
-    stuck: int = 0  # times that it did not come out of what it had been run into
-    crashed: int = 0  # times that the autopilot took itself for crashed, on the floor as a rule
+    stuck: int = 0  # times that the vehicle did not leave what it had run into
+    crashed: int = 0  # times that the autopilot disarmed, mostly on the floor
     way: float = 0.0  # m, the longest while a link was cut
-    speed: float = 0.0  # m/s at which that one began
+    speed: float = 0.0  # m/s at the start of that way
 
     def take_way(self, way: float, speed: float) -> None:
         if way > self.way:
@@ -95,7 +95,7 @@ class Outcomes:
 
 
 class Record:
-    """Of an autopilot in one setup: what all its failures led to."""
+    """The outcomes of all faults of an autopilot in one setup."""
 
     def __init__(self, name: str, faults: int) -> None:
         self.name, self.setup, self._faults, self.done = name, SETUPS[name], faults, 0
@@ -107,7 +107,7 @@ class Record:
         return self._faults - self.done
 
     def next(self) -> str:
-        """What is to fail."""
+        """Return the next fault."""
         name = FAULTS[self.done % len(FAULTS)]
         self.done += 1
         self.of[name].count += 1
@@ -119,7 +119,7 @@ class Record:
 
 
 def _flight(record: Record, start: Path, home: Path, folder: Path, random: Random) -> None:
-    """From switching on to the last fault, or to a crash."""
+    """Fly from the start of the autopilot to the last fault, or to a crash."""
     with (
         switched_on(record.setup, start, home) as (url, system),
         relayed(url) as relay,
@@ -139,7 +139,7 @@ def _flight(record: Record, start: Path, home: Path, folder: Path, random: Rando
                 record.of[name].take_way(float(np.linalg.norm(judge.motion()[0] - at)), speed)
             else:
                 _until(partial(child_of, home, name), fly).kill()
-            _until(steps.told_anew(), fly)  # what was said last may be some seconds old
+            _until(steps.next_line(), fly)  # the latest line may be some seconds old
             _until(partial(steps.beyond, steps.taken + AGAIN), fly)
             outcomes = record.of[name]
             outcomes.stuck += not _comes_out(judge, fly)
@@ -169,7 +169,7 @@ def _flown(where: list[str], home: Path, folder: Path) -> Iterator[tuple[subproc
 
 
 class Steps:
-    """How many a flight has taken, by the lines that it prints now and then."""
+    """The number of steps of a flight, by the lines that it prints now and then."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self.taken = self._lines = 0
@@ -178,8 +178,8 @@ class Steps:
     def beyond(self, number: int) -> bool:
         return self.taken > number
 
-    def told_anew(self) -> Callable[[], bool]:
-        """Has another line come since this was called?"""
+    def next_line(self) -> Callable[[], bool]:
+        """Return a condition: another line has come since this call."""
         before = self._lines
         return lambda: self._lines > before
 
@@ -193,17 +193,17 @@ class Steps:
 
 
 def _until(condition: Callable[[], T | None], fly: subprocess.Popen[str]) -> T:
-    """What it gives once that is something. Raises MavlinkError: the flight has ended, or it takes too long."""
+    """Wait for a true result and return it. Raises MavlinkError: the flight has ended, or it takes too long."""
     deadline = time.monotonic() + FLIES_WITHIN
-    while not (found := condition()):
+    while not (result := condition()):
         if fly.poll() is not None or time.monotonic() > deadline:
-            raise MavlinkError(f"it does not fly (any more); status {fly.poll()}")
+            raise MavlinkError(f"the vehicle does not fly; status {fly.poll()}")
         time.sleep(0.2)
-    return found
+    return result
 
 
 def _comes_out(judge: Judge, fly: subprocess.Popen[str]) -> bool:
-    """Of where it was run into. Raises MavlinkError: the flight has ended."""
+    """Return whether the vehicle leaves what it ran into. Raises MavlinkError: the flight has ended."""
     try:
         return _until(lambda: judge.truth.clearance > ROOM or not judge.client.armed, fly)
     except MavlinkError:
@@ -213,7 +213,7 @@ def _comes_out(judge: Judge, fly: subprocess.Popen[str]) -> bool:
 
 
 def child_of(home: Path, name: str) -> psutil.Process | None:
-    """The living process of that name in the run in that folder."""
+    """Return the living process of that name in the run in that folder."""
     for process in psutil.process_iter(["cmdline"]):
         words = process.info["cmdline"] or []
         if words[-2:] == [str(home / "run"), name]:
@@ -222,7 +222,7 @@ def child_of(home: Path, name: str) -> psutil.Process | None:
 
 
 class Relay:
-    """Carries bytes between an autopilot and whoever connects, until it is cut."""
+    """Carries bytes between an autopilot and its client, until it is cut."""
 
     def __init__(self, upstream: Link) -> None:
         self._upstream, self._server = upstream, TcpServer("127.0.0.1", 0)
@@ -230,7 +230,7 @@ class Relay:
         self._dead_until = 0.0
 
     def cut(self, seconds: float) -> None:
-        """What is sent meanwhile is lost."""
+        """Lose everything that is sent in the next seconds."""
         self._dead_until = time.monotonic() + seconds
 
     @property
@@ -261,7 +261,7 @@ def relayed(url: str) -> Iterator[Relay]:
 
 @dataclass
 class Judge:
-    """Hears truth and estimate beside whoever flies, and compares with the map: all since it was last asked."""
+    """Hears ground truth and estimate beside the actor, and counts collisions with the map."""
 
     client: AutopilotClient
     link: Link
@@ -283,17 +283,17 @@ class Judge:
         client.truth = None
         self.airborne |= truth.state is not None and truth.state[2] > 2.0
         if not self.airborne:
-            self._seen = truth.collisions  # it touches what it stands on
+            self._seen = truth.collisions  # it touches the ground that it stands on
         else:
             self._nearest = min(self._nearest, truth.clearance)
 
     def motion(self) -> tuple[Array, float]:
-        """Where it says that it is (3,) [m], and how fast [m/s]."""
+        """Return the estimated position (3,) [m] and speed [m/s]."""
         assert self.client.position is not None
         return self.client.position.copy(), float(np.linalg.norm(self.client.velocity))
 
     def take(self, outcomes: Outcomes) -> None:
-        """What happened since the last time goes there."""
+        """Add what happened since the last call to some outcomes."""
         outcomes.collisions += self.truth.collisions - self._seen
         outcomes.nearest = min(outcomes.nearest, self._nearest)
         self._seen, self._nearest = self.truth.collisions, float("inf")
@@ -320,9 +320,9 @@ def judged(url: str, system: int) -> Iterator[Judge]:
 
     try:
         client.identify(lambda condition, seconds: wait(condition, max(seconds, sitl.STARTS_IN)))
-        wait(lambda: False, 60.0)  # before, its estimator knows nothing
+        wait(lambda: False, 60.0)  # until its estimator is ready
         for what in (MOTION, TRUTH):
-            client.choose(what, OFTEN, wait)
+            client.choose(what, TRUTH_INTERVAL, wait)
         with repeated(judge.listen, 0.01):
             yield judge
     finally:

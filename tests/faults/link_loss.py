@@ -1,7 +1,7 @@
-"""A quadrotor whose link is cut, or whose keeper dies: how far the autopilot's braking leads out of the verified set.
+"""A quadrotor whose link is cut, or whose vehicle server dies: how far the autopilot's braking leaves the verified set.
 
-The last setpoint stays in force until the autopilot's timeout; the worst is when that happens just before the next
-one, having sent the last one again. The plan that it was committed to brakes meanwhile.
+The last setpoint stays in force until the autopilot's timeout. The worst time is just before the next setpoint, after
+the last one was sent again. The backup plan would brake meanwhile.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ AFTER = 4.0  # s that the autopilot is watched for
 
 
 def excess(positions: Array, center: Array, half: Array) -> Array:
-    """How far positions (K, 3) are outside of the boxes (N, 3) and of those between each and the next: (K,) m."""
+    """Return how far positions (K, 3) are outside the boxes (N, 3) and the boxes between them: (K,) m."""
     shares = np.linspace(0.0, 1.0, BETWEEN)[:, None, None]
     centers, halves = ((a[:-1] + shares * (a[1:] - a[:-1])).reshape(-1, 3) for a in (center, half))
     return np.asarray((np.abs(positions[:, None] - centers) - halves).max(axis=2).min(axis=1))
 
 
 class Loss:
-    """Flights that end with the actor's death, with an autopilot of one timeout."""
+    """Flights that end with the actor's death, behind an autopilot with one timeout."""
 
     def __init__(self, question: Ask, timeout: float) -> None:
         self._question, self._timeout = question, timeout
@@ -54,8 +54,7 @@ class Loss:
         self.collisions = 0
 
     def outside(self, policy: str, number: int) -> float:
-        """m: how far the worst position after the actor's death was outside of what the committed plan's tube sweeps,
-        along the worst axis; not above 0: never outside."""
+        """Return how far the worst position after the actor's death is outside the tube of the backup plan [m]."""
         rng = np.random.default_rng(number)
         propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, ActorIdentity("actor", 0, 0))
         driver.begin(number)
@@ -64,13 +63,13 @@ class Loss:
             driver.execute(driver.backup_plan.plan[0], outcome)
             if not driver.running:
                 break
-        assert outcome is not None and outcome.answer is not None, "nobody kills the filter here"
+        assert outcome is not None and outcome.answer is not None
         center, half = outcome.answer.tube_center, outcome.answer.tube_half_width
         positions = self._die(driver.backup_plan.plan[0])
         return float(excess(positions, center, half).max())
 
     def _die(self, input: Array) -> Array:
-        """The last input for a period, again at its end, then silence: true positions (K, 3), one a tick."""
+        """Send the last input for a period, and again at its end; return true positions (K, 3), one a tick."""
         endpoint = self._endpoint
         client = AutopilotClient(endpoint.receive)
         client.setpoint(input)

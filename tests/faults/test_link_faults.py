@@ -1,4 +1,4 @@
-"""What `benchmarks cuts` cuts with, and what `flights` makes of a flight that never was."""
+"""The tools of `benchmarks cuts`, and the rows of `flights` for a flight that failed."""
 
 from __future__ import annotations
 

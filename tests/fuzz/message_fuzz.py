@@ -1,8 +1,8 @@
-"""Messages of all kinds against every process that listens to them, in this process: does anything raise, or grow?
+"""Send messages of all kinds to every process that listens to them, in this process: nothing may raise, or grow.
 
-Of each topic: valid messages with every field drawn (extremes, wrong sizes, names that are none), such messages with
-bits turned, bytes cut off or doubled, and noise. What a process can't handle it must pass over; what it says of itself
-and shows must still come. `python -m benchmarks fuzz` sends a million, the tests some thousands.
+For each topic there are valid messages with every field drawn (extremes, wrong sizes, unknown names), the same with
+bits turned, bytes cut off or doubled, and noise. A process must skip what it can't handle, and still report its figures.
+`python -m benchmarks fuzz` sends a million messages, the tests some thousands.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.fuzz.message_fuzzer import Mill
 
-LOOK = 25_000  # messages between two looks at what the processes say and show
-SETTLED = 0.3  # of the messages: by then tables are as full as they get
-LATER = 0.67  # of the messages: what grows from here on is a leak
+LOOK = 25_000  # messages between two looks at the processes' figures
+SETTLED = 0.3  # share of the messages after which tables are full
+LATER = 0.67  # share of the messages after which growth is a leak
 
 
 class Wire:
-    """A bus that goes nowhere: what is published is dropped, handlers are kept."""
+    """A bus without a network: it drops published messages, and stores handlers."""
 
     run = 1
 
@@ -79,7 +79,7 @@ class Wire:
 
 @dataclass
 class Party:
-    """A process: what it does with a sample, what it says of itself and shows, and what it passed over."""
+    """A process: it takes samples, `look` makes its figures, `rejected` counts the messages that it skipped."""
 
     topics: tuple[Topic, ...]
     take: Callable[[Sample], None]
@@ -112,7 +112,7 @@ def launcher(folder: Path) -> Party:
 
 
 def recorder(folder: Path) -> Party:
-    """Into a file that is begun anew all the time, so that the disk does not fill up."""
+    """Record into a file that begins anew all the time, so that the disk does not fill up."""
     path, rejected, inbox = folder / "fuzz.mcap", RejectedMessages(), Inbox()
 
     def open_one(run: Path, metadata: Metadata) -> Segment:
@@ -140,7 +140,7 @@ def watch() -> Party:
 
 
 def learning(robot: RobotWithTask, folder: Path) -> Party:
-    """The learner's loop; it takes steps in and joins, and makes no updates."""
+    """Run the learner's loop: it receives steps and joins, and makes no updates."""
     wire = Wire()
     config = LearnerConfig(steps=10**9, capacity=1000)
     learner = Learner(robot, config)
@@ -181,7 +181,7 @@ def actor(robot: RobotWithTask) -> Party:
 
 
 def safety() -> Party:
-    """Questions and models; what is refused goes back to who asked."""
+    """Serve requests and install models; a refusal goes back to the client."""
     models, rejected = ModelRegistry(), RejectedMessages()
     answer = batch_handler(models, ServiceCounts())
 
@@ -199,7 +199,7 @@ def safety() -> Party:
 
 
 def asker(robot: RobotWithTask, mill: Mill) -> Party:
-    """Who asked, and gets an answer of whoever answers."""
+    """Read the replies to one request."""
     request = request_message(BackupPlan(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
 
     def take(sample: Sample) -> None:
@@ -228,7 +228,7 @@ def parties(folder: Path, mill: Mill) -> dict[str, Party]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """A line about each message that is passed over would be most of the work."""
+    """Switch off the log: a line about each skipped message would be most of the work."""
     log = logging.getLogger("brakeline")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -239,7 +239,7 @@ def _quiet() -> Iterator[None]:
 
 
 def fuzz(messages: int, seed: int = 0) -> Figures:
-    """Draw so many messages, and hand each to all that listen to its topic; then read a log of the last ones."""
+    """Draw messages, and give each to all listeners of its topic; then read a log of the last ones."""
     mill, begun = Mill(seed), time.monotonic()
     with tempfile.TemporaryDirectory() as name, _quiet():
         folder = Path(name)
@@ -282,7 +282,7 @@ def fuzz(messages: int, seed: int = 0) -> Figures:
 
 
 def reader(folder: Path) -> Party:
-    """What the recorder has left, as a report."""
+    """Make a report of the recorder's log."""
     party = Party(RECORDED, lambda sample: None, lambda: None)
 
     def look() -> None:

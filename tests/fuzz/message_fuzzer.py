@@ -1,4 +1,4 @@
-"""Messages of every topic as nobody would send them: extreme values, wrong sizes, turned bits, noise."""
+"""Draw hostile messages of every topic: extreme values, wrong sizes, turned bits, noise."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import TOPICS, Topic
 
-ACTORS = 60  # so few that what is kept by name is soon as much as it gets; what too many do is tried elsewhere
-CORPUS = 200  # valid messages of each topic, that the mutated ones are made of
+ACTORS = 60  # number of names; so few that tables by name are soon full
+CORPUS = 200  # valid messages of each topic, which the mutated ones come from
 NUMBERS = (0.0, 1.0, -1.0, 0.1, 1e-300, 1e300, -1e300, 1e9, math.inf, -math.inf, math.nan)
 INTEGERS = (0, 1, 2, 3, 7, 1000, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -(2**63))
 TEXTS = ("", "ground", "ground", "quadrotor", "actor-0", "actor-0", "ERROR", "box", "wall", "sphere", "cylinder")
@@ -32,7 +32,7 @@ class Mill:
         self._corpus = {topic.name: [self._message(topic.message()) for _ in range(CORPUS)] for topic in TOPICS}
 
     def sample(self, topic: Topic) -> Sample:
-        """One message of a topic, received now, most of them from an actor that everybody knows."""
+        """Draw a message of a topic, received now, mostly from a known actor."""
         random = self.random
         key = topic.at(robot="ground", source="actor-0")
         if random.random() < 0.3:
@@ -63,7 +63,7 @@ class Mill:
         return bytes(data[:4096])
 
     def _altered(self, topic: Topic, payload: bytes) -> bytes:
-        """A valid message with some fields drawn anew."""
+        """Return a valid message with some fields drawn anew."""
         message = topic.message.FromString(payload)
         if self.random.random() < 0.02:
             return self._message(topic.message())
@@ -79,7 +79,7 @@ class Mill:
         return self._honest(message)
 
     def _honest(self, message: Any) -> bytes:
-        """Mostly one whose sender says who it is, so that more than its beginning is looked at."""
+        """Serialize a message, mostly with a valid sender, so that its receivers read on."""
         names = message.DESCRIPTOR.fields_by_name
         if self.random.random() < 0.8:
             for name, value in (("robot", "ground"), ("actor", "actor-0"), ("process", "actor-0")):

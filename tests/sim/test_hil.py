@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from brakeline.errors import AutopilotGone, Px4Error
-from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_link import HilLink
@@ -22,12 +21,9 @@ from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_controller import GRAVITY
 from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
+from tests.sim.station import field
 
 HOVER = 1.2 * 9.81 / 4.0 / 8.8  # of a rotor's full thrust
-
-
-def field() -> Arena:
-    return staged_arena(start=(0.0, 0.0, 10.0), goal=(9.0, 9.0, 9.0), half_width=500.0, height=500.0)
 
 
 def sensor_messages(truth: Estimate, scale: float = 0.0, readings: int = 1) -> list[Any]:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from brakeline.messaging.obstacle import SPHERE, Obstacle
+from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles
@@ -31,23 +32,17 @@ def distances(arena: Arena, points: np.ndarray) -> np.ndarray:
     return measured
 
 
-@pytest.mark.parametrize("name", ["default", "dense", "tall"])
-def test_geoms_in_space_have_the_distances_of_their_shapes(name: str) -> None:
-    arena = draw_arena(name, np.random.default_rng(4), QUADROTOR)
-    low, high = np.array(arena.bounds).T
-    points = np.random.default_rng(0).uniform(low, high, (60, 3))
+@pytest.mark.parametrize(
+    ("robot", "name", "heights"),
+    [(QUADROTOR, name, ()) for name in ("default", "dense", "tall")] + [(GROUND, "dense", (0.01, HEIGHT - 0.01))],
+)
+def test_geoms_have_the_distances_of_their_shapes(robot: Robot, name: str, heights: tuple[float, ...]) -> None:
+    """In the plane, geoms stand on the floor: the distance is the same at every height."""
+    arena = draw_arena(name, np.random.default_rng(4), robot)
+    points = np.random.default_rng(0).uniform(*np.array(arena.bounds).T, (60, arena.dim))
     exact = arena.shapes.distance(points)
     points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
-    assert distances(arena, points) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
-
-
-def test_geoms_in_the_plane_stand_on_the_floor() -> None:
-    arena = draw_arena("dense", np.random.default_rng(4), GROUND)
-    points = np.random.default_rng(0).uniform(-2.5, 2.5, (60, 2))
-    exact = arena.shapes.distance(points)
-    points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
-    for height in (0.01, HEIGHT - 0.01):
-        at = np.column_stack((points, np.full(len(points), height)))
+    for at in [np.column_stack((points, np.full(len(points), height))) for height in heights] or [points]:
         assert distances(arena, at) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
 
 

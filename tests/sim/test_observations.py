@@ -70,10 +70,8 @@ def test_tracks_have_position_velocity_and_time_to_encounter() -> None:
     model = TrackingObservation(GROUND, staged_arena(), RNG, 0.0)
     facing_up = np.array([1.0, 1.0, 0.5 * np.pi, 0.0, 0.0])
     # 2 m ahead and 0.3 m to the left, coming straight back at 1 m/s; one that stands 1 m to the right; one too far off
-    positions, velocities = (
-        np.array([[0.7, 3.0], [2.0, 1.0], [1.0, -4.0]]),
-        np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]]),
-    )
+    positions = np.array([[0.7, 3.0], [2.0, 1.0], [1.0, -4.0]])
+    velocities = np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])
     tracks = model.tracks(facing_up, positions, velocities)
     names = TRACKS.observation[-len(tracks) :]
     named = dict(zip(names, tracks.tolist(), strict=True))
