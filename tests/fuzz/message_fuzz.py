@@ -1,7 +1,7 @@
 """Send messages of all kinds to every process that listens to them, in this process: nothing may raise, or grow.
 
 For each topic there are valid messages with every field drawn (extremes, wrong sizes, unknown names), the same with
-bits turned, bytes cut off or doubled, and noise. A process must skip what it can't handle, and still report its figures.
+bits turned, bytes cut off or doubled, and noise. A process must skip what it can't handle, and still report figures.
 `python -m benchmarks fuzz` sends a million messages, the tests some thousands.
 """
 
