@@ -17,7 +17,7 @@ from brakeline.sim.arena_generator import arena_kind
 from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.vehicle import MakeVehicle, Vehicle
+from brakeline.sim.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import FrameTap
@@ -25,18 +25,6 @@ if TYPE_CHECKING:
 
 # m, distance of the walls of an empty arena in the plane and in space: no recorded trajectory gets that far
 EMPTY_ARENA_SIZE = {2: 50.0, 3: 500.0}
-
-
-def factory(robot: RobotWithTask, conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
-    """Return the function that makes vehicles of this robot under these conditions.
-
-    Args:
-        tap: is called with each MAVLink frame of a robot that has any.
-
-    Raises:
-        UnknownTask: the robot has no simulator.
-    """
-    return simulated_vehicle(robot, conditions, tap)
 
 
 def environment(
@@ -54,7 +42,7 @@ def environment(
         UnknownArena: the robot has no such arena.
     """
     conditions = conditions or Conditions()
-    make = factory(robot, conditions, tap)
+    make = simulated_vehicle(robot, conditions, tap)
     arena_kind(robot, arena)
     return NavigationEnv(robot, arena, make, conditions=conditions, seed_key=seed)
 
@@ -88,7 +76,4 @@ def vehicle_in_empty_arena(robot: RobotWithTask, rng: np.random.Generator, condi
     return _maker(robot, conditions)(empty_arena(robot, heading=heading), rng)
 
 
-@lru_cache(maxsize=1)
-def _maker(robot: RobotWithTask, conditions: Conditions) -> MakeVehicle:
-    """Return the same maker for each trajectory of a recording: a real autopilot then starts only once."""
-    return factory(robot, conditions)
+_maker = lru_cache(maxsize=1)(simulated_vehicle)  # the same one for all trajectories: a real autopilot starts once

@@ -12,9 +12,17 @@ from rich.markdown import Markdown
 
 from brakeline.deploy.commands.common_options import Json, console, errors, print_json
 from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.experiments import compare, conservatism
-from brakeline.deploy.experiments.compare import RESULTS, RUNS, SEEDS, ComparisonJob
-from brakeline.deploy.experiments.comparison_cells import METHODS, NONE, CellConfig, quick
+from brakeline.deploy.experiments import conservatism
+from brakeline.deploy.experiments.comparison_cells import (
+    METHODS,
+    NONE,
+    RESULTS,
+    RUNS,
+    SEEDS,
+    CellConfig,
+    cell_configs,
+    quick,
+)
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, table
 from brakeline.deploy.experiments.experiment_jobs import Job, complete
@@ -74,8 +82,8 @@ class CompareCommand:
                     method_for(robot_with_task(robot), method, ModelConfig())
             jobs = self._jobs(robot)
             finished = complete(jobs, results, runs, self.workers, self.again or self.quick, self._print_progress)
-            cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, ComparisonJob)]
-            others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, ComparisonJob)]
+            cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
+            others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
             tables[robot] = self._write(cells, others, results / robot)
         if self.json:
             print_json(tables)
@@ -83,14 +91,12 @@ class CompareCommand:
 
     def _jobs(self, robot: str) -> list[Job]:
         seeds = self.seeds[:1] if self.quick else self.seeds
-        cell_configs = [study for study in compare.cell_configs(robot, seeds) if study.method in self.methods]
         changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
-        cell_configs = [
-            replace(study, penalty=self.penalty, td3=self.td3, arenas=self.arenas) for study in cell_configs
-        ]
-        jobs: list[Job] = [
-            ComparisonJob(replace(quick(study) if self.quick else study, **changed)) for study in cell_configs
-        ]
+        jobs: list[Job] = []
+        for cell in cell_configs(robot, seeds):
+            if cell.method in self.methods:
+                own = replace(cell, penalty=self.penalty, td3=self.td3, arenas=self.arenas)
+                jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(conservatism.Conservatism(robot))
         return jobs

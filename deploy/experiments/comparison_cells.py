@@ -1,14 +1,19 @@
-"""One cell of the comparison: train a method from one seed, then evaluate its policy on the shared fresh episodes.
+"""Compare all methods from the same seeds: train a method from a seed, then evaluate it on the shared fresh episodes.
 
-The results go to one small JSON file, from which tables and plots are made.
+One cell of the comparison is one method with one seed. `brakeline compare` makes the tables from these files alone:
+
+results/<robot>/<method>-s<seed>.json      one cell: configuration, figures, and one row per episode
+results/<robot>/conservatism.json          every error bound and mode, with the stored policy and A*
+results/<robot>/table.md table.json curves.png seeds.png
+runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git)
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,7 +23,8 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, evaluate
+from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, run_trial
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import FigureMismatch
@@ -32,9 +38,18 @@ from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import SAILR
 from brakeline.safety.rivals.secas import SECAS
 
+RESULTS, RUNS = Path("results"), Path("runs/compare")
 NONE, LEARNING = "none", "learning"
 METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
+SEEDS = (0, 1, 2)
+EPISODES = 500  # of each evaluation
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
+POLICY = "policy.safetensors"
+COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_moving"}
+COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
+LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
+
+Report = Callable[[str], object]
 
 
 @dataclass(frozen=True)
@@ -81,37 +96,96 @@ class CellConfig:
             table.append(TrialConfig(TRAINED, DDPC, first, self.episodes))
         return table
 
-    def config(self) -> dict[str, Any]:
-        """Return the configuration as JSON values."""
-        config: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return config
+    def run(self, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
+        """Train, evaluate, and check the figures against the logs. Logs and policy stay in `folder`.
+
+        Raises:
+            FigureMismatch: a log does not agree with the figures.
+        """
+        return _CellRun(self, folder, say).result()
 
 
-Report = Callable[[str], object]
+def quick(cell: CellConfig) -> CellConfig:
+    """Return a cell that runs in a minute: enough to test the code, too short to learn."""
+    td3 = replace(cell.td3, hidden=(64, 64), batch=64, warmup=500)
+    return replace(cell, steps=2_000, episodes=10, untrained=5, td3=td3)
 
 
-def run(study: CellConfig, folder: Path, say: Report = lambda text: None) -> dict[str, Any]:
-    """Train, evaluate, and check the figures against the logs. Logs and policy stay in `folder`.
+def cell_configs(robot: str, seeds: Iterable[int] = SEEDS) -> list[CellConfig]:
+    """Return all cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
+    steps = robot_with_task(robot).task.steps
+    return [CellConfig(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
 
-    Raises:
-        FigureMismatch: a log does not agree with the figures.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    robot = robot_with_task(study.robot)
-    models: dict[str, Model] = {}
-    for method in {study.method, *(trial.method for trial in study.trials())} - {NONE}:
-        models[method] = method_for(robot, method, study.model_config)
-    training = _train(study, robot, models, folder, say)
-    evaluations = {trial.name: _evaluate(study, trial, robot, models, folder, say) for trial in study.trials()}
-    model = models.get(study.method)
-    return {
-        "study": study.config(),
-        "model": None if model is None else {"version": model.version, **_cost(model, robot)},
-        "policy": hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()[:16],
-        "versions": {name: version(name) for name in PACKAGES},
-        "training": training,
-        "evaluations": evaluations,
-    }
+
+class _CellRun:
+    """The run of one cell in a folder."""
+
+    def __init__(self, cell: CellConfig, folder: Path, say: Report) -> None:
+        self.cell, self.folder, self.say = cell, folder, say
+        self.robot = robot_with_task(cell.robot)
+        methods = {cell.method, *(trial.method for trial in cell.trials())} - {NONE}
+        self.models = {method: method_for(self.robot, method, cell.model_config) for method in methods}
+
+    def result(self) -> dict[str, Any]:
+        """Train and evaluate, and return the content of the cell's file."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        training = self._train()
+        evaluations = {trial.name: self._evaluate(trial) for trial in self.cell.trials()}
+        model = self.models.get(self.cell.method)
+        return {
+            "study": configuration(self.cell),
+            "model": None if model is None else {"version": model.version, **_cost(model, self.robot)},
+            "policy": hashlib.sha256((self.folder / POLICY).read_bytes()).hexdigest()[:16],
+            "versions": {name: version(name) for name in PACKAGES},
+            "training": training,
+            "evaluations": evaluations,
+        }
+
+    def _train(self) -> dict[str, Any]:
+        cell = self.cell
+        trial = TrialConfig(LEARNING, cell.method, cell.arenas[0], 0)
+        config = LearnerConfig(td3=cell.td3, seed=cell.seed, steps=cell.steps)
+        driver, ask = self._driver(trial, cell.seed, cell.name)
+        trainer, table = Trainer(driver, ask, Learner(self.robot, config)), EpisodeTable()
+        with self._log("training", trial) as log:
+            for count, step in enumerate(trainer.run(log), 1):
+                table.step(step)
+                if count % 1000 == 0:
+                    last = table.rows[-50:]
+                    self.say(f"step {count}, goals {sum(row['goal'] for row in last) / max(len(last), 1):.0%}")
+        trainer.policy.save(self.folder / POLICY)
+        return _checked(table, log.path) | {"steps": cell.steps, "updates": trainer.learner.updates}
+
+    def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
+        self.say(trial.name)
+        name = str(self.folder / POLICY) if trial.policy == TRAINED else UNTRAINED
+        driver, ask = self._driver(trial, FRESH, trial.name)
+        with self._log(trial.name, trial) as log:
+            policy = policy_named(name, self.robot, self.cell.seed)
+            table = run_trial(driver, policy, ask, trial.episodes, log)
+        return _checked(table, log.path)
+
+    def _driver(self, trial: TrialConfig, seed: int, actor: str) -> tuple[EpisodeRunner, Ask | None]:
+        """Return the episode runner of a trial, and the function that asks its filter."""
+        ask = None if trial.method == NONE else in_process(self.models[trial.method])
+        # SAILR's training ends an episode at an intervention. An evaluation continues, else goals could not compare.
+        cuts = trial.method == SAILR and trial.policy == LEARNING
+        driver = EpisodeRunner(
+            self.robot,
+            environment(self.robot, trial.arena, seed),
+            ActorIdentity(actor, 0, self.cell.seed),
+            penalty=self.cell.penalty,
+            filtered=ask is not None,
+            ends_on_intervention=cuts,
+        )
+        return driver, ask
+
+    def _log(self, name: str, trial: TrialConfig) -> TrialLog:
+        about = {"method": trial.method, "policy": trial.policy, "arena": trial.arena, "seed": str(self.cell.seed)}
+        if trial.method == DDPC:
+            about["certificate"] = self.cell.model_config.certificate
+        metadata = {"run": about, "configuration": {"json": json.dumps(configuration(self.cell))}}
+        return TrialLog(self.folder / f"{name}.mcap", metadata)
 
 
 def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
@@ -121,81 +195,18 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
     return {"samples": str(load_or_record(robot).periods), "collisions": "0"}
 
 
-def _episode_runner(
-    study: CellConfig, trial: TrialConfig, robot: RobotWithTask, seed: int, actor: str
-) -> EpisodeRunner:
-    env = environment(robot, trial.arena, seed)
-    identity, filtered = ActorIdentity(actor, 0, study.seed), trial.method != NONE
-    # SAILR's training ends an episode at an intervention. An evaluation continues, else goal rates could not compare.
-    cuts = trial.method == SAILR and trial.policy == LEARNING
-    return EpisodeRunner(robot, env, identity, penalty=study.penalty, filtered=filtered, ends_on_intervention=cuts)
-
-
-def _decision_service(models: dict[str, Model], method: str) -> Ask | None:
-    return None if method == NONE else in_process(models[method])
-
-
-def _train(
-    study: CellConfig, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
-) -> dict[str, Any]:
-    trial = TrialConfig(LEARNING, study.method, study.arenas[0], 0)
-    config = LearnerConfig(td3=study.td3, seed=study.seed, steps=study.steps)
-    driver = _episode_runner(study, trial, robot, study.seed, study.name)
-    trainer = Trainer(driver, _decision_service(models, study.method), Learner(robot, config))
-    table, log_file = EpisodeTable(), folder / "training.mcap"
-    with TrialLog(log_file, _metadata(study, trial)) as log:
-        for count, step in enumerate(trainer.run(log), 1):
-            table.step(step)
-            if count % 1000 == 0:
-                goals = sum(row[1] for row in table.rows[-50:]) / max(len(table.rows[-50:]), 1)
-                say(f"step {count}, goals {goals:.0%}")
-    trainer.policy.save(folder / "policy.safetensors")
-    return _check_against_log(table, log_file) | {"steps": study.steps, "updates": trainer.learner.updates}
-
-
-def _evaluate(
-    study: CellConfig, trial: TrialConfig, robot: RobotWithTask, models: dict[str, Model], folder: Path, say: Report
-) -> dict[str, Any]:
-    say(trial.name)
-    name = str(folder / "policy.safetensors") if trial.policy == TRAINED else UNTRAINED
-    driver = _episode_runner(study, trial, robot, FRESH, trial.name)
-    log_file = folder / f"{trial.name}.mcap"
-    with TrialLog(log_file, _metadata(study, trial)) as log:
-        policy = policy_named(name, robot, study.seed)
-        table = evaluate(driver, policy, _decision_service(models, trial.method), trial.episodes, log)
-    return _check_against_log(table, log_file)
-
-
-def _metadata(study: CellConfig, trial: TrialConfig) -> dict[str, dict[str, str]]:
-    certificate = {"certificate": study.model_config.certificate} if trial.method == DDPC else {}
-    about = {"method": trial.method, "policy": trial.policy, "arena": trial.arena, "seed": str(study.seed)}
-    return {"run": about | certificate, "configuration": {"json": json.dumps(study.config())}}
-
-
-def _check_against_log(table: EpisodeTable, log_file: Path) -> dict[str, Any]:
+def _checked(table: EpisodeTable, log_file: Path) -> dict[str, Any]:
     """Return the counted figures and those of the log. Raises FigureMismatch if they disagree."""
     columns, logged = table.columns(), analyse(log_file)
-    for name, counted in (
-        ("steps", table.decisions),
-        ("episodes", len(table.rows)),
-        ("goals", sum(columns["goal"])),
-        ("timeouts", sum(columns["timeout"])),
-        ("contacts_moving", sum(columns["contact_moving"])),
-        ("contacts_standing", sum(columns["contact_standing"])),
-    ):
-        if logged[name] != counted:
-            raise FigureMismatch(f"{log_file} has {logged[name]} {name}, but the run counted {counted}")
+    counted = {"steps": table.decisions, "episodes": len(table.rows)}
+    counted |= {name: int(sum(columns[column])) for name, column in COUNTED.items()}
+    for name, count in counted.items():
+        if logged[name] != count:
+            raise FigureMismatch(f"{log_file} has {logged[name]} {name}, but the run counted {count}")
     if logged["collisions"] < sum(columns["collision"]):
         raise FigureMismatch(f"{log_file} has {logged['collisions']} collisions, but the run counted more")
-    logged_names = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
     return {
         "episodes": columns,
         "decision_ms": table.decision_ms(),
-        "logged": {name: logged[name] for name in logged_names},
+        "logged": {name: logged[name] for name in LOGGED},
     }
-
-
-def quick(study: CellConfig) -> CellConfig:
-    """Return a cell that runs in a minute: enough to test the code, too short to learn."""
-    td3 = replace(study.td3, hidden=(64, 64), batch=64, warmup=500)
-    return replace(study, steps=2_000, episodes=10, untrained=5, td3=td3)

@@ -39,50 +39,44 @@ def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
     return float(taken[WINDOW - 1 + reached[0]]) if len(reached) else float(steps)
 
 
-def _episodes(results: Sequence[Result], trial: str, name: str) -> list[list[float]]:
-    return [result["evaluations"][trial]["episodes"][name] for result in results]
-
-
-def _training(results: Sequence[Result], name: str) -> list[list[float]]:
-    return [result["training"]["episodes"][name] for result in results]
-
-
 def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
     """Return the figures of one evaluation over the seeds: estimates, or numbers where an interval has no meaning."""
-    steps = _episodes(results, trial, "steps")
-    times = [result["evaluations"][trial]["decision_ms"] for result in results]
+    evaluations = [result["evaluations"][trial] for result in results]
+    values, times = _by_column(evaluations), [evaluation["decision_ms"] for evaluation in evaluations]
+    contacts = zip(TOUCHED, CONTACTS, strict=True) if values.keys() >= set(CONTACTS) else ()  # old results lack them
     return {
-        "goal rate": mean(_episodes(results, trial, "goal")),
-        "collision rate": mean(_episodes(results, trial, "collision")),
-        **_contacts(results, trial),
-        "mean speed [m/s]": ratio(_episodes(results, trial, "speed"), steps),
-        "max speed [m/s]": max(max(values) for values in _episodes(results, trial, "fastest")),
-        "mean reward": mean(_episodes(results, trial, "reward")),
-        "interventions": ratio(_episodes(results, trial, "interventions"), steps),
+        "goal rate": mean(values["goal"]),
+        "collision rate": mean(values["collision"]),
+        **{row: mean(values[name]) for row, name in contacts},
+        "mean speed [m/s]": ratio(values["speed"], values["steps"]),
+        "max speed [m/s]": max(map(max, values["fastest"])),
+        "mean reward": mean(values["reward"]),
+        "interventions": ratio(values["interventions"], values["steps"]),
         "decision [ms]": float(np.mean([t["mean"] for t in times])),
         "its std [ms]": float(np.mean([t["std"] for t in times])),
     }
 
 
-def _contacts(results: Sequence[Result], trial: str) -> Row:
-    """Return contacts with moving obstacles; old results do not contain them."""
-    if any(name not in result["evaluations"][trial]["episodes"] for result in results for name in CONTACTS):
-        return {}
-    return dict(zip(TOUCHED, (mean(_episodes(results, trial, name)) for name in CONTACTS), strict=True))
-
-
 def training_rows(results: Sequence[Result]) -> Row:
     """Return the figures of training over the seeds."""
-    learned = [steps_to_learn(r["training"]["episodes"], r["training"]["steps"]) for r in results]
+    trainings, model = [result["training"] for result in results], results[0]["model"]
+    values, steps = _by_column(trainings), [training["steps"] for training in trainings]
+    learned = [steps_to_learn(training["episodes"], training["steps"]) for training in trainings]
     return {
-        "collision rate": mean(_training(results, "collision")),
-        "collisions": float(np.mean([sum(values) for values in _training(results, "collision")])),
+        "collision rate": mean(values["collision"]),
+        "collisions": float(np.mean([sum(counts) for counts in values["collision"]])),
         "steps to 90 % goals": mean([[value] for value in learned]),
-        "seeds that got there": sum(value < r["training"]["steps"] for value, r in zip(learned, results, strict=True)),
-        "interventions": ratio(_training(results, "interventions"), _training(results, "steps")),
-        "pre-training samples": 0 if results[0]["model"] is None else int(results[0]["model"]["samples"]),
-        "pre-training collisions": 0 if results[0]["model"] is None else int(results[0]["model"]["collisions"]),
+        "seeds that got there": sum(value < limit for value, limit in zip(learned, steps, strict=True)),
+        "interventions": ratio(values["interventions"], values["steps"]),
+        "pre-training samples": 0 if model is None else int(model["samples"]),
+        "pre-training collisions": 0 if model is None else int(model["collisions"]),
     }
+
+
+def _by_column(trials: Sequence[Result]) -> dict[str, list[list[float]]]:
+    """Return the values of each column that all trials have: one list of episodes for each trial."""
+    names = set.intersection(*(set(trial["episodes"]) for trial in trials))
+    return {name: [trial["episodes"][name] for trial in trials] for name in names}
 
 
 def table(results: Iterable[Result]) -> dict[str, Any]:
@@ -91,38 +85,35 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
     Raises:
         ValueError: the results belong to several robots, or the methods have different seeds.
     """
-    cells = list(results)
-    by_method = {m: [c for c in cells if c["study"]["method"] == m] for m in METHODS}
-    seeds = {m: sorted(c["study"]["seed"] for c in group) for m, group in by_method.items() if group}
+    cells = sorted(results, key=lambda cell: int(cell["study"]["seed"]))
+    groups = {m: group for m in METHODS if (group := [c for c in cells if c["study"]["method"] == m])}
+    seeds = {m: [c["study"]["seed"] for c in group] for m, group in groups.items()}
     robots = {c["study"]["robot"] for c in cells}
     if len(robots) != 1 or len({tuple(s) for s in seeds.values()}) != 1:
         raise ValueError(f"not the same seeds of one robot: {robots}, {seeds}")
-    groups = {m: sorted(g, key=lambda c: int(c["study"]["seed"])) for m, g in by_method.items() if g}
-    parts: dict[str, dict[str, Row]] = {"training": {m: training_rows(group) for m, group in groups.items()}}
-    for arena in cells[0]["study"]["arenas"]:
-        parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{m}-{arena}") for m, g in groups.items()}
-    parts["deployment"] = _deployment(groups, cells[0]["study"]["arenas"][0])
     study = cells[0]["study"]
-    return {
-        "robot": robots.pop(),
-        "seeds": next(iter(seeds.values())),
-        "steps": study["steps"],
-        "episodes": study["episodes"],
-        "parts": parts,
-    }
+    parts: dict[str, dict[str, Row]] = {"training": {m: training_rows(group) for m, group in groups.items()}}
+    for arena in study["arenas"]:
+        parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{m}-{arena}") for m, g in groups.items()}
+    parts["deployment"] = _deployment(groups, study["arenas"][0])
+    about = {"robot": study["robot"], "seeds": next(iter(seeds.values()))}
+    return about | {"steps": study["steps"], "episodes": study["episodes"], "parts": parts}
+
+
+DEPLOYMENT = (  # name, method of the training, policy and filter of the evaluation
+    ("trained without, run with the filter", NONE, f"{TRAINED}-{DDPC}"),
+    ("trained with, run without the filter", DDPC, f"{TRAINED}-{NONE}"),
+    ("untrained, run with the filter", DDPC, f"{UNTRAINED}-{DDPC}"),
+)
 
 
 def _deployment(groups: dict[str, list[Result]], arena: str) -> dict[str, Row]:
     """Return the rows for a filter that is added or removed after training, and for an untrained policy."""
-    rows = {}
-    for name, method, trial in (
-        ("trained without, run with the filter", NONE, f"{TRAINED}-{DDPC}-{arena}"),
-        ("trained with, run without the filter", DDPC, f"{TRAINED}-{NONE}-{arena}"),
-        ("untrained, run with the filter", DDPC, f"{UNTRAINED}-{DDPC}-{arena}"),
-    ):
-        if method in groups:
-            rows[name] = evaluation_rows(groups[method], trial)
-    return rows
+    return {
+        name: evaluation_rows(groups[method], f"{trial}-{arena}")
+        for name, method, trial in DEPLOYMENT
+        if method in groups
+    }
 
 
 def plain(value: Any) -> Any:
@@ -142,54 +133,46 @@ def without_times(value: Any) -> Any:
 
 
 PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED)
+DIGITS = {"mean speed [m/s]": ".3g", "max speed [m/s]": ".3g", "decision [ms]": ".2f", "its std [ms]": ".2f"}
 
 
 def written(name: str, value: Any) -> str:
     """Format a figure for the table, with its interval in brackets."""
-    form: Callable[[float], str]
-    if name in PERCENT:
-        form = lambda v: f"{100.0 * v:.1f}"  # noqa: E731
-    elif "speed" in name:
-        form = lambda v: f"{v:.3g}"  # noqa: E731
-    elif "[ms]" in name:
-        form = lambda v: f"{v:.2f}"  # noqa: E731
-    else:
-        form = lambda v: f"{v:.0f}"  # noqa: E731
-    unit = " %" if name in PERCENT else ""
+    percent = name in PERCENT
+    digits, factor, unit = (".1f", 100.0, " %") if percent else (DIGITS.get(name, ".0f"), 1.0, "")
     if isinstance(value, MeanEstimate):
-        return f"{form(value.value)}{unit} [{form(value.low)}, {form(value.high)}]"
-    return form(float(value)) + unit
+        middle, low, high = (f"{factor * v:{digits}}" for v in (value.value, value.low, value.high))
+        return f"{middle}{unit} [{low}, {high}]"
+    return f"{factor * float(value):{digits}}{unit}"
 
 
-PAPER_ROWS = {
-    "goal rate": ("goal", 0.01),
-    "collision rate": ("collision", 0.01),
-    "mean speed [m/s]": ("mean_speed", 1.0),
-    "max speed [m/s]": ("max_speed", 1.0),
-    "mean reward": ("reward", 1.0),
+PAPER_ROWS: dict[str, Callable[[dict[str, Any], str], str]] = {
+    "goal rate": lambda paper, row: written(row, paper["goal"] * 0.01),
+    "collision rate": lambda paper, row: written(row, paper["collision"] * 0.01),
+    "mean speed [m/s]": lambda paper, row: written(row, paper["mean_speed"]),
+    "max speed [m/s]": lambda paper, row: written(row, paper["max_speed"]),
+    "mean reward": lambda paper, row: written(row, paper["reward"]),
+    "decision [ms]": lambda paper, row: f"{paper['decision_ms'][0]:.1f}",
+    "its std [ms]": lambda paper, row: f"{paper['decision_ms'][1]:.1f}",
 }
 
 
 def _paper(robot: str, row: str, method: str) -> str:
     """Return the paper's figure for a row, or an empty string."""
     published = json.loads(PAPER.read_text()).get(robot, {}).get(method)
-    if published is None:
-        return ""
-    if row == "decision [ms]":
-        return f"{published['decision_ms'][0]:.1f}"
-    if row == "its std [ms]":
-        return f"{published['decision_ms'][1]:.1f}"
-    if row not in PAPER_ROWS:
-        return ""
-    name, factor = PAPER_ROWS[row]
-    return written(row, published[name] * factor)
+    return "" if published is None or row not in PAPER_ROWS else PAPER_ROWS[row](published, row)
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
+    lines = ["|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|" for cells in (heads, *rows)]
+    return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
 def markdown(figures: dict[str, Any]) -> str:
     """Return the tables of one robot as Markdown, with the paper's figures in italics."""
-    robot, lines = figures["robot"], []
-    seeds = ", ".join(map(str, figures["seeds"]))
-    lines += [
+    robot, seeds = figures["robot"], ", ".join(map(str, figures["seeds"]))
+    lines = [
         f"# {robot}",
         "",
         f"{figures['steps']} training steps, seeds {seeds}; {figures['episodes']} episodes a seed, the same for all "
@@ -198,14 +181,11 @@ def markdown(figures: dict[str, Any]) -> str:
         "",
     ]
     for part, methods in figures["parts"].items():
-        columns = list(methods)
-        heads = [NAMES.get(column, column) for column in columns]
-        lines += [f"## {part}", "", "| | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+        rows = []
         for row in next(iter(methods.values()), {}):
-            shown = [written(row, methods[column][row]) for column in columns]
-            lines.append(f"| {row} | " + " | ".join(shown) + " |")
-            beside = [_paper(robot, row, column) for column in columns]
+            rows.append([row, *(written(row, values[row]) for values in methods.values())])
+            beside = [_paper(robot, row, method) for method in methods]
             if part not in ("training", "deployment") and any(beside):
-                lines.append("| *paper* | " + " | ".join(f"*{text}*" for text in beside) + " |")
-        lines.append("")
+                rows.append(["*paper*", *(f"*{text}*" for text in beside)])
+        lines += [f"## {part}", "", *markdown_table(["", *(NAMES.get(m, m) for m in methods)], rows), ""]
     return "\n".join(lines)

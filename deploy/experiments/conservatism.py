@@ -7,7 +7,6 @@ the filter cannot verify any motion, and the closed loop is skipped.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,8 +15,10 @@ from typing import Any
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import load_or_record
+from brakeline.deploy.experiments.comparison_table import markdown_table
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import EpisodeTable, evaluate
+from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.trials import run_trial
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadData, ErrorBoundError
@@ -43,10 +44,6 @@ class Conservatism:
     def name(self) -> str:
         return "conservatism"
 
-    def config(self) -> dict[str, Any]:
-        config: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return config
-
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """Return one row per error bound and mode; a row without a model set gives the reason."""
         robot = robot_with_task(self.robot)
@@ -68,12 +65,12 @@ class Conservatism:
                     ask = in_process(model, ANY_BOUND)
                     driving = {policy: self._drive(robot, policy, ask) for policy in self.policies}
                 rows.append(row | {"driving": driving})
-        return {"study": self.config(), "data": data.digest(), "rows": rows}
+        return {"study": configuration(self), "data": data.digest(), "rows": rows}
 
     def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
         """Evaluate the closed loop on the first fresh episodes."""
         driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), ActorIdentity("conservatism", 0, 0))
-        table: EpisodeTable = evaluate(driver, policy_named(policy, robot, 0), question, self.episodes)
+        table = run_trial(driver, policy_named(policy, robot, 0), question, self.episodes)
         columns, steps = table.columns(), table.decisions
         return {
             "goals": sum(columns["goal"]),
@@ -89,20 +86,16 @@ def markdown(result: dict[str, Any]) -> str:
     policies, episodes = result["study"]["policies"], result["study"]["episodes"]
     heads = ["certificate", "mode", "stop from rest", "from full speed", "plans outside", "at most"]
     heads += [f"{policy}: goals of {episodes}, interventions" for policy in policies]
-    lines = [f"# Conservatism: {result['study']['robot']}", "", "| " + " | ".join(heads) + " |"]
-    lines.append("|---" * len(heads) + "|")
+    rows = []
     for row in result["rows"]:
-        if "refused" in row:
-            figures = [f"refused: {row['refused']}"] + [""] * (len(heads) - 3)
-        else:
-            figures = _figures(row, policies)
-        lines.append("| " + " | ".join([row["certificate"], row["mode"], *figures]) + " |")
-    lines += [
-        "",
+        figures = [f"refused: {row['refused']}"] if "refused" in row else _figures(row, policies)
+        cells = [row["certificate"], row["mode"], *figures]
+        rows.append(cells + [""] * (len(heads) - len(cells)))
+    note = (
         "Half-widths of a full stop's set on its widest axis; held-out plans outside their tubes, and the bound on "
-        "that at 99 % confidence.",
-    ]
-    return "\n".join(lines)
+        "that at 99 % confidence."
+    )
+    return "\n".join([f"# Conservatism: {result['study']['robot']}", "", *markdown_table(heads, rows), "", note])
 
 
 def _length(metres: float) -> str:
@@ -114,5 +107,5 @@ def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
     figures = [_length(validation[name]) for name in ("half_width_rest", "half_width_full")]
     figures += [f"{validation['violations']} of {validation['windows']}", f"{validation['bound_plan']:.2%}"]
     if driving is None:
-        return figures + ["not driven: wider than the arena"] + [""] * (len(policies) - 1)
+        return [*figures, "not driven: wider than the arena"]
     return figures + [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]

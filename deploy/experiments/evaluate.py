@@ -10,7 +10,7 @@ from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.vehicle_factory import environment, fleet_world
+from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.log_analysis import perception_in
 from brakeline.logs.metrics import EpisodeStats, closed_loop
 from brakeline.messaging import brakeline_pb2 as pb
@@ -51,6 +51,11 @@ def in_process(model: Model, accept_bound: float | None = None) -> Ask:
     """
     models = ModelRegistry(accept_bound=accept_bound)
     models.install(model)
+    return asking(models)
+
+
+def asking(models: ModelRegistry) -> Ask:
+    """Return a function that asks the core of the safety service with these models, in the bytes of the bus."""
     answer = batch_handler(models, ServiceCounts())
 
     def ask(requests: Sequence[pb.Request]) -> list[pb.Reply]:
@@ -75,13 +80,6 @@ def prepare_evaluation(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeR
     return driver, policy, question
 
 
-def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
-    """Return the function that asks the filter, or None for the method `none`."""
-    if what.method == "none":
-        return None
-    return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
-
-
 def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """Create the group, the world, the policies and the filter's function for several robots in one world.
 
@@ -90,7 +88,7 @@ def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, F
         ValueError: this method supports no reservations.
     """
     check_reservations(what.method)
-    world = fleet_world(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
+    world = FleetEnv(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
     policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
     question = _question(robot, what)
     drivers = [
@@ -100,56 +98,54 @@ def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, F
     return RobotGroup(drivers, world, question is not None), world, policies, question
 
 
+def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
+    """Return the function that asks the filter, or None for the method `none`."""
+    if what.method == "none":
+        return None
+    return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
+
+
 def evaluate(
-    robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda tally: None
+    robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda stats: None
 ) -> dict[str, Any]:
     """Run `what.episodes` episodes and return their closed-loop metrics.
 
-    A fleet runs at least that many episodes, counted over all its robots. The function calls `each` after every
-    episode with the statistics so far.
+    A fleet runs at least that many episodes, counted over all its robots; its metrics are also given by kind, by robot,
+    and for its worlds. The function calls `each` after every episode with the statistics so far.
     """
+    world: FleetEnv | None = None
     if what.fleet:
-        return _together(robot, what, each) | _about(what)
-    driver, policy, question = prepare_evaluation(robot, what)
-    tally = EpisodeStats()
-    for number in range(what.episodes):
-        for step in episode(driver, policy, question, number):
-            tally.step(step)
-        each(tally)
-    return closed_loop([tally]) | _about(what)
-
-
-def _together(robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any]) -> dict[str, Any]:
-    """Run a fleet's episodes and return the metrics in total, by kind, by robot, and for its worlds."""
-    fleet, world, policies, question = prepare_fleet(robot, what)
-    tallies = {driver.identity.actor: EpisodeStats() for driver in fleet.runners}
-    rounds, periods = -(-what.episodes // what.fleet), 0
+        group, world, policies, question = prepare_fleet(robot, what)
+    else:
+        driver, policy, question = prepare_evaluation(robot, what)
+        group, policies = RobotGroup([driver]), [policy]
+    stats = {runner.identity.actor: EpisodeStats() for runner in group.runners}
+    rounds, periods = -(-what.episodes // len(stats)), 0
     for number in range(rounds):
-        for steps in run_episode(fleet, policies, question, number):
+        for steps in run_episode(group, policies, question, number):
             periods += 1
             for step in steps:
-                tallies[step.actor].step(step)
-        for tally in tallies.values():
-            each(tally)
-    figures = closed_loop(tallies.values())
-    seconds = periods * robot.period
+                stats[step.actor].step(step)
+        for actor in stats.values():
+            each(actor)
+    figures = closed_loop(stats.values())
+    if world is not None:
+        seconds = periods * robot.period
+        figures |= {
+            "robots": {robot.name: dict(figures)},
+            "actors": {name: closed_loop([actor]) for name, actor in stats.items()},
+            "worlds": {
+                "count": rounds,
+                "robot_steps": periods * what.fleet,  # includes robots that stand at their goals
+                "touches": world.touches,  # contacts between two robots, for any reason
+                "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
+            },
+        }
+    filtered = what.method == DDPC
     return figures | {
-        "robots": {robot.name: figures},
-        "actors": {name: closed_loop([tally]) for name, tally in tallies.items()},
-        "worlds": {
-            "count": rounds,
-            "robot_steps": periods * what.fleet,  # includes robots that stand at their goals
-            "touches": world.touches,  # contacts between two robots, for any reason
-            "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
-        },
-    }
-
-
-def _about(what: Evaluation) -> dict[str, Any]:
-    return {
         "method": what.method,
-        "certificate": what.model_config.certificate if what.method == DDPC else None,
-        "mode": what.model_config.mode if what.method == DDPC else None,
+        "certificate": what.model_config.certificate if filtered else None,
+        "mode": what.model_config.mode if filtered else None,
         "policy": what.policy,
         "arena": what.arena,
         "perception": perception_in(what.conditions.describe()),

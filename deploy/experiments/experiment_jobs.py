@@ -9,14 +9,14 @@ import json
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import asdict
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
-from brakeline.deploy.interpreter import spawning
+from brakeline.deploy.interpreter import end_with_parent, spawning
 from brakeline.errors import StaleResultError
 from brakeline.messaging.atomic_files import write_atomically
 
@@ -24,14 +24,21 @@ LONGEST_LINE = 500  # characters per progress message
 
 
 class Job(Protocol):
-    """One job of an experiment: name of its result, configuration, and the run itself."""
+    """One job of an experiment: a dataclass whose fields are its configuration. Its `name` names the result."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def robot(self) -> str: ...
     @property
     def name(self) -> str: ...
-    def config(self) -> dict[str, Any]: ...
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]: ...
+
+
+def configuration(job: Job) -> dict[str, Any]:
+    """Return the fields of a job as JSON values."""
+    values: dict[str, Any] = json.loads(json.dumps(asdict(job)))
+    return values
 
 
 def result_path(results: Path, job: Job) -> Path:
@@ -49,7 +56,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     if not path.exists():
         return None
     result: dict[str, Any] = json.loads(path.read_text())
-    stored, current = result.get("study", {}), job.config()
+    stored, current = result.get("study", {}), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
         raise StaleResultError(
@@ -130,14 +137,9 @@ def _start_worker(progress: Connection) -> None:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends workers too, without a traceback
-
-    def exit_with_parent() -> None:
-        parent = multiprocessing.parent_process()
-        assert parent is not None
-        parent.join()
+    parent = multiprocessing.parent_process()
+    if parent is None or parent.pid is None or not end_with_parent(parent.pid, signal.SIGKILL):
         os._exit(1)
-
-    threading.Thread(target=exit_with_parent, name="exit with parent", daemon=True).start()
 
 
 def _run_job(job: Job, results: Path, runs: Path) -> None:

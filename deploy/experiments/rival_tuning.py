@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import evaluate
+from brakeline.deploy.experiments.trials import run_trial
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.messaging.task import RobotWithTask
@@ -53,7 +53,7 @@ def try_threshold(
     tables = {}
     for name in (ORACLE, GREEDY):
         driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("tune", 0, 0))
-        tables[name] = evaluate(driver, policy_named(name, robot, 0), question, episodes)
+        tables[name] = run_trial(driver, policy_named(name, robot, 0), question, episodes)
     oracle, greedy = tables[ORACLE].columns(), tables[GREEDY].columns()
     return ThresholdTrial(
         value,

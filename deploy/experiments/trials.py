@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from operator import add
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,10 +29,31 @@ from brakeline.sim.scripted_policies import Policy, scripted
 FLUSH = 2000  # messages per write
 RUN = 1  # run number: a launched process has a random one
 CONTACTS = ("contact_moving", "contact_standing")
-COLUMNS = (
-    *("steps", "goal", "collision", "timeout", "reward", "speed", "fastest", "interventions", "milliseconds"),
-    *CONTACTS,
-)
+INTERVENTIONS = (pb.FAILSAFE, pb.ADJUSTED, pb.RECOVERING)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of an `EpisodeTable`: the value of each step, how an episode combines them, and its type in JSON."""
+
+    value: Callable[[pb.Step], float]
+    combine: Callable[[float, float], float] = add
+    count: bool = False
+
+
+COLUMNS = {
+    "steps": Column(lambda step: 1, count=True),
+    "goal": Column(lambda step: step.goal, count=True),
+    "collision": Column(lambda step: step.collision, max, count=True),
+    "timeout": Column(lambda step: step.truncated and not step.terminated and not step.cut, count=True),
+    "reward": Column(lambda step: step.reward),  # without penalties
+    "speed": Column(lambda step: step.speed),  # m/s, summed over steps
+    "fastest": Column(lambda step: step.speed, max),
+    "interventions": Column(lambda step: step.fallback or step.decision in INTERVENTIONS, count=True),
+    "milliseconds": Column(lambda step: step.propose_ms + step.decide_ms),  # of policy and method
+    "contact_moving": Column(lambda step: step.contact_moving, count=True),
+    "contact_standing": Column(lambda step: step.contact_standing, count=True),
+}
 
 
 class TrialLog:
@@ -45,6 +67,7 @@ class TrialLog:
         self._count: dict[str, int] = {}
 
     def put(self, topic: Topic, message: pb.Step | pb.Episode) -> None:
+        """Add a message, and number it."""
         key = topic.at(robot=message.robot, source=message.actor)
         self._count[key] = number = self._count.get(key, 0) + 1
         header, now = message.header, time.time_ns()
@@ -54,6 +77,14 @@ class TrialLog:
         )
         if len(self._waiting) >= FLUSH:
             self._save()
+
+    def put_step(self, step: pb.Step) -> None:
+        """Add a copy of a step without observations and path."""
+        copy = pb.Step()
+        copy.CopyFrom(step)
+        for name in ("observation", "next_observation", "path"):
+            copy.ClearField(name)
+        self.put(STEP, copy)
 
     def _save(self) -> None:
         self._segment.save(self._waiting)
@@ -70,111 +101,71 @@ class TrialLog:
 
 @dataclass
 class EpisodeTable:
-    """One row per finished episode, and statistics of the decision times.
+    """One row per finished episode with the values of `COLUMNS`, and statistics of the decision times."""
 
-    steps; goal, collision, timeout (0 or 1); reward without penalties; speed [m/s] summed over steps, and the highest;
-    interventions; milliseconds of policy and method, summed over steps; contact with what moves, moving and standing.
-    """
-
-    rows: list[tuple[float, ...]] = field(default_factory=list)
+    rows: list[dict[str, float]] = field(default_factory=list)
     decisions: int = 0
     milliseconds: float = 0.0
     squares: float = 0.0  # ms²
-    _running: list[float] = field(default_factory=lambda: [0.0] * len(COLUMNS))
+    _running: dict[str, float] = field(default_factory=lambda: dict.fromkeys(COLUMNS, 0))
 
     def step(self, step: pb.Step) -> None:
         """Add the next step."""
-        row, spent = self._running, step.propose_ms + step.decide_ms
-        failsafe = step.fallback or step.decision == pb.FAILSAFE
-        row[0] += 1
-        row[1] += step.goal
-        row[2] = max(row[2], float(step.collision))
-        row[3] += step.truncated and not step.terminated and not step.cut
-        row[4] += step.reward
-        row[5] += step.speed
-        row[6] = max(row[6], step.speed)
-        row[7] += failsafe or step.decision in (pb.ADJUSTED, pb.RECOVERING)
-        row[8] += spent
-        row[9] += step.contact_moving
-        row[10] += step.contact_standing
+        for name, column in COLUMNS.items():
+            self._running[name] = column.combine(self._running[name], column.value(step))
+        spent = COLUMNS["milliseconds"].value(step)
         self.decisions += 1
         self.milliseconds += spent
         self.squares += spent * spent
         if step.terminated or step.truncated:
-            self.rows.append(tuple(row))
-            self._running = [0.0] * len(COLUMNS)
+            self.rows.append(self._running)
+            self._running = dict.fromkeys(COLUMNS, 0)
 
     def columns(self) -> dict[str, list[float]]:
         """Return the columns, rounded to four digits; counts are integers."""
-        table = np.array(self.rows).reshape(-1, len(COLUMNS)).T
-        whole = {"steps", "goal", "collision", "timeout", "interventions", *CONTACTS}
         return {
-            name: [int(v) for v in values] if name in whole else [round(float(v), 4) for v in values]
-            for name, values in zip(COLUMNS, table, strict=True)
+            name: [int(row[name]) if column.count else round(float(row[name]), 4) for row in self.rows]
+            for name, column in COLUMNS.items()
         }
 
     def decision_ms(self) -> dict[str, float]:
+        """Return the mean and the standard deviation of the decision times [ms]."""
         mean = self.milliseconds / max(self.decisions, 1)
         return {"mean": mean, "std": max(self.squares / max(self.decisions, 1) - mean * mean, 0.0) ** 0.5}
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """An action (m,) and the time that the policy needed, in ms."""
+def take_step(driver: EpisodeRunner, policy: Policy, question: Ask | None, version: int = 0) -> pb.Step:
+    """Take one step: propose an action, request a decision, execute it.
 
-    action: NDArray[np.float64]
-    ms: float
-
-
-Propose = Callable[[EpisodeRunner], Proposal]
-
-
-def timed_policy(policy: Policy) -> Propose:
-    """Wrap a policy so that it measures its own time."""
-
-    def propose(driver: EpisodeRunner) -> Proposal:
-        before = time.perf_counter_ns()
-        action = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        return Proposal(action, (time.perf_counter_ns() - before) * 1e-6)
-
-    return propose
-
-
-def take_step(driver: EpisodeRunner, propose: Propose, question: Ask | None, version: int = 0) -> pb.Step:
-    """Take one step: propose an action, request a decision, execute it."""
-    proposal = propose(driver)
-    outcome = driver.decide(proposal.action, question)
+    Raises:
+        RuntimeError: there is no decision. In one process this is a defect, never the network.
+    """
+    before = time.perf_counter_ns()
+    proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+    spent_ms = (time.perf_counter_ns() - before) * 1e-6
+    outcome = driver.decide(proposal, question)
     if outcome is not None and outcome.answer is None:
-        raise RuntimeError(f"no decision: {outcome.failure}")  # in one process this is a defect, never the network
-    step = driver.execute(proposal.action, outcome, version)
-    step.propose_ms = proposal.ms
+        raise RuntimeError(f"no decision: {outcome.failure}")
+    step = driver.execute(proposal, outcome, version)
+    step.propose_ms = spent_ms
     return step
 
 
-def without_observations(step: pb.Step) -> pb.Step:
-    """Return a copy of a step without observations and path."""
-    copy = pb.Step()
-    copy.CopyFrom(step)
-    for name in ("observation", "next_observation", "path"):
-        copy.ClearField(name)
-    return copy
-
-
-def evaluate(
+def run_trial(
     driver: EpisodeRunner, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
 ) -> EpisodeTable:
     """Run the policy without exploration through episodes 0 to `episodes` − 1 of the environment."""
-    found, propose = EpisodeTable(), timed_policy(policy)
+    table = EpisodeTable()
     for number in range(episodes):
         message = driver.begin(number)
         if log is not None:
             log.put(EPISODE, message)
         while driver.running:
-            step = take_step(driver, propose, question)
-            found.step(step)
+            step = take_step(driver, policy, question)
+            table.step(step)
             if log is not None:
-                log.put(STEP, without_observations(step))
-    return found
+                log.put_step(step)
+    return table
 
 
 class Trainer:
@@ -196,13 +187,13 @@ class Trainer:
                 self._random = scripted("random", self.driver.robot, self.driver.rng)
                 if log is not None:
                     log.put(EPISODE, message)
-            step = take_step(self.driver, timed_policy(self._explore), self.question, self.policy.version)
+            step = take_step(self.driver, self._explore, self.question, self.policy.version)
             self.learner.insert(step)
             self.learner.work(1 << 30)
             if self.learner.weights_due():
                 self.policy = decode(self.learner.publish().file, self.driver.robot)
             if log is not None:
-                log.put(STEP, without_observations(step))
+                log.put_step(step)
             yield step
 
     def _explore(self, observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:

@@ -13,17 +13,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from brakeline.deploy.run.run_view import RunView
+from brakeline.deploy.run.launcher import Launcher
+from brakeline.logs.console_tables import PLAIN
 from brakeline.logs.report import show
 from brakeline.logs.tube_stats import stated
 
 REFRESH = 0.5  # s between updates of the table
-PLAIN = 10.0  # s between lines without a terminal
+SPACING = 10.0  # s between lines without a terminal
 LINES = 5  # shown warnings
 
 
 class Display:
-    """Shows the view of a run. You can call it at any rate: it limits the redrawing itself."""
+    """Shows a run. You can call it at any rate: it limits the redrawing itself."""
 
     def __init__(self, console: Console, steps: int) -> None:
         self.console = console
@@ -44,34 +45,34 @@ class Display:
         if self._live is not None:
             self._live.stop()
 
-    def __call__(self, view: RunView) -> None:
-        if self._live is None and (phase := run_phase(view)) != self._last_phase:
+    def __call__(self, run: Launcher) -> None:
+        if self._live is None and (phase := run_phase(run)) != self._last_phase:
             self._last_phase = phase
             self.console.print(phase, markup=False)
-        spacing = REFRESH if self._live is not None else PLAIN
-        if time.monotonic() - self._last < spacing and not (view.ending and self._live is not None):
+        spacing = REFRESH if self._live is not None else SPACING
+        if time.monotonic() - self._last < spacing and not (run.ending and self._live is not None):
             return
         self._last = time.monotonic()
-        figures = view.metrics.figures()
+        figures = run.metrics.figures()
         learned = sum(learner["steps"] for learner in figures["learners"].values())
         self._bar.update(self._task, completed=max(figures["steps"], learned))  # a resumed run has earlier steps
         if self._live is not None:
-            self._live.update(live(view, figures, self._bar), refresh=True)
+            self._live.update(live(run, figures, self._bar), refresh=True)
         else:
             self.console.print(line(figures))
 
 
-def run_phase(view: RunView) -> str:
+def run_phase(run: Launcher) -> str:
     """Return what the run is doing now."""
-    if view.ending:
+    if run.ending:
         return "ending every process in order"
-    known = view.metrics.processes.copy()
-    starting = [child.spec.name for child in view.processes if child.spec.name not in known and not child.finished]
+    known = run.metrics.processes.copy()
+    starting = [child.spec.name for child in run.processes if child.spec.name not in known and not child.finished]
     if starting:
         return f"starting {', '.join(starting)}"
-    if not any(stats.steps for stats in view.metrics.actors.copy().values()) and view.config.actors:
+    if not any(stats.steps for stats in run.metrics.actors.copy().values()) and run.config.actors:
         return "waiting for the first step"
-    return "driving" if view.config.policy else "driving and learning" if view.config.actors else "learning from logs"
+    return "driving" if run.config.policy else "driving and learning" if run.config.actors else "learning from logs"
 
 
 def line(figures: dict[str, Any]) -> str:
@@ -86,59 +87,57 @@ def line(figures: dict[str, Any]) -> str:
     )
 
 
-def live(view: RunView, figures: dict[str, Any], bar: Progress) -> RenderableType:
+def live(run: Launcher, figures: dict[str, Any], bar: Progress) -> RenderableType:
     """Format progress, learning, safety, processes and the latest warnings."""
-    parts: list[RenderableType] = [Text(run_phase(view), "bold"), bar, _run(figures), _processes(view)]
-    if view.lines:
-        parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(view.lines)[-LINES:]]
-    subtitle = "ending" if view.ending else "^C ends every process in order"
-    return Panel(Group(*parts), title=Text(f"brakeline: {view.folder}"), subtitle=subtitle)
+    parts: list[RenderableType] = [Text(run_phase(run), "bold"), bar, _figures_table(figures), _processes(run)]
+    if run.lines:
+        parts += [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in list(run.lines)[-LINES:]]
+    subtitle = "ending" if run.ending else "^C ends every process in order"
+    return Panel(Group(*parts), title=Text(f"brakeline: {run.folder}"), subtitle=subtitle)
 
 
-def _run(figures: dict[str, Any]) -> Table:
+def _figures_table(figures: dict[str, Any]) -> Table:
     """Format the figures in two columns of names and values, for 80 columns."""
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
-    episodes, steps = figures["episodes"], figures["steps"]
-    times, trip, contained = figures["decision_ms"], figures["round_trip_ms"], figures["containment"]
-    color = "green" if figures["collisions"] == 0 else "bold red"
-    table.add_row("episodes", str(episodes), "goals", share(figures["goals"], episodes))
-    table.add_row("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", _mean(figures))
-    table.add_row("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"]))
-    clearance = "-" if figures["for_clearance"] is None else str(figures["for_clearance"])
-    table.add_row("adjusted", share(figures["adjusted"], steps), "for clearance", clearance)
-    table.add_row(
-        "outside the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])
-    )
-    plans = figures["plans"]
+    episodes, steps, plans = figures["episodes"], figures["steps"], figures["plans"]
+    contained, color = figures["containment"], "bold red" if figures["collisions"] else "green"
+    rows = [
+        ("episodes", str(episodes), "goals", share(figures["goals"], episodes)),
+        ("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", known("{:.1f}", figures["mean_reward"])),
+        ("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"])),
+        ("adjusted", share(figures["adjusted"], steps), "for clearance", known("{}", figures["for_clearance"])),
+        ("outside the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])),
+    ]
     if plans["flown"]:
-        left = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
-        table.add_row("plans outside tube", left)
-    table.add_row("decide p50 / p99", _pair(times), "reply p50 / p99", _pair(trip))
-    several = len(figures["learners"]) > 1
+        rows.append(("plans outside tube", f"{share(plans['outside'], plans['flown'])}; {stated(plans)}", "", ""))
+    decide, reply = (
+        known("{0[p50]:.2f} / {0[p99]:.2f} ms", figures[name]) for name in ("decision_ms", "round_trip_ms")
+    )
+    rows.append(("decide p50 / p99", decide, "reply p50 / p99", reply))
     for robot, learner in figures["learners"].items():
-        steps_per_s, updates_per_s = (f"{learner[name]:.0f}/s" for name in ("steps_per_s", "updates_per_s"))
-        table.add_row(f"steps {robot}" if several else "steps", steps_per_s, "updates", updates_per_s)
-        critic, actor = (f"{learner[name]:.3f}" for name in ("critic_loss", "actor_loss"))
-        table.add_row("critic loss", critic, "actor loss", actor)
-        table.add_row("steps lost", str(learner["missing"]), "duplicate steps", str(learner["duplicates"]))
+        name = f"steps {robot}" if len(figures["learners"]) > 1 else "steps"
+        rows += [
+            (name, f"{learner['steps_per_s']:.0f}/s", "updates", f"{learner['updates_per_s']:.0f}/s"),
+            ("critic loss", f"{learner['critic_loss']:.3f}", "actor loss", f"{learner['actor_loss']:.3f}"),
+            ("steps lost", str(learner["missing"]), "duplicate steps", str(learner["duplicates"])),
+        ]
+    table = Table(show_header=False, **PLAIN)
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
-def _mean(figures: dict[str, Any]) -> str:
-    return "-" if figures["mean_reward"] is None else f"{figures['mean_reward']:.1f}"
+def known(form: str, value: Any) -> str:
+    """Format a value; `-` for None."""
+    return "-" if value is None else form.format(value)
 
 
-def _pair(times: dict[str, Any] | None) -> str:
-    return "-" if times is None else f"{times['p50']:.2f} / {times['p99']:.2f} ms"
-
-
-def _processes(view: RunView) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0))
+def _processes(run: Launcher) -> Table:
+    table = Table(**PLAIN)
     for column in ("process", "state", "restarts"):
         table.add_column(column, style="dim" if column != "process" else "")
-    for child in view.processes:
+    for child in run.processes:
         state = "[green]runs[/]" if child.alive else "done" if child.finished else "[red]down[/]"
-        if child.spec.name not in view.metrics.processes and not child.restarts and not child.finished:
+        if child.spec.name not in run.metrics.processes and not child.restarts and not child.finished:
             state = "[yellow]starts[/]"
         table.add_row(child.spec.name, state, str(child.restarts))
     return table
@@ -155,31 +154,22 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
     console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
-    if "from_logs" in figures:
-        fed = figures["from_logs"]
-        console.print(
-            f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner had already"
-        )
+    if fed := figures.get("from_logs"):
+        known_before = f"{fed.get('known', 0)} that the learner had already"
+        console.print(f"steps from logs: {fed.get('published', 0)}, and {known_before}")
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
-        console.print(
-            f"[yellow]stopped before the last step[/]; continue with: brakeline train --resume {figures['folder']}"
-        )
-    console.print(f"log:    {figures['log'] or 'not recorded'}", markup=False)
-    for path in figures["policies"]:
-        console.print(f"policy: {path}", markup=False)
-    for command in following(figures):
-        console.print(f"next:   {command}", markup=False)
+        resume = f"brakeline train --resume {figures['folder']}"
+        console.print(f"[yellow]stopped before the last step[/]; continue with: {resume}")
+    lines = [f"log:    {figures['log'] or 'not recorded'}", *(f"policy: {path}" for path in figures["policies"])]
+    for line in (*lines, *(f"next:   {command}" for command in following(figures))):
+        console.print(line, markup=False)
 
 
 def following(figures: dict[str, Any]) -> list[str]:
     """Return useful commands after a run."""
-    commands = []
+    folder, robots, commands = figures["folder"], list(figures["robots"]), []
     if figures["log"]:
-        commands += [
-            f"brakeline analyse {figures['folder']} --html report.html",
-            f"brakeline replay {figures['folder']}",
-        ]
-    robots = list(figures["robots"])
+        commands += [f"brakeline analyse {folder} --html report.html", f"brakeline replay {folder}"]
     if figures["policies"] and len(robots) == 1:
         commands.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
     return commands

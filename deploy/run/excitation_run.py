@@ -15,11 +15,12 @@ import numpy as np
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.excitation_plan import Region, RegionExcitation, run_length
-from brakeline.deploy.experiments.trials import TrialLog, take_step, timed_policy
-from brakeline.deploy.vehicle_factory import empty_arena, factory
+from brakeline.deploy.experiments.trials import TrialLog, take_step
+from brakeline.deploy.vehicle_factory import empty_arena
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, STEP
 from brakeline.sim.arena import Arena
+from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 
@@ -61,7 +62,7 @@ def drive(
     def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
         return empty_arena(robot, ((region[0] + region[2]) / 2.0, (region[1] + region[3]) / 2.0))
 
-    env = NavigationEnv(robot, make_vehicle=factory(robot, Conditions()), seed_key=seed, draw=draw)
+    env = NavigationEnv(robot, make_vehicle=simulated_vehicle(robot, Conditions()), seed_key=seed, draw=draw)
     driver = EpisodeRunner(robot, env, ActorIdentity("excite", 0, seed), filtered=False)
     low, high = np.array(region[:2]) + robot.footprint, np.array(region[2:]) - robot.footprint
     metadata = {
@@ -76,7 +77,7 @@ def drive(
             log.put(EPISODE, driver.begin(run))
             before = periods
             while driver.running and periods - before < length:
-                step = take_step(driver, timed_policy(policy), None)
+                step = take_step(driver, policy, None)
                 log.put(STEP, step)
                 position = np.array(step.true_state[:2])
                 periods, collisions = periods + 1, collisions + step.collision

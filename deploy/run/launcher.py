@@ -14,7 +14,6 @@ from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, sign_models
-from brakeline.deploy.run.run_view import RunView
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.errors import LaunchError
 from brakeline.logs.metrics import Metrics
@@ -54,7 +53,13 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
 
 
 class Launcher:
-    """A run from its first process to its last."""
+    """A run from its first process to its last.
+
+    Attributes:
+        metrics: the figures so far.
+        lines: the latest warnings.
+        ending: whether the launcher ends the processes.
+    """
 
     def __init__(self, config: RunConfig, folder: Path, bus: BusSettings) -> None:
         """bus: the endpoint to listen on, and the folder with the keys of all processes, if they have any."""
@@ -62,20 +67,20 @@ class Launcher:
         self.processes = [SupervisedProcess(spec, folder) for spec in process_specs(config)]
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
+        self.ending = False
         self._inbox: deque[Sample] = deque()
         self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
 
-    def run(self, show: Callable[[RunView], Any] = lambda view: None) -> dict[str, Any]:
+    def run(self, show: Callable[[Launcher], Any] = lambda run: None) -> dict[str, Any]:
         """Run until the learners are done, SIGINT or SIGTERM. Returns the figures, and saves them in the run's folder.
 
         Args:
-            show: is called several times a second with the state of the run.
+            show: is called several times a second with this launcher.
 
         Raises:
             LaunchError: a process failed several times in a row; the launcher has ended the others.
             Unreachable: the launcher can't listen on the endpoint.
         """
-        view = RunView(self.config, self.folder, self.metrics, self.processes, self.lines)
         failure: LaunchError | None = None
         with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
             self._rejected = process.bus.rejected
@@ -85,21 +90,21 @@ class Launcher:
             process.refresh = lambda: self._update_health(process)
             try:
                 if self.config.record:
-                    self._start_recorder(process, lambda: show(view))
+                    self._start_recorder(process, lambda: show(self))
                 process.announce()
                 while not process.stop.is_set() and not self.finished:
                     for child in self.processes:
                         if not self._must_wait(child):
                             child.supervise()
                     self._drain()
-                    show(view)
+                    show(self)
                     process.stop.wait(PERIOD)
             except LaunchError as error:
                 failure = error
                 log.error("%s", error)
             finally:
-                view.ending = True
-                show(view)
+                self.ending = True
+                show(self)
                 self._end()
                 self._drain()
                 outcome = "finished" if self.finished else "stopped before its last step"
@@ -113,18 +118,11 @@ class Launcher:
 
     def _update_health(self, process: Process) -> None:
         """Put the totals of the run into each health message, for viewers that connect in its middle."""
-        config = self.config
+        config, steps = self.config, self.config.steps * len(self.config.robots)
         process.figures.update({f"restarts {child.spec.name}": child.restarts for child in self.processes})
         process.figures.update(totals_to_health(run_totals(self.metrics)))
-        process.notes.update(
-            {
-                "run": self.folder.name,
-                "method": config.method,
-                "arena": config.arena,
-                "seed": str(config.seed),
-                "steps": str(config.steps * len(config.robots)),
-            }
-        )
+        process.notes.update(run=self.folder.name, method=config.method, arena=config.arena)
+        process.notes.update(seed=str(config.seed), steps=str(steps))
 
     def figures(self) -> dict[str, Any]:
         """Return the figures that `analyse` computes from the log, and those that only the launcher knows."""
@@ -136,15 +134,13 @@ class Launcher:
             "seed": self.config.seed,
         }
         restarts = {child.spec.name: child.restarts for child in self.processes if child.restarts}
-        log_path = str(self.folder / LOG) if self.config.record else None
-        paths = {"folder": str(self.folder), "log": log_path, "policies": self.policies()}
-        return (
-            setup
-            | self.metrics.figures()
-            | {"finished": self.finished, "restarts": restarts}
-            | self._from_logs()
-            | paths
-        )
+        outcome = {"finished": self.finished, "restarts": restarts} | self._from_logs()
+        paths = {
+            "folder": str(self.folder),
+            "log": str(self.folder / LOG) if self.config.record else None,
+            "policies": [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))],
+        }
+        return setup | self.metrics.figures() | outcome | paths
 
     @property
     def finished(self) -> bool:
@@ -153,15 +149,20 @@ class Launcher:
         A run from logs alone has also finished when the logs end. Its learner may then lack a few steps, which an
         interrupted learner had not saved.
         """
-        kinds = ("learner", "feeder", "actor")
-        done = {kind: [c.finished for c in self.processes if c.spec.kind == kind] for kind in kinds}
+
+        def done(kind: str) -> bool:
+            return all(child.finished for child in self._of(kind))
+
         if self.config.policy:
-            return all(done["actor"])
-        return all(done["learner"]) or (self.config.actors == 0 and all(done["feeder"]))
+            return done("actor")
+        return done("learner") or (self.config.actors == 0 and done("feeder"))
+
+    def _of(self, kind: str) -> list[SupervisedProcess]:
+        return [child for child in self.processes if child.spec.kind == kind]
 
     def _must_wait(self, child: SupervisedProcess) -> bool:
         """Whether a process is an actor whose learner still learns from logs."""
-        feeders = (c for c in self.processes if c.spec.kind == "feeder" and c.spec.robot == child.spec.robot)
+        feeders = (feeder for feeder in self._of("feeder") if feeder.spec.robot == child.spec.robot)
         return child.spec.kind == "actor" and not all(feeder.finished for feeder in feeders)
 
     def _from_logs(self) -> dict[str, Any]:
@@ -169,15 +170,10 @@ class Launcher:
         if not self.config.from_logs:
             return {}
         steps: Counter[str] = Counter()
-        for child in self.processes:
-            process = self.metrics.processes.get(child.spec.name)
-            if child.spec.kind == "feeder" and process is not None:
+        for feeder in self._of("feeder"):
+            if (process := self.metrics.processes.get(feeder.spec.name)) is not None:
                 steps.update({name: int(count) for name, count in process.figures.items()})
         return {"from_logs": {"logs": list(self.config.from_logs)} | dict(steps)}
-
-    def policies(self) -> list[str]:
-        """Return the saved policy files."""
-        return [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))]
 
     def _claim_folder(self) -> None:
         """Write the files that the processes read, and make runs/latest point to this run."""
@@ -206,10 +202,8 @@ class Launcher:
             process.stop.wait(0.05)
         else:
             if not process.stop.is_set():
-                log.error(
-                    "no recorder, so the run starts without a log: %s",
-                    last_line(self.folder / "logs" / "recorder.log"),
-                )
+                said = last_line(self.folder / "logs" / "recorder.log")
+                log.error("no recorder, so the run starts without a log: %s", said)
 
     def _drain(self) -> None:
         """Take in the received messages."""
@@ -227,10 +221,8 @@ class Launcher:
 
     def _end(self) -> None:
         """End the actors first, so that none lacks answers, and the recorder last, so that it logs all messages."""
-        recorders = [child for child in self.processes if child.spec.kind == "recorder"]
-        actors = [child for child in self.processes if child.spec.kind == "actor"]
-        others = [child for child in self.processes if child not in (*recorders, *actors)]
-        for group in filter(None, (actors, others, recorders)):
+        others = [child for child in self.processes if child.spec.kind not in ("actor", "recorder")]
+        for group in filter(None, (self._of("actor"), others, self._of("recorder"))):
             for child in group:
                 child.terminate()
             deadline = time.monotonic() + TERMINATION_TIMEOUT

@@ -6,7 +6,6 @@ start each process alone, with `brakeline safety`, `learner`, `actor` or `record
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import sys
@@ -15,6 +14,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from brakeline.deploy.interpreter import end_with_parent
 from brakeline.deploy.run.processes import (
     CONFIG,
     LOG,
@@ -29,8 +29,6 @@ from brakeline.deploy.run.run_config import RunConfig, load
 from brakeline.errors import BusError
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
-
-PR_SET_PDEATHSIG = 1  # of prctl: the signal that a process gets when its parent dies
 
 
 def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
@@ -149,9 +147,8 @@ MAIN_FUNCTIONS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], 
 def main() -> int:
     """Run the process that the command line names, until its work is done or its launcher ends. Returns the status."""
     folder, name = Path(sys.argv[1]), sys.argv[2]
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if os.getppid() != launcher_pid(folder):  # the launcher died before the prctl call
+    if not end_with_parent(launcher_pid(folder)):
         return UNFINISHED
     config = load(folder / CONFIG)
     number, spec = next(row for row in enumerate(process_specs(config)) if row[1].name == name)

@@ -6,10 +6,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+from brakeline.deploy.experiments.compare import ComparisonJob, cell_configs
 
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments.bootstrap import mean, ratio
-from brakeline.deploy.experiments.compare import ComparisonJob, cell_configs
 from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig, TrialConfig, quick, run
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times

@@ -1,7 +1,6 @@
 """Console output of a run, on a terminal of 80 columns and in a file."""
 
 import io
-from collections import deque
 from pathlib import Path
 
 import pytest
@@ -10,12 +9,11 @@ from rich.progress import Progress
 
 from brakeline.deploy.commands import common_options
 from brakeline.deploy.run.display import Display, line, live, run_phase, summary
-from brakeline.deploy.run.processes import process_specs
+from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.deploy.run.run_view import RunView
-from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.logs.metrics import Metrics
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings
 
 
 def step(number: int) -> pb.Step:
@@ -26,7 +24,7 @@ def step(number: int) -> pb.Step:
 
 
 @pytest.fixture
-def view() -> RunView:
+def view() -> Launcher:
     """The view of a run with the widest possible figures."""
     metrics = Metrics()
     for number in range(1000):
@@ -36,13 +34,14 @@ def view() -> RunView:
     exchange = pb.Exchange(round_trip_ms=543.21)
     metrics.add("exchange/ground/actor-0", exchange)
     folder = Path("/a/folder/with [brackets] in its name")
-    lines = deque(["safety-0: [red]no[/] markup " + "and very long " * 20])
-    processes = [SupervisedProcess(spec, folder) for spec in process_specs(RunConfig(replicas=2))]
-    return RunView(RunConfig(), folder, metrics, processes, lines)
+    run = Launcher(RunConfig(replicas=2), folder, BusSettings())
+    run.metrics = metrics
+    run.lines.append("safety-0: [red]no[/] markup " + "and very long " * 20)
+    return run
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])
-def test_the_live_picture_fits_the_terminal(view: RunView, width: int) -> None:
+def test_the_live_picture_fits_the_terminal(view: Launcher, width: int) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
     console.print(live(view, view.metrics.figures(), Progress()))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
@@ -62,14 +61,14 @@ def test_the_live_picture_fits_the_terminal(view: RunView, width: int) -> None:
         assert name in shown, "no value is broken"
 
 
-def test_without_a_terminal_it_says_a_line_now_and_then(view: RunView, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
     console = Console(file=io.StringIO(), soft_wrap=True)
     with Display(console, 1000) as display:
         for _ in range(100):
             display(view)
         said = console.file.getvalue()  # type: ignore[attr-defined]
         assert said.startswith("starting recorder, safety-0,") and said.count("\n") == 1, "what it does, at once"
-        monkeypatch.setattr("brakeline.deploy.run.display.PLAIN", 0.0)
+        monkeypatch.setattr("brakeline.deploy.run.display.SPACING", 0.0)
         display(view)
         monkeypatch.undo()
         view.ending = True
@@ -78,7 +77,7 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: RunView, monkeypat
     assert rows[1:] == [line(view.metrics.figures()), "ending every process in order"]
 
 
-def test_the_summary_has_the_paths_whole(view: RunView) -> None:
+def test_the_summary_has_the_paths_whole(view: Launcher) -> None:
     console = Console(file=io.StringIO(), soft_wrap=common_options.console.soft_wrap)
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
@@ -90,8 +89,8 @@ def test_the_summary_has_the_paths_whole(view: RunView) -> None:
     assert f"next:   brakeline analyse {folder} --html report.html" in rows, "and what comes next"
 
 
-def test_what_a_run_is_at_is_said_from_the_first_second(view: RunView) -> None:
-    young = RunView(view.config, view.folder, Metrics(), view.processes, deque())
+def test_what_a_run_is_at_is_said_from_the_first_second(view: Launcher) -> None:
+    young = Launcher(view.config, view.folder, BusSettings())
     console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
     console.print(live(young, young.metrics.figures(), Progress()))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
