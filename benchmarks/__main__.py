@@ -1,4 +1,4 @@
-"""`make bench`: every benchmark, each beside its peer in the same run."""
+"""Run benchmarks, each beside its peer in the same run (`make bench`)."""
 
 from __future__ import annotations
 
@@ -42,35 +42,41 @@ from tests.fuzz import message_fuzz
 
 @dataclass(frozen=True)
 class Bench:
-    """Every benchmark that needs neither root nor a quarter of an hour, or the named ones."""
+    """Run the named benchmarks, or every one that needs neither root nor a quarter of an hour."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Which; all that do not have to be asked for, unless given."""
+    """Benchmarks to run. Defaults to all but those that run only when you name them."""
     json: bool = False
-    """One JSON object on stdout."""
+    """Print one JSON object on stdout."""
     seed: int = 0
-    """Of chaos, cuts and fuzz."""
+    """Seed of chaos, cuts and fuzz."""
     kills: int = 100
-    """Of chaos."""
+    """Faults of chaos."""
     faults: int = 60
-    """Of cuts."""
+    """Faults of cuts."""
     delay: float = 0.0
-    """Of chaos: s each way between actors and routers."""
+    """Delay of chaos, each way between actors and routers [s]."""
     messages: int = 1_000_000
-    """Of fuzz."""
+    """Messages of fuzz."""
     rate: int = crowd.JUNK
-    """Of crowd: junk messages /s of each sender."""
+    """Junk messages of each sender of crowd [1/s]."""
     minutes: float = 10.0
-    """Of flights: of each policy in each arena."""
+    """Duration of flights, of each policy in each arena [min]."""
     folder: Path = Path("runs/flights")
-    """Of flights, upsets and cuts: where data, logs and figures are kept; what is there already is not flown again."""
+    """Folder of the data, logs and figures of flights, upsets and cuts. What it has already is not flown again."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    module: ModuleType  # its documentation says what is measured
+    """A benchmark: its module, whose documentation says what it measures, and how it runs.
+
+    Attributes:
+        named: it runs only when you name it, since it writes gigabytes, takes minutes, or needs root or other programs.
+    """
+
+    module: ModuleType
     run: Callable[[Bench], Figures | Words]
-    asked: bool = False  # only when it is named: it writes gigabytes, takes minutes, or needs root or other programs
+    named: bool = False
 
 
 BENCHMARKS = {
@@ -85,56 +91,54 @@ BENCHMARKS = {
     "logs": Benchmark(log_reading, lambda _: log_reading.run()),
     "recording": Benchmark(recording_cost, lambda _: recording_cost.run()),
     "askers": Benchmark(askers, lambda _: askers.run()),
-    "logs-2gb": Benchmark(log_reading, lambda _: log_reading.run_large(), asked=True),
-    "fuzz": Benchmark(message_fuzz, lambda given: message_fuzz.fuzz(given.messages, given.seed), asked=True),
-    "manners": Benchmark(autopilot_conformance, lambda _: autopilot_conformance.run(), asked=True),
-    "flights": Benchmark(flights, lambda given: flights.run(given.minutes, given.folder), asked=True),
-    "upsets": Benchmark(disturbances, lambda given: disturbances.run(given.folder), asked=True),
-    "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), asked=True),
-    "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), asked=True),
-    "costs": Benchmark(costs, lambda _: costs.run(), asked=True),
-    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), asked=True),
+    "logs-2gb": Benchmark(log_reading, lambda _: log_reading.run_large(), named=True),
+    "fuzz": Benchmark(message_fuzz, lambda given: message_fuzz.fuzz(given.messages, given.seed), named=True),
+    "manners": Benchmark(autopilot_conformance, lambda _: autopilot_conformance.run(), named=True),
+    "flights": Benchmark(flights, lambda given: flights.run(given.minutes, given.folder), named=True),
+    "upsets": Benchmark(disturbances, lambda given: disturbances.run(given.folder), named=True),
+    "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
+    "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
+    "costs": Benchmark(costs, lambda _: costs.run(), named=True),
+    "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }
 
 
 def overview() -> str:
-    """What each measures, and examples."""
+    """Return what each benchmark measures, and examples."""
     lines = []
     for name, one in BENCHMARKS.items():
         what = (one.module.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
-        lines.append(f"  {name}: {what}{' (only when named)' if one.asked else ''}")
+        lines.append(f"  {name}: {what}{' (only when named)' if one.named else ''}")
     examples = "  python -m benchmarks decide --json\n  python -m benchmarks chaos --kills 30 --seed 1"
     return "\n".join([Bench.__doc__ or "", "", *lines, "", "examples:", examples])
 
 
-def _cell(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
-
-
-def show(console: Console, name: str, figures: Figures | Words) -> None:
-    table = StackingTable(title=name)
-    table.add_column("what")
+def print_figures(console: Console, name: str, figures: Figures | Words) -> None:
+    """Print the figures of a benchmark as a table."""
     columns = sorted({key for row in figures.values() for key in row}, key=str)
+    table = StackingTable("what", title=name)
     for column in columns:
         table.add_column(column, justify="right")
     for what, row in figures.items():
-        table.add_row(what, *(_cell(row.get(c, "")) for c in columns))
+        values = (row.get(column, "") for column in columns)
+        table.add_row(what, *(value if isinstance(value, str) else f"{value:.4g}" for value in values))
     console.print(table)
 
 
 def main() -> int:
+    """Run the benchmarks that the command line names. Returns the exit status."""
     given = tyro.cli(Bench, prog="python -m benchmarks", description=overview())
-    names = given.names or tuple(name for name, one in BENCHMARKS.items() if not one.asked)
+    names = given.names or tuple(name for name, one in BENCHMARKS.items() if not one.named)
     unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:
         print(f"no benchmark is called {', '.join(unknown)}; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # what it started ends with it
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that all that was started ends too
     results = {}
     for name in names:
         results[name] = BENCHMARKS[name].run(given)
         if not given.json:
-            show(Console(), name, results[name])
+            print_figures(Console(), name, results[name])
     if given.json:
         print(json.dumps(results))
     return 0

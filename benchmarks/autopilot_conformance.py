@@ -1,13 +1,12 @@
-"""Real autopilots' manners beside the embedded ones': the same messages to both, their answers, and how they brake.
+"""Compare real autopilots with the embedded ones: answers to the same messages, and how they brake.
 
-Needs `$BRAKELINE_ARDUPILOT`, `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one; what is not there is left
-out. In real time: two minutes for each.
+Needs `$BRAKELINE_ARDUPILOT` and `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one. The benchmark leaves
+out what is missing. In real time: two minutes for each.
 """
 
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import tempfile
 import time
@@ -19,10 +18,9 @@ from benchmarks import sitl
 from benchmarks.ground_station import VELOCITY_ONLY, Station
 from benchmarks.timing import Words
 from brakeline.actors.mavlink.mavlink_decoder import OFFBOARD
-from brakeline.deploy.interpreter import PYTHON
 from brakeline.messaging.byte_links import open_link
-from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.autopilot.common_dialect import mavlink as m
+from tests.system.flights import autopilot
 
 Manners = dict[str, float | str]
 
@@ -36,7 +34,7 @@ STILL = (0.0, 0.0, 0.0)
 
 
 def run() -> Words:
-    """Rows: what was asked; columns: who answered."""
+    """Return a row for each request, with the answer of each autopilot."""
     columns: dict[str, Manners] = {}
     with tempfile.TemporaryDirectory() as folder:
         for kind in sitl.KINDS:
@@ -56,19 +54,13 @@ def run() -> Words:
 
 @contextmanager
 def embedded(kind: str) -> Iterator[str]:
-    """`brakeline autopilot` on its pad, in real time."""
-    port = free_udp_port()
-    words = ("autopilot", "--rules", kind, "--url", f"udpout:127.0.0.1:{port}", "--truth", "")
-    process = subprocess.Popen([*PYTHON, "-m", "brakeline.deploy.cli", *words], stderr=subprocess.DEVNULL)
-    try:
+    """Run `brakeline autopilot` on the ground, in real time, until the end of the block. Yields its URL."""
+    with autopilot("--rules", kind) as port:
         yield f"udpin:127.0.0.1:{port}"
-    finally:
-        process.terminate()
-        process.wait(20.0)
 
 
 def manners(url: str, system: int, kind: str) -> Manners:
-    """From switching on to the ground again."""
+    """Return the answers of one autopilot from its start to its landing."""
     link = open_link(url)
     try:
         station = Station(link, system)
@@ -81,7 +73,7 @@ def manners(url: str, system: int, kind: str) -> Manners:
 
 
 def on_the_ground(station: Station, kind: str) -> Manners:
-    """Disarmed: what it grants, and what it refuses."""
+    """Send requests to the autopilot on the ground."""
     station.listen(READY, lambda: "HEARTBEAT" in station.last)
     found: Manners = {"boots in mode": station.mode}
     started = time.monotonic()
@@ -108,7 +100,7 @@ def on_the_ground(station: Station, kind: str) -> Manners:
 
 
 def up(station: Station, kind: str) -> Manners:
-    """Armed and taken off, as each of them wants it."""
+    """Arm and take off, in the order that each kind wants."""
     started = time.monotonic()
     interval(station, "LOCAL_POSITION_NED", 0.0)
     station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, m.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 100_000)
@@ -127,7 +119,7 @@ def up(station: Station, kind: str) -> Manners:
     ground = place(station)[2]
     station.velocity = None if kind == "ardupilot" else STILL  # a setpoint would end ArduCopter's climb
     found["take off"] = take_off(station, kind)
-    if kind == "px4":  # its takeoff is a mode of its own
+    if kind == "px4":  # takeoff is a mode of its own there
         station.listen(CLIMB, lambda: ground - place(station)[2] > 1.5)
         to_offboard(station, kind)
         station.velocity = (0.0, 0.0, -1.0)
@@ -138,6 +130,7 @@ def up(station: Station, kind: str) -> Manners:
 
 
 def in_the_air(station: Station, kind: str) -> Manners:
+    """Send requests to the flying autopilot, and setpoints that it follows or refuses."""
     found: Manners = {
         "arm, in the air": switch(station, True),
         "disarm, in the air": switch(station, False),
@@ -171,6 +164,7 @@ def in_the_air(station: Station, kind: str) -> Manners:
 
 
 def down(station: Station, kind: str) -> Manners:
+    """Land."""
     main, sub = LAND[kind]
     found: Manners = {"mode land": station.command(m.MAV_CMD_DO_SET_MODE, 1, main, sub)}
     station.velocity = None
@@ -188,7 +182,7 @@ def down(station: Station, kind: str) -> Manners:
 
 
 def driven(station: Station) -> Manners:
-    """How the speed rises at a setpoint of `SPEED`."""
+    """Return how the speed rises with a setpoint of `SPEED`."""
     station.velocity = NORTH
     found: Manners = {}
     for second in (1, 2, 4):
@@ -198,12 +192,13 @@ def driven(station: Station) -> Manners:
 
 
 def cruise(station: Station) -> None:
+    """Fly north until the speed is `SPEED`."""
     station.velocity = NORTH
     station.listen(CRUISE)
 
 
 def braked(station: Station, name: str, seconds: float) -> Manners:
-    """From `SPEED` on: when it slows down, when it stands, and how far it goes."""
+    """Return when the vehicle has slowed down, when it stands, and the way that it took."""
     began, fast = place(station), speed(station)
     slows = station.listen(seconds, lambda: speed(station) < 0.6 * fast)
     stands = slows + station.listen(seconds, lambda: speed(station) < 0.3)
@@ -216,7 +211,7 @@ def braked(station: Station, name: str, seconds: float) -> Manners:
 
 
 def after(station: Station, frame: int, mask: int) -> float:
-    """The speed that odd setpoints lead to, from `SPEED` on."""
+    """Return the speed after 2 s of setpoints in another frame or with another mask, from `SPEED` on."""
     cruise(station)
     ordinary = station.frame
     station.frame, station.mask = frame, mask
@@ -227,16 +222,17 @@ def after(station: Station, frame: int, mask: int) -> float:
 
 
 def switch(station: Station, on: bool) -> str:
+    """Arm or disarm. Returns the answer."""
     return station.command(m.MAV_CMD_COMPONENT_ARM_DISARM, float(on))
 
 
 def to_offboard(station: Station, kind: str) -> str:
-    number = OFFBOARD[kind][0]
-    return station.command(m.MAV_CMD_DO_SET_MODE, 1, number)
+    """Request the mode that follows setpoints. Returns the answer."""
+    return station.command(m.MAV_CMD_DO_SET_MODE, 1, OFFBOARD[kind][0])
 
 
 def take_off(station: Station, kind: str) -> str:
-    """To `HEIGHT`: above home to ArduCopter, above the sea to PX4."""
+    """Take off to `HEIGHT`: ArduCopter counts it from home, PX4 from the sea. Returns the answer."""
     if kind == "ardupilot":
         return station.command(m.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT)
     station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 200_000)
@@ -246,7 +242,7 @@ def take_off(station: Station, kind: str) -> str:
 
 
 def interval(station: Station, name: str, seconds: float = 1.5) -> str:
-    """What is said to the request, and how much then comes."""
+    """Request a message at 20 Hz. Returns the answer, and whether the message then comes."""
     said = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, getattr(m, f"MAVLINK_MSG_ID_{name}"), 50_000)
     if seconds:
         station.heard[name] = 0
@@ -256,13 +252,13 @@ def interval(station: Station, name: str, seconds: float = 1.5) -> str:
 
 
 def place(station: Station) -> tuple[float, float, float]:
-    """NED, m."""
+    """Return the position (NED) [m]."""
     station.listen(1.0, lambda: "LOCAL_POSITION_NED" in station.last)
     at = station.last["LOCAL_POSITION_NED"]
     return at.x, at.y, at.z
 
 
 def speed(station: Station) -> float:
-    """Level, m/s."""
+    """Return the horizontal speed [m/s]."""
     at = station.last["LOCAL_POSITION_NED"]
     return math.hypot(at.vx, at.vy)

@@ -1,9 +1,9 @@
-"""What a step costs each process: a run of one ground robot over five hosts, with keys, the default networks and two
-recorders.
+"""Measure the processor time of each process for a step of one ground robot: five hosts, keys, two recorders.
 
-python -m benchmarks costs
+    python -m benchmarks costs
 
-Processor time does not depend on who else is busy, or little; how fast the robot drives does.
+The networks have their default size. Other load on the machine changes the processor time little; it changes the speed
+of the robot.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.safety_processes import used
 from benchmarks.timing import Figures
 from tests.faults.five_hosts import PATIENCE, TURN, Fleet
 from tests.faults.network_hosts import Hosts
@@ -23,7 +24,7 @@ MEASURED = 500
 
 
 def _until(fleet: Fleet, steps: int) -> None:
-    """Wait for as long as it gets on."""
+    """Wait until the robot has taken so many steps. Raises RuntimeError if it makes no progress."""
     taken, since = fleet.taken("ground"), time.monotonic()
     while taken < steps:
         time.sleep(TURN)
@@ -35,23 +36,23 @@ def _until(fleet: Fleet, steps: int) -> None:
 
 
 def run() -> Figures:
-    """CPU ms a step, and resident MiB at the end. Raises NoHosts."""
+    """Return a row for each process: processor time of a step, and memory at the end. Raises NoHosts."""
     with tempfile.TemporaryDirectory(prefix="costs") as name, Hosts(5) as hosts:
         hosts.join(1, 2)
         with Fleet(Path(name), hosts, learning=("--learner.td3.warmup", 200)) as fleet:
             fleet.start()
             _until(fleet, WARM_UP)
-            processes = {spot.name: psutil.Process(spot.popen.pid) for spot in fleet.spots.values() if spot.popen}
-            before = {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
+            pids = {spot.name: spot.popen.pid for spot in fleet.spots.values() if spot.popen}
+            before = {name: used([pid]) for name, pid in pids.items()}
             steps, began = fleet.taken("ground"), time.monotonic()
             _until(fleet, steps + MEASURED)
             taken, seconds = fleet.taken("ground") - steps, time.monotonic() - began
             figures = {
                 name: {
-                    "CPU ms a step": 1e3 * (sum(process.cpu_times()[:2]) - before[name]) / taken,
-                    "MiB": process.memory_info().rss / 2**20,
+                    "CPU ms a step": 1e3 * (used([pid]) - before[name]) / taken,
+                    "MiB": psutil.Process(pid).memory_info().rss / 2**20,
                 }
-                for name, process in processes.items()
+                for name, pid in pids.items()
             }
             fleet.end()
     return figures | {"the robot": {"steps /s": taken / seconds}}

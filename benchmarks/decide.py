@@ -1,5 +1,4 @@
-"""`decide`, by kind of decision, of the ground robot for every certificate and mode, of the quadrotor, and of both by
-what they see.
+"""Time `decide` by kind of decision: ground robot with every error bound and mode, quadrotor, and both by scan.
 
 The paper's figures are 80.4 and 80.9 ms a step.
 """
@@ -15,38 +14,36 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.error_bounds import KINDS
-from brakeline.safety.model.model_set import MODES
+from brakeline.safety.model.model_set import MODES, ModelSet
 from brakeline.sim.sim_conditions import Conditions, Perception
 
 SCANS = Conditions(perception=Perception("scan"))
 
 
 def run() -> Figures:
-    asked = situations.messages()
-    figures: Figures = {}
+    """Return a row for each filter and kind of decision."""
+    asked, figures = situations.messages(), Figures()
     for certificate in KINDS:
         for mode in MODES:
-            ready = Filter(situations.model(certificate, mode))
-            for kind, seconds in _by_kind(ready, asked).items():
-                figures[f"{certificate} {mode}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
-    for name, robot, conditions in (
+            figures |= _by_kind(f"{certificate} {mode}", situations.model(certificate, mode), asked)
+    for name, kind, conditions in (
         ("quadrotor, residual direct", "quadrotor", None),
         ("ground by scan, residual direct", "ground", SCANS),
         ("quadrotor by scan, residual direct", "quadrotor", SCANS),
     ):
-        of = robot_with_task(robot)
-        asked = situations.messages(robot=of, conditions=conditions)
-        for kind, seconds in _by_kind(Filter(situations.model(robot=of)), asked).items():
-            figures[f"{name}: {kind}"] = milliseconds(seconds) | {"count": len(seconds)}
+        robot = robot_with_task(kind)
+        asked = situations.messages(robot=robot, conditions=conditions)
+        figures |= _by_kind(name, situations.model(robot=robot), asked)
     figures["the paper, a step (its own machine)"] = {"mean ms": 80.41}
     return figures
 
 
-def _by_kind(ready: Filter, asked: list[pb.Request]) -> dict[str, list[float]]:
-    times = defaultdict(list)
+def _by_kind(name: str, model: ModelSet, asked: list[pb.Request]) -> Figures:
+    """Return the times of each kind of decision."""
+    ready, times = Filter(model), defaultdict(list)
     for i, request in enumerate(situations.requests(ready, asked)):
         before = perf_counter()
         kind = ready.decide(request).kind
         if i >= WARM_UP:
             times[kind].append(perf_counter() - before)
-    return dict(sorted(times.items()))
+    return {f"{name}: {kind}": milliseconds(times[kind]) | {"count": len(times[kind])} for kind in sorted(times)}

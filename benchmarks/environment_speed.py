@@ -1,4 +1,4 @@
-"""Steps a second of the environment with each robot; its lidar beside casting the rays one by one."""
+"""Measure the environment with each robot in steps a second, and its lidar beside casting the rays one by one."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ STEPS = 3000
 
 
 def run() -> Figures:
+    """Return a row for each robot, and one for each way to cast its rays."""
     figures: Figures = {}
     for robot in map(robot_with_task, shipped_robots()):
         figures[f"{robot.name}: environment, lidar included"], arena = _steps(robot)
@@ -27,11 +28,9 @@ def run() -> Figures:
 
 
 def _steps(robot: RobotWithTask) -> tuple[dict[str, float], Arena]:
-    """Speed of random driving; the last arena."""
-    env = environment(robot, "default", 0)
-    rng = np.random.default_rng(0)
-    seconds, resets, episode = 0.0, 0.0, 0
-    running = False
+    """Return the speed with random inputs, and the last arena."""
+    env, rng = environment(robot, "default", 0), np.random.default_rng(0)
+    seconds, resets, episode, running = 0.0, 0.0, 0, False
     for _ in range(STEPS):
         if not running:
             before = perf_counter()

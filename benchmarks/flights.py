@@ -1,8 +1,9 @@
-"""Real autopilots among obstacles: their first flight, one behind the filter that came of it, and then policies.
+"""Fly real autopilots among obstacles: a first flight, flights behind the filter that it gives, and then policies.
 
-Needs `$BRAKELINE_ARDUPILOT`, `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one; what is not there is left
-out. In real time: twenty minutes or thirty, and `--minutes` for each policy in each arena. What `--folder` has already
-is not flown again. Collisions and clearances are the autopilot's own simulator's, not the estimate's.
+Needs `$BRAKELINE_ARDUPILOT` and `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one. The benchmark leaves
+out what is missing. In real time: twenty minutes or thirty, and `--minutes` for each policy in each arena. It does not
+repeat flights that `--folder` has. Collisions and clearances come from the autopilot's own simulator, not from the
+estimate.
 """
 
 from __future__ import annotations
@@ -27,17 +28,24 @@ from brakeline.deploy.interpreter import PYTHON
 
 POLICIES, ARENAS = ("astar", "trained", "adversary"), ("default", "dense")
 FIRST, SECOND, THIRD = 15.0, 5.0, 10.0  # minutes
-PRACTICE = "0.15"  # share of steps at which it brakes as planned: what a model set is made of
-BEYOND = 240.0  # s that a command may take beyond its flight: the estimator, the landing, the model set
-# Some minutes of flight state little, and what comes of flying behind that is to be measured.
+PRACTICE = "0.15"  # share of steps at which it practises the planned stop: a model set needs such steps
+BEYOND = 240.0  # s that a command may take besides its flight: estimator, landing, model set
+# A few minutes of flight give a loose bound. The benchmark measures flights behind it all the same.
 ACCEPTING = ("--accept-bound", "1")
 TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
 
 @dataclass(frozen=True)
 class Setup:
-    """kind: of autopilot; parameters: what their owner would set; words: for `collect` and `fly`; cameras: it flies
-    under motion capture; further: its last model set is of a third flight, long enough for envelopes as they are."""
+    """An autopilot as its owner would set it up.
+
+    Attributes:
+        kind: of autopilot.
+        parameters: of the autopilot.
+        words: options of `collect` and `fly`.
+        cameras: it flies under motion capture.
+        further: its last model set is of a third flight, long enough without `--few`.
+    """
 
     kind: str
     parameters: Mapping[str, float]
@@ -46,13 +54,12 @@ class Setup:
     further: bool = False
 
 
-# ArduCopter 4.0 leads a position along with the velocity that it was given, and catches up with it by flying faster
-# than asked: with less than this of it, it creeps after a stop, with more it overshoots. Upright it is quicker. Led to
-# places, it has nothing to catch up with, and may be as stiff as it can.
+# ArduCopter 4.0 moves a target position along with the requested velocity, and flies faster than requested to catch up
+# with it. With lower gains it creeps after a stop, with higher ones it overshoots. With position targets (`--lead`) it
+# has nothing to catch up with, so the gains can be high.
 CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 1.0, "PSC_VELZ_P": 8.0}
 STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
-# PX4's SIH has an accelerometer, a gyro and a barometer of other noise than its estimator takes them for, and a GPS
-# without delay.
+# The sensors of PX4's SIH have other noise than its estimator assumes, and its GPS has no delay.
 HEARD = {
     "COM_OF_LOSS_T": 0.5,
     "EKF2_GPS_DELAY": 0.0,
@@ -61,10 +68,10 @@ HEARD = {
     "EKF2_HGT_REF": 0,
     "EKF2_BARO_NOISE": 0.3,
 }
-# Who flies as fast as that must be quick to hold its place when setpoints stop.
+# A vehicle that flies so fast must hold its place soon when setpoints stop.
 ALERT = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
 OUTDOORS, HEARING = "ardupilot", "px4"
-# Who is led is at rest at the last place before it does anything else.
+# With position targets the vehicle is at rest at the last target before it does anything else.
 PATIENT = {**ALERT, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 INDOORS_LED = "px4 with motion capture, led to places"
@@ -82,7 +89,7 @@ class Failed(RuntimeError):
 
 
 def run(minutes: float, folder: Path) -> Words:
-    """Rows: flights; columns: what they came to."""
+    """Return a row for each flight, with its outcome."""
     rows: Words = {}
     for name, setup in SETUPS.items():
         try:
@@ -113,13 +120,18 @@ def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, flo
 def _certified(flights: Flights, name: str, *words: str) -> dict[str, float | str]:
     try:
         return certified(flights.certify(name, flights.data, *words))
-    except Failed as error:  # too few windows: what follows is behind the model set of before
+    except Failed as error:  # too few windows: the next flights use the model set of before
         return {"failed": str(error)}
 
 
 @dataclass(frozen=True)
 class Upset:
-    """Other parameters than its setup's; or from a moment of the command on, s, and others from another one on."""
+    """Parameters that differ from those of the setup.
+
+    Attributes:
+        begins, ends: times after the start of the command, s. The autopilot has `parameters` from `begins` on, and
+            `afterwards` from `ends` on. With ends = 0 it has `parameters` from the start.
+    """
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     begins: float = 0.0
@@ -128,7 +140,7 @@ class Upset:
 
 
 class Flights:
-    """In one setup, each from switching on; its data, logs and figures are kept in a folder."""
+    """Flights in one setup, each with a new start of the autopilot. Data, logs and figures stay in a folder."""
 
     def __init__(self, setup: str, start: Path, folder: Path) -> None:
         self._name, self._setup, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
@@ -136,98 +148,79 @@ class Flights:
 
     @classmethod
     def beside(cls, other: Flights, name: str) -> Flights:
-        """Of the same autopilot, with data and flights of their own in a folder of the other's."""
+        """Return flights of the same autopilot with data of their own, in a folder of the other's."""
         return cls(other._name, other._start, other._folder / f"{name}-own")
 
     def first(self) -> dict[str, Any]:
+        """Record the first data set and make its model set."""
         return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
 
     def second(self) -> dict[str, Any]:
-        """Behind the model set of the first, which a new one is to be made of."""
+        """Fly behind the model set of the first flight, to make a new one."""
         return self.upset("second", SECOND, Upset(), "--practice", PRACTICE)
 
     def third(self) -> dict[str, Any]:
-        """Behind the model set of the second, and as long as it takes to do without `--few`."""
+        """Fly behind the model set of the second flight, long enough to certify without `--few`."""
         return self.upset("third", THIRD, Upset(), "--practice", PRACTICE)
 
     def certify(self, name: str, data: Path, *words: str) -> dict[str, Any]:
-        """The model set of a flight's log, from then on in use in that folder; {"refused": …}: there is none."""
-        kept = self._folder / f"{name}-certified.json"
-        if not kept.exists():
+        """Put the model set of a flight's log to use in a data folder. Returns its validation, or {"refused": …}."""
+        path = self._folder / f"{name}-certified.json"
+        if not path.exists():
             command = ["certify", str(self.run(name)), "--robot", "quadrotor-late", *words, "--use", *ACCEPTING]
-            kept.write_text(told([*command, "--certificates", "residual", "--mode", "direct", "--json"], data, BEYOND))
-        figures: dict[str, Any] = json.loads(kept.read_text())["residual"]["direct"]
+            path.write_text(told([*command, "--certificates", "residual", "--mode", "direct", "--json"], data, BEYOND))
+        figures: dict[str, Any] = json.loads(path.read_text())["residual"]["direct"]
         return figures
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
+        """Fly a policy in an arena."""
         return self.upset(f"{policy}-{arena}", minutes, Upset(), "--policy", policy, "--arena", arena)
 
     def pair(self, minutes: float) -> dict[str, Any]:
-        """Two of them in one run, which ask one service."""
-        return self._kept("pair", minutes, partial(self._both, minutes))
+        """Fly two vehicles in one run, which share a safety service."""
+        return self._figures("pair", minutes, "fly", "--minutes", str(minutes), *self._out("pair"), vehicles=2)
 
     def upset(self, name: str, minutes: float, upset: Upset, *words: str) -> dict[str, Any]:
-        out = ("--at-start", "--pictures", "0", "--out", str(self.run(name)))
-        return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *out, upset=upset)
+        """Fly with changed parameters."""
+        return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *self._out(name), upset=upset)
+
+    def _out(self, name: str) -> tuple[str, ...]:
+        return "--at-start", "--pictures", "0", "--out", str(self.run(name))
 
     def run(self, name: str) -> Path:
-        """The folder of a flight."""
+        """Return the folder of a flight."""
         return self._folder / name
 
-    def _figures(self, name: str, minutes: float, *words: str, upset: Upset = Upset()) -> dict[str, Any]:
-        """Of a command, or of the time when it was run. Raises Failed, NoAutopilot."""
-        return self._kept(name, minutes, partial(self._flown, minutes, words, upset))
-
-    def _kept(self, name: str, minutes: float, fly: Callable[[], str]) -> dict[str, Any]:
-        kept = self._folder / f"{name}.json"
-        if not kept.exists():
+    def _figures(
+        self, name: str, minutes: float, *words: str, upset: Upset = Upset(), vehicles: int = 1
+    ) -> dict[str, Any]:
+        """Return the figures of a command, now or of an earlier run. Raises Failed, NoAutopilot."""
+        path = self._folder / f"{name}.json"
+        if not path.exists():
             print(f"{self._name}: {name}, {minutes:g} minutes", file=sys.stderr)
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(fly())
-        figures: dict[str, Any] = json.loads(kept.read_text())
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(self._flown(minutes, words, upset, vehicles))
+        figures: dict[str, Any] = json.loads(path.read_text())
         return figures
 
-    def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset) -> str:
+    def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset, vehicles: int) -> str:
         with ExitStack() as stack:
-            url, system = self._switched_on(stack, {} if upset.ends else upset.parameters)
-            stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, system, url), system))
-            command = [
-                *words,
-                *ACCEPTING,
-                *self._setup.words,
-                "--url",
-                url,
-                "--system",
-                str(system),
-                "--raise-limits",
-                "--json",
-            ]
-            return told(command, self.data, 60.0 * minutes + BEYOND)
-
-    def _both(self, minutes: float) -> str:
-        with ExitStack() as stack:
-            urls, systems = zip(*(self._switched_on(stack, {}) for _ in range(2)), strict=True)
-            command = ["fly", "--minutes", str(minutes), "--url", *urls, "--systems", *map(str, systems)]
-            command += [
-                *ACCEPTING,
-                *self._setup.words,
-                "--at-start",
-                "--pictures",
-                "0",
-                "--out",
-                str(self.run("pair")),
-                "--raise-limits",
-                "--json",
-            ]
+            parameters = {} if upset.ends else upset.parameters
+            urls, systems = zip(*(self._switched_on(stack, parameters) for _ in range(vehicles)), strict=True)
+            stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0]))
+            option = "--system" if vehicles == 1 else "--systems"
+            where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
+            command = [*words, *ACCEPTING, *self._setup.words, *where]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
-        """One more of them until the stack ends: (the URL for us, its system id)."""
+        """Start an autopilot until the stack ends. Returns its URL and its system id."""
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         return stack.enter_context(switched_on(self._setup, self._start, folder, parameters))
 
     @contextmanager
     def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:
+        """Change the parameters at the times of the upset, until the end of the block."""
         over = threading.Event()
 
         def change() -> None:
@@ -251,7 +244,7 @@ class Flights:
 def switched_on(
     setup: Setup, start: Path, folder: Path, parameters: Mapping[str, float] = MappingProxyType({})
 ) -> Iterator[tuple[str, int]]:
-    """One of that setup with other parameters besides, which runs in a folder: (the URL for us, its system id)."""
+    """Start an autopilot of a setup in a folder, with further parameters. Yields its URL and its system id."""
     with ExitStack() as stack:
         lasting = {**setup.parameters, **parameters}
         url, system = stack.enter_context(sitl.flying(setup.kind, start, folder, lasting))
@@ -261,16 +254,10 @@ def switched_on(
 
 
 def told(words: list[str], data: Path, seconds: float) -> str:
-    """The last line of a command of ours, which works in that folder of data sets. Raises Failed."""
+    """Return the last line that a command of ours prints; data: its folder of data sets. Raises Failed."""
     environment = os.environ | {"BRAKELINE_DATA": str(data)}
-    done = subprocess.run(
-        [*PYTHON, "-m", "brakeline.deploy.cli", *words],
-        check=False,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=environment,
-        timeout=seconds,
-    )
+    command, environment = [*PYTHON, "-m", "brakeline.deploy.cli", *words], os.environ | {"BRAKELINE_DATA": str(data)}
+    done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment, timeout=seconds)
     if not (lines := done.stdout.splitlines()):
         raise Failed(f"{' '.join(words)}: no figures, status {done.returncode}")
     return lines[-1]
@@ -282,13 +269,13 @@ def _learned(first: dict[str, Any]) -> dict[str, float | str]:
 
 
 def certified(figures: dict[str, Any]) -> dict[str, float | str]:
-    """What a statement says."""
+    """Return the figures of a validation."""
     wanted = ["windows", "violations", "bound_plan", "bound_step", "half_width_rest", "half_width_full", "refused"]
     return {name: figures[name] for name in wanted if name in figures}
 
 
 def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
-    """What a flight came to; it may not have taken off, for want of room to hover."""
+    """Return the outcome of a flight, or that it failed: without room to hover it does not take off."""
     try:
         figures = fly()
     except Failed as error:
@@ -300,17 +287,19 @@ def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     row |= {"outside": f"{contained['violations']} of {contained['steps']}"}
     if plans := figures.get("plans"):
         row |= {"stops outside": f"{plans['outside']} of {plans['flown']}"}
-    row |= {name: flight[name] for name in TRUE if name in flight}
+    return row | _own(flight)
+
+
+def _own(flight: dict[str, Any]) -> dict[str, float | str]:
+    """Return the figures of one vehicle."""
+    row: dict[str, float | str] = {name: flight[name] for name in TRUE if name in flight}
     return row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
 
 
 def two(fly: Callable[[], dict[str, Any]]) -> Words:
-    """A row for both, and one for what is each one's own."""
+    """Return a row for both vehicles together, and one for each of them."""
     whole = flown(fly)
     if "failed" in whole:
         return {"two at once": whole}
-    rows: Words = {"two at once": {name: value for name, value in whole.items() if name not in (*TRUE, "in time")}}
-    for actor, flight in fly()["flights"].items():
-        row: dict[str, float | str] = {name: flight[name] for name in TRUE if name in flight}
-        rows[f"two at once, {actor}"] = row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
-    return rows
+    both = {name: value for name, value in whole.items() if name not in (*TRUE, "in time")}
+    return {"two at once": both} | {f"two at once, {actor}": _own(flight) for actor, flight in fly()["flights"].items()}

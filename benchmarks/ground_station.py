@@ -1,4 +1,4 @@
-"""A ground station for comparisons: sends what it is told to, and keeps what it hears. It judges nothing."""
+"""A ground station for comparisons. It sends what its caller wants, and keeps what it receives, without a check."""
 
 from __future__ import annotations
 
@@ -11,16 +11,23 @@ from brakeline.messaging.byte_links import Link
 from brakeline.sim.autopilot.common_dialect import mavlink
 
 OURSELVES = 254  # system id
-STEP = 0.02  # s between two looks
+STEP = 0.02  # s between two reads of the link
 STREAM = 0.05  # s between two setpoints
-PATIENCE = 3.0  # s for an answer
-VELOCITY_ONLY = 0b0000_1101_1100_0111  # type mask: position, acceleration, yaw and its rate are to be ignored
+PATIENCE = 3.0  # s, longest wait for an answer
+VELOCITY_ONLY = 0b0000_1101_1100_0111  # type mask: ignore position, acceleration, yaw and its rate
 RESULTS = {value: name.removeprefix("MAV_RESULT_").lower().replace("_", " ") for name, value in vars(mavlink).items()
            if name.startswith("MAV_RESULT_") and isinstance(value, int)}  # fmt: skip
 
 
 class Station:
-    """Talks to one vehicle. `last` holds the newest message of each type, `heard` how many there were of each."""
+    """Talks to one vehicle.
+
+    Attributes:
+        last: the newest message of each type.
+        heard: the number of messages of each type.
+        velocity: setpoint that the station streams [m/s, NED]; None: it streams none.
+        frame, mask: coordinate frame and type mask of the setpoints.
+    """
 
     def __init__(self, link: Link, system: int) -> None:
         self._link, self.system = link, system
@@ -28,16 +35,16 @@ class Station:
         self._mav.robust_parsing = True
         self.last: dict[str, Any] = {}
         self.heard: Counter[str] = Counter()
-        self.velocity: tuple[float, float, float] | None = None  # m/s NED, streamed while it is not None
+        self.velocity: tuple[float, float, float] | None = None
         self.frame, self.mask = int(mavlink.MAV_FRAME_LOCAL_NED), VELOCITY_ONLY
         self._beaten = self._streamed = -1.0
 
     def write(self, data: bytes) -> None:
-        """For pymavlink."""
+        """Send bytes; pymavlink calls this."""
         self._link.send(bytes(data))
 
     def listen(self, seconds: float, until: Callable[[], object] = lambda: False) -> float:
-        """Hear, and stream what is to be streamed; returns how long [s] it took until `until` held."""
+        """Receive and stream setpoints for `seconds`, or until `until` holds. Returns the time that passed [s]."""
         started = time.monotonic()
         while (passed := time.monotonic() - started) < seconds:
             self._speak(time.monotonic())
@@ -51,7 +58,7 @@ class Station:
         return passed
 
     def command(self, number: int, *params: float) -> str:
-        """COMMAND_LONG; its result in words, "silence" if there is none."""
+        """Send COMMAND_LONG. Returns its result in words; "silence" if there is none."""
         self.last.pop("COMMAND_ACK", None)
         self._mav.command_long_send(self.system, 1, number, 0, *params, *[0.0] * (7 - len(params)))
 
@@ -64,12 +71,13 @@ class Station:
 
     @property
     def armed(self) -> bool:
+        """Whether the last heartbeat says that the vehicle is armed."""
         beat = self.last.get("HEARTBEAT")
         return beat is not None and bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
     @property
     def mode(self) -> int:
-        """As its heartbeat says."""
+        """The custom mode of the last heartbeat."""
         return int(self.last["HEARTBEAT"].custom_mode)
 
     def _speak(self, now: float) -> None:

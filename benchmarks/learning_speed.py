@@ -1,4 +1,4 @@
-"""TD3 updates a second, beside the same written with torch.nn and torch.optim; the actor's forward pass."""
+"""Measure TD3 updates a second beside the same with torch.nn and torch.optim, and the forward pass of the policy."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ UPDATES = 100
 
 
 def network(inputs: int, outputs: int) -> nn.Sequential:
+    """Return a network with two hidden layers."""
     return nn.Sequential(nn.Linear(inputs, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, outputs))
 
 
 class Plain:
-    """The textbook's TD3: what `brakeline.learner.td3` is measured against."""
+    """TD3 as in a textbook, the peer of `brakeline.learner.td3`."""
 
     def __init__(self, config: TD3Config, observations: int, actions: int) -> None:
         self.config, self.updates = config, 0
@@ -35,6 +36,7 @@ class Plain:
         self.critic_optimiser = torch.optim.Adam(self.critics.parameters(), config.critic_rate)
 
     def update(self, s: torch.Tensor, a: torch.Tensor, r: torch.Tensor, n: torch.Tensor) -> None:
+        """Learn from a batch of observations, actions, rewards (B, 1) and next observations."""
         c, (actor, critics) = self.config, self.targets
         with torch.no_grad():
             noise = (torch.randn_like(a) * c.target_noise).clamp(-c.target_noise_clip, c.target_noise_clip)
@@ -50,16 +52,14 @@ class Plain:
             self.actor_optimiser.zero_grad()
             gain.backward()
             self.actor_optimiser.step()
-            self._follow()
-
-    def _follow(self) -> None:
-        with torch.no_grad():
-            for target, source in zip(self.targets, (self.actor, self.critics), strict=True):
-                for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
-                    slow.lerp_(fast, self.config.tau)
+            with torch.no_grad():
+                for target, source in zip(self.targets, (self.actor, self.critics), strict=True):
+                    for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
+                        slow.lerp_(fast, self.config.tau)
 
 
 def run() -> Figures:
+    """Return a row for each implementation and batch size."""
     torch.set_num_threads(1)
     robot = robot_with_task("ground")
     observations, actions = robot.task.observation_dim, robot.action_dim

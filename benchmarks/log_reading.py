@@ -1,7 +1,7 @@
-"""Reading logs: all figures of a log of 200 MB (of 2 GB when asked), beside the `mcap` package that only decodes them.
+"""Measure the figures of a log of 200 MB (or 2 GB) beside the `mcap` package, which only decodes the messages.
 
-The log is made of real messages, over and over with new numbers; each measurement is a process of its own, so that its
-peak memory is its own. `python -m benchmarks logs-2gb` needs 2.5 GB in the temporary folder, and some minutes.
+The log repeats real messages with new numbers. Each measurement is a process of its own, which has a peak memory of its
+own. `python -m benchmarks logs-2gb` needs 2.5 GB in the temporary folder, and some minutes.
 """
 
 from __future__ import annotations
@@ -36,37 +36,28 @@ PERIOD = 2_000_000  # ns between messages: some 250 steps a second
 
 
 def real() -> list[tuple[str, Any]]:
-    """Keys and messages of some episodes, driven in process (what it takes is not loaded where memory is measured)."""
-    import numpy as np
-
-    from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-    from brakeline.deploy.data.model_store import model_for
-    from brakeline.deploy.experiments.evaluate import in_process
-    from brakeline.deploy.vehicle_factory import environment
+    """Return the keys and messages of some episodes, driven in this process."""
+    from benchmarks.situations import driven  # here, so that it takes no memory where memory is measured
     from brakeline.messaging.task import robot_with_task
-    from brakeline.safety.model.model_set import ModelConfig
-    from brakeline.sim.scripted_policies import scripted
 
-    ground = robot_with_task("ground")
-    ask = in_process(model_for(ground, ModelConfig()))
-    driver = EpisodeRunner(ground, environment(ground, "default", 7), ActorIdentity("actor-0", 0, 7))
-    policy = scripted("greedy", ground, np.random.default_rng(7))
-    found: list[tuple[str, Any]] = []
-    for number in range(EPISODES):
-        found.append(("episode/ground/actor-0", driver.begin(number)))
-        while driver.running:
-            proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-            outcome = driver.decide(proposal, ask)
-            assert outcome is not None
-            found.append(("exchange/ground/actor-0", outcome.exchange(driver.info["time"])))
-            found.append(("step/ground/actor-0", driver.execute(proposal, outcome)))
-        found.append(("health/actor-0", pb.Health(process="actor-0", figures={"steps_per_s": 100.0, "steps": number})))
-        found.append(("metrics/ground", pb.LearnerMetrics(robot="ground", steps=number, weights_version=number)))
-    return found
+    messages: list[tuple[str, Any]] = []
+    for episode, outcome, step in driven("greedy", 7, robot_with_task("ground")):
+        if step.episode == EPISODES:
+            break
+        if episode is not None:
+            messages.append(("episode/ground/actor-0", episode))
+        messages.append(("exchange/ground/actor-0", outcome.exchange(step.header.time)))
+        messages.append(("step/ground/actor-0", step))
+        if step.terminated or step.truncated:
+            figures = {"steps_per_s": 100.0, "steps": step.episode}
+            messages.append(("health/actor-0", pb.Health(process="actor-0", figures=figures)))
+            metrics = pb.LearnerMetrics(robot="ground", steps=step.episode, weights_version=step.episode)
+            messages.append(("metrics/ground", metrics))
+    return messages
 
 
 def endless(messages: list[tuple[str, Any]]) -> Iterator[Entry]:
-    """The messages over and over, numbered and dated as if they had been published one after the other."""
+    """Yield the messages again and again, with the numbers and times of a publisher."""
     numbers: dict[str, int] = {}
     now, rounds = 1_700_000_000 * 10**9, 0
     while True:
@@ -84,7 +75,7 @@ def endless(messages: list[tuple[str, Any]]) -> Iterator[Entry]:
 
 
 def synthesise(path: Path, size: int) -> int:
-    """Write a log of that many bytes; returns how many messages it has."""
+    """Write a log of `size` bytes. Returns the number of its messages."""
     segment, entries, count = open_segment(path, {}), endless(real()), 0
     while segment.size < size:
         segment.save(islice(entries, PORTION))
@@ -94,7 +85,7 @@ def synthesise(path: Path, size: int) -> int:
 
 
 def measured(what: str, path: Path) -> dict[str, float]:
-    """In a process of its own: messages a second, and the peak of its memory."""
+    """Measure one way to read a log in a process of its own: messages a second, and peak memory."""
     words = [*PYTHON, "-m", "benchmarks.log_reading", what, str(path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}  # nothing installs the benchmarks
     run = subprocess.run(words, check=True, capture_output=True, text=True, env=environment)
@@ -103,18 +94,20 @@ def measured(what: str, path: Path) -> dict[str, float]:
 
 
 def ours(path: Path, pictures: bool) -> int:
+    """Compute all figures of a log, and what the report draws. Returns the number of messages."""
     figures = analyse_runs(path, AnalysisOptions(pictures)).figures()
     return int(sum(segment["messages"] for segment in figures["segments"]))
 
 
 def peer(path: Path) -> int:
-    """The first messages, decoded by the `mcap` package."""
+    """Decode the first messages with the `mcap` package. Returns their number."""
     with path.open("rb") as file:
         reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
         return sum(1 for _ in islice(reader.iter_decoded_messages(log_time_order=False), PEER))
 
 
 def of_size(size: int) -> Figures:
+    """Return a row for each way to read a log of `size` bytes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         synthesise(path, size)
@@ -127,15 +120,17 @@ def of_size(size: int) -> Figures:
 
 
 def run() -> Figures:
+    """Return the rows of a small log."""
     return of_size(SMALL)
 
 
 def run_large() -> Figures:
+    """Return the rows of a small and of a large log."""
     return of_size(SMALL) | of_size(LARGE)
 
 
 def main() -> None:
-    """One measurement, as JSON on stdout."""
+    """Make one measurement, and print it as JSON."""
     what, path = sys.argv[1], Path(sys.argv[2])
     wall, cpu = time.perf_counter(), time.process_time()
     count = peer(path) if what == "mcap" else ours(path, pictures=what == "report")
@@ -144,7 +139,7 @@ def main() -> None:
 
 
 def peak() -> float:
-    """The most memory that this process had, in MiB (getrusage would count the process that started it too)."""
+    """Return the peak memory of this process in MiB. (getrusage would include the process that started it.)"""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 

@@ -1,4 +1,4 @@
-"""A motion capture system: tells a PX4 with its own simulator where it is, and how fast, as cameras would."""
+"""A motion capture system: sends position and velocity to a PX4 with its own simulator, as cameras would."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.repeated import repeated
+from benchmarks.timing import repeated
 from brakeline.messaging.byte_links import Link, open_link
 from brakeline.sim.autopilot.common_dialect import mavlink
 
 OURSELVES = 250  # system id
-EVERY = 0.02  # s between two pictures
-LOOKS = 0.002  # s between two looks at what has come
-ERROR, SPEED_ERROR = 0.01, 0.02  # m, m/s: σ an axis; what the simulator tells is rounded to 1 cm, cm/s besides
+EVERY = 0.02  # s between two measurements
+LOOKS = 0.002  # s between two reads of the link
+ERROR, SPEED_ERROR = 0.01, 0.02  # m, m/s: σ of each axis; the simulator rounds to 1 cm and 1 cm/s besides
 UNKNOWN = [math.nan, *[0.0] * 20]  # a covariance
-DEGREE = math.radians(1.0) * 6_371_000.0  # m of latitude, as that simulator has it
+DEGREE = math.radians(1.0) * 6_371_000.0  # m of a degree of latitude in that simulator
 
-# What its estimator is to make of it: position and velocity from here, none from GPS. And what its controller can, that
-# is told velocities so good: as delivered it comes to 2.4 m/s of 3, and takes 3 s to a stop.
+# The estimator takes position and velocity from the cameras, none from GPS. With velocities so good the controller can
+# be stiffer: as delivered it reaches 2.4 m/s of 3, and takes 3 s to a stop.
 PARAMETERS = {
     "MPC_XY_VEL_P_ACC": 4.0,
     "MPC_XY_VEL_I_ACC": 2.0,
@@ -37,7 +37,7 @@ PARAMETERS = {
 
 @contextmanager
 def captured(url: str, system: int, seed: int = 0) -> Iterator[None]:
-    """Meanwhile it is told, at an address that nobody else talks to it at."""
+    """Send measurements until the end of the block. url: an address that nobody else uses."""
     link = open_link(url)
     try:
         with repeated(_Cameras(link, system, seed).look, LOOKS):
@@ -53,15 +53,15 @@ class _Cameras:
             self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
         )
         self._mav.robust_parsing = True
-        self._home: Any = None  # the first place that it told
+        self._home: Any = None  # the first position that it sent
         self._flies, self._beaten = False, -math.inf
 
     def write(self, data: bytes) -> None:
-        """For pymavlink."""
+        """Send bytes; pymavlink calls this."""
         self._link.send(bytes(data))
 
     def look(self) -> None:
-        """Answer every place that it tells with what is seen of it."""
+        """Answer each true position with a measurement."""
         if time.monotonic() - self._beaten > 1.0:
             self._beaten = time.monotonic()
             self._mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
@@ -77,7 +77,7 @@ class _Cameras:
 
 
 def _introduce(mav: Any, system: int, home: Any) -> None:
-    """Ask for what is needed, and say where on Earth the hall is."""
+    """Request the true positions, and send the place of the hall on Earth."""
     if home is None:
         what = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION
         mav.command_long_send(system, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, what, 1e6 * EVERY, *[0.0] * 5)
@@ -88,14 +88,14 @@ def _introduce(mav: Any, system: int, home: Any) -> None:
 def _tell(mav: Any, message: Any, home: Any, rng: np.random.Generator) -> None:
     place = _place(message, home) + ERROR * rng.normal(size=3)
     velocity = 0.01 * np.array([message.vx, message.vy, message.vz]) + SPEED_ERROR * rng.normal(size=3)
-    ned, whose = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_ESTIMATOR_TYPE_VISION  # as MOCAP it would be logged alone
+    ned, whose = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_ESTIMATOR_TYPE_VISION  # PX4 only logs MOCAP
     turn = list(message.attitude_quaternion)
     rates = message.rollspeed, message.pitchspeed, message.yawspeed
     mav.odometry_send(message.time_usec, ned, ned, *place, turn, *velocity, *rates, UNKNOWN, UNKNOWN, 0, whose, 100)
 
 
 def _place(message: Any, home: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """North, east, down from there, m."""
+    """Return north, east, down from home, m."""
     narrow = math.cos(math.radians(1e-7 * home.lat))
     north, east = 1e-7 * DEGREE * (message.lat - home.lat), 1e-7 * DEGREE * narrow * (message.lon - home.lon)
     return np.array([north, east, -1e-3 * (message.alt - home.alt)])

@@ -1,14 +1,15 @@
-"""What free space costs by where it comes from: size on the wire and time, for a map, a scan, things that move,
-fleets, and in the air. A period's question of a fleet is one message with a request for each of its robots.
+"""Measure the cost of each source of free space: size of the messages, and time, on the ground and in the air.
 
-Times by kind are those in `decide`, by the clock; `answer` is a request's share of its question's processor time,
-decoding and encoding included, which other work on the machine changes less.
+A fleet asks once a period, in one message with a request for each robot. The times by kind of decision are those of
+`decide`, by the clock. `answer` is the processor time of a request with decoding and encoding, which other load on the
+machine changes less.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import islice
 from time import process_time
 
@@ -17,8 +18,8 @@ import numpy as np
 from benchmarks.decide import SCANS
 from benchmarks.timing import WARM_UP, Figures
 from brakeline.actors.decision_guard import Ask
-from brakeline.actors.episode_runner import run_episode
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, prepare_evaluation, prepare_fleet
+from brakeline.actors.episode_runner import RobotGroup, run_episode
+from brakeline.deploy.experiments.evaluate import Evaluation, prepare_evaluation, prepare_fleet
 from brakeline.logs.episode_stats import KINDS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -38,11 +39,11 @@ SITUATIONS = {
     "air, scan": ("quadrotor", Evaluation(conditions=SCANS)),
     "air, scan, dense": ("quadrotor", Evaluation(arena="dense", conditions=SCANS)),
 }
-POLICIES = ("trained", "random")  # most of the one's inputs are allowed, half of the other's are not
+POLICIES = ("trained", "random")  # the filter allows most inputs of the first, and half of those of the second
 
 
 class Weighed:
-    """Asks, and notes what each request and reply weighs, and how long each kind of decision took [ms]."""
+    """Asks, and notes the size of each message [B] and the time of each kind of decision [ms]."""
 
     def __init__(self, question: Ask) -> None:
         self._question = question
@@ -61,6 +62,7 @@ class Weighed:
 
 
 def run(steps: int = STEPS) -> Figures:
+    """Return a row for each source of free space."""
     return {name: _weighed(robot_with_task(robot), what, steps) for name, (robot, what) in SITUATIONS.items()}
 
 
@@ -68,17 +70,15 @@ def _weighed(robot: RobotWithTask, what: Evaluation, steps: int) -> dict[str, fl
     sizes: dict[str, list[int]] = defaultdict(list)
     times: dict[str, list[float]] = defaultdict(list)
     for policy in POLICIES:
-        asked = Evaluation(policy, arena=what.arena, conditions=what.conditions, fleet=what.fleet)
+        asked = replace(what, policy=policy)
         if what.fleet:
-            fleet, _, policies, question = prepare_fleet(robot, asked)
-            assert question is not None
-            weighed = Weighed(question)
-            taken = (1 for k in range(steps) for _ in run_episode(fleet, policies, weighed, k))
+            group, _, policies, question = prepare_fleet(robot, asked)
         else:
             driver, choose, question = prepare_evaluation(robot, asked)
-            assert question is not None
-            weighed = Weighed(question)
-            taken = (1 for k in range(steps) for _ in episode(driver, choose, weighed, k))
+            group, policies = RobotGroup([driver]), [choose]
+        assert question is not None
+        weighed = Weighed(question)
+        taken = (1 for k in range(steps) for _ in run_episode(group, policies, weighed, k))
         sum(islice(taken, steps // max(1, what.fleet)))
         for name, values in weighed.sizes.items():
             sizes[name] += values

@@ -1,6 +1,6 @@
-"""What a log costs: training with a recorder and without one, in pairs, each first in turn.
+"""Measure the cost of a log: training with and without a recorder, in pairs, each of them first in turn.
 
-On a machine that others use too, the rates say more of them; the recorder's share of the run's processor time does not.
+Other load on the machine changes the rates. It changes the recorder's share of the processor time less.
 """
 
 from __future__ import annotations
@@ -23,23 +23,14 @@ LOOK = 0.5  # s between two looks at the processes
 
 
 def training(out: Path, record: bool) -> tuple[float, float]:
-    """Steps a second of a run, from its first step to its last, and the recorder's share of its processor time then."""
-    words = [
-        *PYTHON,
-        "-m",
-        "brakeline.deploy.cli",
-        "train",
-        "ground",
-        "--steps",
-        str(STEPS),
-        "--json",
-        "--out",
-        str(out),
-    ]
-    run = subprocess.Popen(
-        [*words, "--record" if record else "--no-record"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    )
-    looks = []
+    """Train, and return the steps a second and the recorder's share of the processor time.
+
+    Raises:
+        RuntimeError: the run took too few steps.
+    """
+    words = ["train", "ground", "--steps", str(STEPS), "--json", "--out", str(out)]
+    command = [*PYTHON, "-m", "brakeline.deploy.cli", *words, "--record" if record else "--no-record"]
+    run, looks = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL), []
     while run.poll() is None:
         looks.append(processor_time(run.pid, out))
         time.sleep(LOOK)
@@ -51,7 +42,7 @@ def training(out: Path, record: bool) -> tuple[float, float]:
 
 
 def processor_time(launcher: int, out: Path) -> dict[str, float]:
-    """Seconds of each living process of a run, by name."""
+    """Return the processor time of each living process of a run [s], by name."""
     found = {}
     for process in psutil.process_iter(["cmdline"]):
         words = process.info["cmdline"] or []
@@ -66,7 +57,7 @@ def processor_time(launcher: int, out: Path) -> dict[str, float]:
 
 
 def _share(looks: list[dict[str, float]]) -> float:
-    """Of the recorder, between two looks at which all processes lived and had started: a third of the way, and last."""
+    """Return the recorder's share from a third of the looks at all processes to the last of these looks."""
     most = max(map(len, looks))
     whole = [look for look in looks if len(look) == most]
     first, last = whole[len(whole) // 3], whole[-1]
@@ -75,6 +66,7 @@ def _share(looks: list[dict[str, float]]) -> float:
 
 
 def run() -> Figures:
+    """Return the rates with and without a recorder, and the cost of the recording."""
     pairs, shares = [], []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(PAIRS):
@@ -85,15 +77,10 @@ def run() -> Figures:
             pairs.append((found[True], found[False]))
     recorded, bare = np.array(pairs).T
     cost = 100.0 * (1.0 - recorded / bare)
+    share = {"% of the run's processor time": 100 * float(np.mean(shares))}
+    spread = {"%, mean": float(cost.mean()), "%, least": float(cost.min()), "%, most": float(cost.max())}
     return {
-        "with a recorder": {
-            "steps/s": float(recorded.mean()),
-            "% of the run's processor time": 100 * float(np.mean(shares)),
-        },
+        "with a recorder": {"steps/s": float(recorded.mean())} | share,
         "without": {"steps/s": float(bare.mean())},
-        "cost of recording": {
-            "%, mean": float(cost.mean()),
-            "%, least": float(cost.min()),
-            "%, most": float(cost.max()),
-        },
+        "cost of recording": spread,
     }

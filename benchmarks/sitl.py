@@ -1,4 +1,4 @@
-"""Real autopilots with their own physics, where there are any: a folder whose `sitl FOLDER INSTANCE` runs one."""
+"""Run real autopilots with their own physics: programs `sitl FOLDER INSTANCE` in folders that variables name."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from brakeline.messaging.byte_links import open_link
 KINDS = ("ardupilot", "px4")
 INSTANCES = range(1, 10)  # PX4 has no more ports
 STARTS_IN = 30.0  # s
-SAVED_IN = 4.0  # s until parameters that were set are in a file
+SAVED_IN = 4.0  # s until the autopilot has saved its parameters
 LISTENS = "0A"  # a socket's state in /proc/net/tcp
-# ArduCopter ends with its parent, and takes one of another user for gone: this one waits for it.
+# ArduCopter ends with its parent, and takes a parent of another user for gone. This program is a parent that waits.
 KEEPER = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[1:]))"
 
 
 class NoAutopilot(RuntimeError):
-    """There is none, or it did not start."""
+    """There is no such autopilot, or it did not start."""
 
 
 def variable(kind: str) -> str:
-    """Of the environment: the folder with `sitl` in it."""
+    """Return the environment variable with the folder of `sitl`."""
     return f"BRAKELINE_{kind.upper()}"
 
 
 def program(kind: str, default: Path | None = None) -> Path:
-    """What starts it. Raises NoAutopilot, naming the variable."""
+    """Return the program that starts an autopilot. Raises NoAutopilot, with the name of the variable."""
     folder = os.environ.get(variable(kind), default)
     if folder is None or not (Path(folder) / "sitl").exists():
         raise NoAutopilot(f"no real {kind}: set {variable(kind)} to a folder with `sitl` in it")
@@ -47,12 +47,13 @@ def program(kind: str, default: Path | None = None) -> Path:
 def flying(
     kind: str, start: Path, folder: Path, parameters: Mapping[str, float] | None = None
 ) -> Iterator[tuple[str, int]]:
-    """One that runs in a folder: (the URL for us, its system id).
+    """Run an autopilot in a folder until the end of the block. Yields its URL and its system id.
 
-    parameters: set before, in a first start, for some count from a start on only.
+    Args:
+        parameters: set in a start before, since some take effect at a start only.
 
     Raises:
-        NoAutopilot: with what it said, or the parameter that it does not take.
+        NoAutopilot: it did not start, or refused a parameter; with its output.
     """
     if parameters:
         with _running(kind, start, folder) as (url, system):
@@ -62,7 +63,7 @@ def flying(
 
 
 def beside(kind: str, system: int, url: str) -> str:
-    """Where a second one can talk to it while somebody flies it."""
+    """Return the URL for a second client while another one flies the vehicle."""
     if kind == "px4":
         return f"udpout:127.0.0.1:{18570 + system - 1}"
     address, _, port = url.rpartition(":")
@@ -70,19 +71,19 @@ def beside(kind: str, system: int, url: str) -> str:
 
 
 def hall(system: int) -> str:
-    """Where cameras can talk to a PX4 while somebody flies it and a second one listens: its simulator's port."""
+    """Return the URL of a PX4's simulator, for cameras besides two other clients."""
     return f"udpout:127.0.0.1:{19450 + system - 1}"
 
 
 def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
-    """Set them, and wait until they are in a file. Raises NoAutopilot: it does not take one of them."""
+    """Set parameters, and wait until the autopilot has saved them. Raises NoAutopilot if it refuses one."""
     link = open_link(url)
     client = AutopilotClient(link.send, system)
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
-            client.heartbeat()  # PX4 speaks to who spoke first
+            client.heartbeat()  # PX4 answers clients that spoke first
             client.feed(link.receive())
             time.sleep(0.05)
         return condition()
@@ -99,6 +100,7 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
 
 @contextmanager
 def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
+    """Run an autopilot with its saved parameters. Yields its URL and its system id."""
     said = folder / f"{kind}.log"
     with _free(kind) as instance, said.open("wb") as output:
         command = [sys.executable, "-c", KEEPER, str(start), str(folder / kind), str(instance)]
@@ -107,7 +109,7 @@ def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
         )
         try:
             deadline = time.monotonic() + STARTS_IN
-            while not _taken(kind, instance):  # looked at, not tried: its first connection is its only one
+            while not _taken(kind, instance):  # without a connection: its first one is its only one
                 if time.monotonic() > deadline:
                     raise NoAutopilot(f"{kind} does not listen: {said.read_text(errors='replace')[-500:]}")
                 time.sleep(0.1)
@@ -122,7 +124,7 @@ def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
 
 @contextmanager
 def _free(kind: str) -> Iterator[int]:
-    """A number that nobody of this machine has, kept: of two that start at once each finds the other's ports free."""
+    """Reserve an instance number on this machine: two that start at once would both find its ports free."""
     for instance in reversed(INSTANCES):
         lock = FileLock(Path(gettempdir(), f"{kind}-{instance}.brakeline"), blocking=False, mode=0o666)
         try:
@@ -139,7 +141,7 @@ def _free(kind: str) -> Iterator[int]:
 
 
 def _taken(kind: str, instance: int) -> bool:
-    """Does one of that number run, or somebody who expects it?"""
+    """Return whether an instance of this number runs, or a program waits for it."""
     table, ports = "tcp", [5760 + 10 * instance]
     if kind == "px4":
         table, ports = "udp", [14540 + instance, 14580 + instance, 18570 + instance, 19450 + instance]

@@ -1,11 +1,13 @@
-"""Requests as they come up while driving: what the benchmarks of the filter decide on."""
+"""Make requests as they come up while driving: the benchmarks of the filter decide on them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count, islice
 
 import numpy as np
 
+from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -23,34 +25,44 @@ STEPS = 1500
 
 
 def model(certificate: str = "residual", mode: str = "direct", robot: RobotWithTask | None = None) -> ModelSet:
+    """Return a model set of a robot; by default of the ground robot."""
     return model_for(robot or robot_with_task("ground"), ModelConfig(certificate, mode))
+
+
+def driven(
+    policy: str, seed: int, robot: RobotWithTask, conditions: Conditions | None = None
+) -> Iterator[tuple[pb.Episode | None, DecisionOutcome, pb.Step]]:
+    """Drive a policy behind the default filter, without end.
+
+    Yields:
+        At each step: the message of the episode at its first step, else None; the outcome of the request; the step.
+    """
+    ask = in_process(model(robot=robot))
+    driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), ActorIdentity("actor-0", 0, seed))
+    choose = policy_named(policy, robot, seed)
+    for number in count():
+        episode: pb.Episode | None = driver.begin(number)
+        while driver.running:
+            proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
+            outcome = driver.decide(proposal, ask)
+            assert outcome is not None
+            yield episode, outcome, driver.execute(proposal, outcome)
+            episode = None
 
 
 def messages(
     policy: str = "random", seed: int = 5, robot: RobotWithTask | None = None, conditions: Conditions | None = None
 ) -> list[pb.Request]:
-    """The questions of some episodes of a policy behind the default filter."""
-    robot = robot or robot_with_task("ground")
-    question = in_process(model(robot=robot))
-    driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), ActorIdentity("bench", 0, seed))
-    choose = policy_named(policy, robot, seed)
-    asked: list[pb.Request] = []
-    episode = 0
-    while len(asked) < STEPS:
-        driver.begin(episode)
-        episode += 1
-        while driver.running and len(asked) < STEPS:
-            proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
-            outcome = driver.decide(proposal, question)
-            assert outcome is not None
-            asked.append(outcome.request)
-            driver.execute(proposal, outcome)
-    return asked
+    """Return the requests of some episodes of a policy behind the default filter."""
+    steps = driven(policy, seed, robot or robot_with_task("ground"), conditions)
+    return [outcome.request for _, outcome, _ in islice(steps, STEPS)]
 
 
 def requests(ready: Filter, asked: list[pb.Request]) -> Iterator[Request]:
-    """The same as the filter takes them, each decoded when it is its turn, as a service does; plans of another model
-    count as standing still's."""
+    """Yield the requests as the filter takes them, each decoded when it is needed, as in a service.
+
+    A plan of another model counts as the plan of a robot that stands.
+    """
     for message in asked:
         message.model = message.model and ready.version
         yield request_of(message, ready.robot)

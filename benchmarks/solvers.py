@@ -1,5 +1,7 @@
-"""The filter's QPs by ProxQP, as the filter calls it, and by DAQP: how long they take; of how many the two disagree
-whether they can be met, or on the input, by more than a thousandth of its range, and by how much at the most."""
+"""Time the filter's QPs with ProxQP, as the filter calls it, and with DAQP; count where their answers differ.
+
+The two solvers can disagree on whether a QP has a solution, or on the input by more than a thousandth of its range.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from brakeline.safety.filter.qp_solver import ACCURACY, SOLVED, QuadraticProgram
 from brakeline.sim.sim_conditions import Conditions
 
 APART = 1e-3  # of an input's range
-QUESTIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
+SITUATIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
     ("residual", "ground", "residual", None),
     ("matrix zonotope", "ground", "matrix-zonotope", None),
     ("ground by scan", "ground", "residual", SCANS),
@@ -29,7 +31,7 @@ QUESTIONS: tuple[tuple[str, str, str, Conditions | None], ...] = (
 
 
 def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | None) -> list[QuadraticProgram]:
-    """The QPs that come up."""
+    """Return the QPs that the filter solves for the recorded requests."""
     seen: list[QuadraticProgram] = []
 
     def note(program: QuadraticProgram) -> Solution:
@@ -44,7 +46,7 @@ def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | No
 
 
 def by_daqp(program: QuadraticProgram) -> np.ndarray | None:
-    """None: it can't be met."""
+    """Return the solution of DAQP; None if it finds none."""
     n = len(program.h)
     low = np.full(len(program.b), -1e30)
     sense = np.zeros(len(program.b), dtype=np.int32)
@@ -53,7 +55,7 @@ def by_daqp(program: QuadraticProgram) -> np.ndarray | None:
 
 
 def disagreements(seen: list[QuadraticProgram], inputs: int) -> dict[str, float]:
-    """How often the two do, and by how much at the most they do on the first so many unknowns."""
+    """Return how often the solvers disagree, and the largest difference of the first `inputs` unknowns."""
     apart, other = [0.0], 0
     for program in seen:
         ours, theirs = solve(program), by_daqp(program)
@@ -65,12 +67,12 @@ def disagreements(seen: list[QuadraticProgram], inputs: int) -> dict[str, float]
 
 
 def run() -> Figures:
+    """Return a row for each situation and solver."""
     figures: Figures = {}
-    for name, kind, certificate, conditions in QUESTIONS:
+    for name, kind, certificate, conditions in SITUATIONS:
         robot = robot_with_task(kind)
         seen = programs(certificate, robot, conditions)
-        count = {"count": float(len(seen))}
-        size = f"{name} ({len(seen[0].h)} variables)"
+        count, size = {"count": float(len(seen))}, f"{name} ({len(seen[0].h)} variables)"
         beside = disagreements(seen, robot.action_dim)
         figures[f"{size}: ProxQP"] = each([partial(solve, program) for program in seen]) | count | beside
         figures[f"{size}: DAQP"] = each([partial(by_daqp, program) for program in seen]) | count

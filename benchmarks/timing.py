@@ -1,42 +1,35 @@
-"""Timing in one process: medians and percentiles of many calls, after a warm-up."""
+"""Time calls in one process: medians and percentiles of many calls, after a warm-up."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
-Figures = dict[str, dict[str, float]]
-Words = dict[str, dict[str, float | str]]  # of what is no figure alone
+Figures = dict[str, dict[str, float]]  # numbers by row and column
+Words = dict[str, dict[str, float | str]]  # the same, with texts
 
 WARM_UP = 20  # calls
 
 
-def milliseconds(seconds: list[float]) -> dict[str, float]:
-    """p50, p99 and mean, in ms."""
+def milliseconds(seconds: Sequence[float]) -> dict[str, float]:
+    """Return p50, p99 and mean in ms."""
     p50, p99 = np.percentile(seconds, (50, 99)) * 1e3
     return {"p50 ms": float(p50), "p99 ms": float(p99), "mean ms": float(np.mean(seconds) * 1e3)}
 
 
 def timed(call: Callable[[], object], count: int) -> dict[str, float]:
-    """Times of `count` calls."""
-    for _ in range(min(WARM_UP, count)):
-        call()
-    seconds = []
-    for _ in range(count):
-        before = perf_counter()
-        call()
-        seconds.append(perf_counter() - before)
-    return milliseconds(seconds)
+    """Return the times of `count` calls of one function, after a warm-up."""
+    return each([call] * (count + min(WARM_UP, count)))
 
 
-def each(calls: list[Callable[[], object]]) -> dict[str, float]:
-    """Times of one call each, the first ones not counted."""
+def each(calls: Sequence[Callable[[], object]]) -> dict[str, float]:
+    """Return the times of one call of each function. The first calls are a warm-up and do not count."""
     seconds = []
     for call in calls:
         before = perf_counter()
@@ -45,9 +38,33 @@ def each(calls: list[Callable[[], object]]) -> dict[str, float]:
     return milliseconds(seconds[min(WARM_UP, len(seconds) // 2) :])
 
 
+@contextmanager
+def repeated(call: Callable[[], object], seconds: float) -> Iterator[None]:
+    """Call a function in a thread every `seconds` until the end of the block."""
+    over = threading.Event()
+
+    def loop() -> None:
+        while not over.wait(seconds):
+            call()
+
+    thread = threading.Thread(target=loop, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
 @dataclass
 class Stalls:
-    """What this machine let a thread wait beyond the pauses that it asked for: at most, and in all, with these, s."""
+    """The time for which this machine let a thread wait beyond the pauses that it asked for.
+
+    Attributes:
+        worst: the longest time beyond one pause, s.
+        beyond: the sum over all pauses, s.
+        passed: the time in all, s.
+    """
 
     worst: float = 0.0
     beyond: float = 0.0
@@ -55,27 +72,21 @@ class Stalls:
 
     @property
     def share(self) -> float:
-        """Of the time that passed."""
+        """The share of the time that the thread waited too long."""
         return self.beyond / self.passed
 
 
 @contextmanager
 def stalls(pause: float) -> Iterator[Stalls]:
-    """Of a thread that asks for such pauses [s]."""
-    found, done = Stalls(), threading.Event()
+    """Measure the stalls of a thread that asks for pauses of `pause` s, until the end of the block."""
+    found = Stalls()
 
-    def watch() -> None:
-        while not done.is_set():
-            before = time.monotonic()
-            time.sleep(pause)
-            passed = time.monotonic() - before
-            found.worst = max(found.worst, passed - pause)
-            found.beyond, found.passed = found.beyond + passed - pause, found.passed + passed
+    def sleep() -> None:
+        before = time.monotonic()
+        time.sleep(pause)
+        passed = time.monotonic() - before
+        found.worst = max(found.worst, passed - pause)
+        found.beyond, found.passed = found.beyond + passed - pause, found.passed + passed
 
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
+    with repeated(sleep, 0.0):
         yield found
-    finally:
-        done.set()
-        thread.join()

@@ -20,10 +20,10 @@ from matplotlib.patches import Circle, FancyArrow, FancyBboxPatch, Patch, Polygo
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from brakeline.actors.decision_guard import Ask, request_decisions
+from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.logs.decision_explanation import Explanation
-from brakeline.logs.decision_view import decision_view
+from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import KINDS as DECISIONS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
@@ -53,21 +53,18 @@ class Frame:
     Attributes:
         position: (d,), true position at the start of the period, m; heading: rad.
         kind: of decision.
-        low, high, center: (N, d), corners and centers of the tube's boxes, m; N = 0 without a tube.
-        margin: from the tube to the edge of free space, m.
-        why: the explanation of the decision; None without one.
-        around: the perceived surroundings.
+        view: the tube, the explanation of the decision, and the perceived surroundings.
     """
 
     position: Array
     heading: float
     kind: str
-    low: Array
-    high: Array
-    center: Array
-    margin: float
-    why: Explanation | None = None
-    around: DisplayedMap | None = None
+    view: DecisionView
+
+    @property
+    def boxes(self) -> tuple[Array, Array]:
+        """The least and the greatest corners (N, d) of the tube's boxes, m; N = 0 without a tube."""
+        return self.view.centers - self.view.half_widths, self.view.centers + self.view.half_widths
 
 
 @dataclass(frozen=True)
@@ -89,26 +86,21 @@ class Film:
 def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Film:
     """Run episode `number` and return its frames."""
     driver.begin(number)
-    d = driver.robot.position_dim
-    frames, step = [], pb.Step()
+    robot, frames, step = driver.robot, list[Frame](), pb.Step()
     while driver.running:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
-        request = driver.request(proposal)
-        outcome = request_decisions(question, [request], driver.robot)[0] if question is not None else None
-        reply = pb.Reply()
+        exchange = pb.Exchange(request=driver.request(proposal))
+        outcome = driver.decide(proposal, question)
         if outcome is not None and outcome.answer is not None and outcome.reply is not None:
-            reply = outcome.reply
+            exchange.reply.CopyFrom(outcome.reply)
         before = np.asarray(driver.info["true_state"])
         step = driver.execute(proposal, outcome)
-        heading = 0.0 if driver.robot.heading is None else float(before[driver.robot.heading])
+        heading = 0.0 if robot.heading is None else float(before[robot.heading])
         kind = KINDS.get(step.decision, "no filter")
-        view = decision_view(driver.robot, pb.Exchange(request=request, reply=reply))
-        boxes = view.centers - view.half_widths, view.centers + view.half_widths, view.centers
-        why = view.explanation if len(view.centers) else None
-        frames.append(Frame(before[:d], heading, kind, *boxes, reply.decision.margin, why, view.perceived))
+        frames.append(Frame(before[: robot.position_dim], heading, kind, decision_view(robot, exchange)))
     touched = step.contact_moving or step.contact_standing
     end = "goal" if step.goal else "collision" if step.collision else "run into" if touched else "out of time"
-    return Film(driver.robot, driver.info["arena"], frames, np.asarray(step.true_state[:d]), end)
+    return Film(robot, driver.info["arena"], frames, np.asarray(step.true_state[: robot.position_dim]), end)
 
 
 def check_ending(path: Path) -> None:
@@ -132,16 +124,14 @@ def save(films: Sequence[Film], path: Path) -> None:
             panel.all_at_once()
         figure.savefig(path, dpi=130)
         return
-    dpi, last = 90 // len(films), max(len(film.frames) for film in films)
-    with (writer := _writer(path, round(SPEED / films[0].robot.period))).saving(figure, str(path), dpi=dpi):
-        for k in range(last):
+    last = max(len(film.frames) for film in films)
+    writer = _writer(path, round(SPEED / films[0].robot.period))
+    with writer.saving(figure, str(path), dpi=90 // len(films)):
+        for k in range(last + 1):
             for panel in panels:
                 panel.show(k)
-            writer.grab_frame()
-        for panel in panels:
-            panel.ended()
-        for _ in range(LAST_FRAMES):
-            writer.grab_frame()
+            for _ in range(1 if k < last else LAST_FRAMES):
+                writer.grab_frame()
 
 
 def _writer(path: Path, rate: int) -> AbstractMovieWriter:
@@ -172,17 +162,21 @@ class _FilmAxes:
         (left, right), (bottom, top) = arena.bounds[:2]
         edge = 0.03 * (right - left)
         axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, linewidth=2.0, zorder=1))
-        axes.set(xlim=(left - edge, right + edge), ylim=(bottom - edge, top + edge), aspect="equal")
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
-        inside = [o for o in arena.obstacles if o.kind != WALL and not self._closes(o)]
+        axes.set(
+            xlim=(left - edge, right + edge),
+            ylim=(bottom - edge, top + edge),
+            aspect="equal",
+            xlabel="x [m]",
+            ylabel="y [m]",
+        )
+        covers = [o for o in arena.obstacles if o.kind == BOX and o.size[0] >= right - left]  # floor and ceiling
+        inside = [o for o in arena.obstacles if o.kind != WALL and o not in covers]
         drawn = PatchCollection([_patch(o) for o in inside], edgecolor="#333333", linewidth=0.8, zorder=2)
         if self.flies:
             drawn.set_array(np.array([_top(o) for o in inside]))
             drawn.set(cmap=HEIGHTS, clim=arena.bounds[2], alpha=0.45)
-            axes.figure.colorbar(
-                drawn, ax=axes, label="height of the path and of the tops of obstacles [m]", shrink=0.7
-            )
+            label = "height of the path and of the tops of obstacles [m]"
+            axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.7)
         else:
             drawn.set_facecolor("#9a9a9a")
         axes.add_collection(drawn)
@@ -191,73 +185,56 @@ class _FilmAxes:
         axes.plot(*goal[:2], marker="*", color="#009e73", markersize=12, zorder=3)
         axes.plot(*self.path[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
 
-    def _closes(self, obstacle: Obstacle) -> bool:
-        """Return whether the obstacle is a floor or a ceiling."""
-        (left, right), _ = self.film.arena.bounds[:2]
-        return obstacle.kind == BOX and obstacle.size[0] >= right - left
-
     def show(self, k: int) -> None:
-        """Draw the start of period k with its plan; after the last period, the outcome."""
-        if k >= len(self.film.frames):
-            return self.ended()
-        frame = self.film.frames[k]
-        for artist in self._moving:
-            artist.remove()
-        self._moving = [
-            *self._draw_perceived(frame.around),
-            *self._tube(frame, 0.35),
-            *self._body(frame.position, frame.heading, frame.kind),
-        ]
-        if len(frame.center):
-            points = np.vstack([frame.position, frame.center])
-            self._moving += self.axes.plot(
-                points[:, 0], points[:, 1], color=COLOURS[frame.kind], linewidth=1.2, zorder=5
-            )
-        self._draw_path(k)
-        said = frame.kind
-        if frame.why is not None:
-            self._moving += self._draw_explanation(frame, frame.why)
-            said = frame.kind if frame.kind == "allowed" else textwrap.fill(f"{frame.kind}: {frame.why.said}", 80)
-        self.axes.set_title(f"{self._heading()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
-
-    def ended(self) -> None:
-        """Draw the whole path and the outcome."""
+        """Draw the start of period k with its plan; after the last period, the whole path and the outcome."""
         for artist in self._moving:
             artist.remove()
         frames = self.film.frames
-        self._moving = self._body(self.film.last, frames[-1].heading, frames[-1].kind)
-        if self.film.end == "collision":
-            self._moving += self.axes.plot(*self.film.last[:2], marker="x", color=EDGE, markersize=18, mew=4, zorder=10)
-        self._draw_path(len(frames))
-        seconds = len(frames) * self.robot.period
-        self.axes.set_title(f"{self._heading()}{seconds:5.1f} s\n{self.film.end}", fontsize=10, loc="left")
+        self._draw_path(min(k, len(frames)))
+        if k >= len(frames):
+            self._moving = self._body(self.film.last, frames[-1].heading, frames[-1].kind)
+            if self.film.end == "collision":
+                self._moving += self.axes.plot(*self.film.last[:2], "x", color=EDGE, markersize=18, mew=4, zorder=10)
+            return self._title(len(frames), self.film.end)
+        frame, explained = frames[k], frames[k].view.explanation if len(frames[k].view.centers) else None
+        self._moving = [
+            *self._draw_perceived(frame.view.perceived),
+            *self._tube(frame, 0.35),
+            *self._body(frame.position, frame.heading, frame.kind),
+            *self._line([frame.position, *frame.view.centers], color=COLOURS[frame.kind], linewidth=1.2, zorder=5),
+            *([] if explained is None else self._draw_explanation(frame, explained)),
+        ]
+        if explained is None or frame.kind == "allowed":
+            return self._title(k, frame.kind)
+        return self._title(k, textwrap.fill(f"{frame.kind}: {explained.said}", 80))
+
+    def _title(self, k: int, said: str) -> None:
+        self.axes.set_title(f"{self._name()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
+
+    def _line(self, points: Sequence[Array], **style: Any) -> list[Any]:
+        """Draw a line through points, from above."""
+        return list(self.axes.plot(*np.stack([point[:2] for point in points]).T, **style))
 
     def _draw_explanation(self, frame: Frame, why: Explanation) -> list[Any]:
         """Draw the proposed and the executed input, and the edge of the half-space that blocks the proposal."""
         drawn: list[Any] = []
-        x, y = frame.position[:2]
         for label, way in (("proposed", why.proposed), ("executed", why.executed)):
-            wide = 0.12 * self.robot.footprint
-            arrow = FancyArrow(
-                x, y, way[0], way[1], width=wide, length_includes_head=True, color=ARROWS[label], zorder=9
-            )
+            style = {"width": 0.12 * self.robot.footprint, "color": ARROWS[label], "zorder": 9}
+            arrow = FancyArrow(*frame.position[:2], *way[:2], length_includes_head=True, **style)
             drawn.append(self.axes.add_patch(arrow))
         flat = float(np.hypot(*why.normal[:2])) if len(why.at) else 0.0
         if flat > 0.2 and frame.kind != "allowed":
             along = 3.0 * self.robot.footprint * np.array([-why.normal[1], why.normal[0]]) / flat
-            ends = np.stack([why.at[:2] - along, why.at[:2] + along])
-            drawn += self.axes.plot(ends[:, 0], ends[:, 1], color=EDGE, linewidth=2.5, zorder=9)
+            drawn += self._line([why.at[:2] - along, why.at[:2] + along], color=EDGE, linewidth=2.5, zorder=9)
         return drawn
 
     def _draw_perceived(self, about: DisplayedMap | None, alpha: float = 1.0) -> list[Any]:
         """Draw scan hits, free space, and moving obstacles with the sets that they can reach during the plan."""
-        if about is None:
-            return []
         drawn: list[Any] = []
+        if about is None:
+            return drawn
         if len(about.free):
-            outline = Polygon(
-                about.free[:, :2], closed=True, facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1
-            )
+            outline = Polygon(about.free[:, :2], facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1)
             drawn.append(self.axes.add_patch(outline))
             hits = np.reshape(about.flat(HITS)["hits"], (-1, 2))
             drawn += self.axes.plot(*hits.T, ".", color=HIT, markersize=2, alpha=alpha, zorder=5)
@@ -271,28 +248,21 @@ class _FilmAxes:
         """Draw the whole path, and tubes and bodies of some frames."""
         frames = self.film.frames
         for k in np.unique(np.linspace(0, len(frames) - 1, 16).astype(int)):
-            self._draw_perceived(frames[k].around, 0.2)
+            self._draw_perceived(frames[k].view.perceived, 0.2)
             self._tube(frames[k], 0.18)
             self._body(frames[k].position, frames[k].heading, frames[k].kind, alpha=0.25)
         self._body(self.film.last, frames[-1].heading, frames[-1].kind)
         self._draw_path(len(frames))
-        shares = [f"{100 * np.mean([f.kind == kind for f in frames]):.0f} % {kind}" for kind in COLOURS]
-        shown = ", ".join(text for text in shares if not text.startswith("0 %"))
+        shares = {kind: float(np.mean([frame.kind == kind for frame in frames])) for kind in COLOURS}
+        shown = ", ".join(f"{100 * share:.0f} % {kind}" for kind, share in shares.items() if share >= 0.005)
         time = f"{len(frames) * self.robot.period:.1f} s"
-        self.axes.set_title(f"{self._heading()}{self.film.end} after {time}; {shown}", fontsize=11, loc="left")
-        seen = [kind for kind in COLOURS if any(frame.kind == kind for frame in frames)]
+        self.axes.set_title(f"{self._name()}{self.film.end} after {time}; {shown}", fontsize=11, loc="left")
         if not self.flies:
-            handles = [Patch(color=COLOURS[kind], label=kind) for kind in seen]
-            self.axes.legend(
-                handles=handles,
-                loc="upper right",
-                fontsize=8,
-                ncols=len(seen),
-                frameon=False,
-                bbox_to_anchor=(1.0, 1.0),
-            )
+            handles = [Patch(color=COLOURS[kind], label=kind) for kind, share in shares.items() if share]
+            style: dict[str, Any] = {"fontsize": 8, "frameon": False, "bbox_to_anchor": (1.0, 1.0)}
+            self.axes.legend(handles=handles, loc="upper right", ncols=len(handles), **style)
 
-    def _heading(self) -> str:
+    def _name(self) -> str:
         unfiltered = all(frame.kind == "no filter" for frame in self.film.frames)
         return f"{self.robot.name}, {self.film.arena.name}{', without the filter' if unfiltered else ''}: "
 
@@ -307,26 +277,23 @@ class _FilmAxes:
 
     def _tube(self, frame: Frame, alpha: float) -> list[Any]:
         """Draw the tube's boxes, enlarged by the footprint."""
-        drawn = []
-        for low, high in zip(frame.low, frame.high, strict=True):
-            size, round_off = high - low, f"Round, pad={self.robot.footprint}, rounding_size={self.robot.footprint}"
-            box = FancyBboxPatch(low[:2], size[0], size[1], boxstyle=round_off, color=COLOURS[frame.kind], alpha=alpha)
-            box.set(linewidth=0, zorder=3)
-            drawn.append(self.axes.add_patch(box))
-        return drawn
+        rounded = f"Round, pad={self.robot.footprint}, rounding_size={self.robot.footprint}"
+        style: dict[str, Any] = {"boxstyle": rounded, "color": COLOURS[frame.kind], "alpha": alpha}
+        boxes = [
+            FancyBboxPatch(low[:2], *(high - low)[:2], linewidth=0, zorder=3, **style)
+            for low, high in zip(*frame.boxes, strict=True)
+        ]
+        return [self.axes.add_patch(box) for box in boxes]
 
     def _body(self, position: Array, heading: float, kind: str, alpha: float = 1.0) -> list[Any]:
         """Draw the discs of the body and a line to its front."""
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-        drawn: list[Any] = []
-        for disc in self.robot.body:
-            middle = tuple(position[:2] + turn @ disc.at[:2])
-            circle = Circle(middle, disc.radius, facecolor=COLOURS[kind], edgecolor="black", alpha=alpha, zorder=7)
-            drawn.append(self.axes.add_patch(circle))
+        style: dict[str, Any] = {"facecolor": COLOURS[kind], "edgecolor": "black", "alpha": alpha, "zorder": 7}
+        circles = [Circle(tuple(position[:2] + turn @ disc.at[:2]), disc.radius, **style) for disc in self.robot.body]
+        drawn: list[Any] = [self.axes.add_patch(circle) for circle in circles]
         if self.robot.heading is not None:
             nose = position[:2] + self.robot.front_extent * turn[:, 0]
-            line = np.stack([position[:2], nose])
-            drawn += self.axes.plot(line[:, 0], line[:, 1], color="white", linewidth=1.5, alpha=alpha, zorder=8)
+            drawn += self._line([position, nose], color="white", linewidth=1.5, alpha=alpha, zorder=8)
         return drawn
 
 

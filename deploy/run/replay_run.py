@@ -10,10 +10,9 @@ past stays as it was.
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from brakeline.deploy.data.data_paths import data_root
+from brakeline.deploy.experiments.evaluate import asking
 from brakeline.errors import ReplayError
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.mcap_container import model_attachment_name
@@ -29,7 +29,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.methods import Method, decode, load, ready
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import ModelRegistry
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # Fields that depend on a key that no log holds, and fields that explain a decision without changing it.
@@ -105,7 +105,7 @@ class Comparison:
     rounding: float = 0.0  # the largest difference of a number in an equal decision
     kinds: Counter[tuple[str, str]] = field(default_factory=Counter)  # (logged, now)
     fields: dict[str, list[float]] = field(default_factory=dict)  # sizes of the differences; inf: no numbers
-    _largest: list[tuple[tuple[float, float, int], dict[str, Any]]] = field(default_factory=list)  # a heap
+    examples: list[tuple[tuple[float, float], dict[str, Any]]] = field(default_factory=list)  # by size, largest first
 
     @property
     def different(self) -> int:
@@ -128,12 +128,11 @@ class Comparison:
     def _differ(self, request: pb.Request, logged: pb.Reply, now: pb.Reply, sizes: dict[str, float]) -> None:
         for name, size in sizes.items():
             self.fields.setdefault(name, []).append(size)
-        where = {"actor": request.actor, "episode": request.episode, "step": request.step}
-        kinds = {"logged": NAMES[logged.decision.kind], "now": NAMES[now.decision.kind]}
-        # Rank by the difference of the input first, then of any field; the earlier of equal ones first.
-        rank = sizes.get("input", 0.0), max(sizes.values()), -self.requests
-        push = heapq.heappushpop if len(self._largest) == EXAMPLES else heapq.heappush
-        push(self._largest, (rank, where | kinds | {"differences": sizes}))
+        example = {"actor": request.actor, "episode": request.episode, "step": request.step}
+        example |= {"logged": NAMES[logged.decision.kind], "now": NAMES[now.decision.kind], "differences": sizes}
+        # Rank by the difference of the input first, then of any field; the sort leaves the earlier of equal ones first.
+        rank = sizes.get("input", 0.0), max(sizes.values())
+        self.examples = sorted([*self.examples, (rank, example)], key=lambda one: one[0], reverse=True)[:EXAMPLES]
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the comparison, as `brakeline replay --json` prints them.
@@ -148,12 +147,10 @@ class Comparison:
             kinds.setdefault(logged, {})[now] = count
         fields = {name: {"count": len(sizes), "largest": max(sizes)} for name, sizes in sorted(self.fields.items())}
         counts = {name: getattr(self, name) for name in ("requests", "unanswered", "identical", "equal", "different")}
-        otherwise = sum(
-            len(self.fields.get(name, ())) for name in ("input", "result")
-        )  # a reply has one of them at most
-        counts["same_input"] = counts["requests"] - counts["unanswered"] - otherwise
-        worst = [example for _, example in sorted(self._largest, key=lambda item: item[0], reverse=True)]
-        return counts | {"rounding": self.rounding, "kinds": kinds, "fields": fields, "examples": worst}
+        otherwise = [*self.fields.get("input", ()), *self.fields.get("result", ())]  # a reply has one of them at most
+        counts["same_input"] = counts["requests"] - counts["unanswered"] - len(otherwise)
+        examples = [example for _, example in self.examples]
+        return counts | {"rounding": self.rounding, "kinds": kinds, "fields": fields, "examples": examples}
 
 
 def differences(
@@ -214,8 +211,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
     """
     log = open_log(paths)
     archive, models, result = Archive(log), ModelRegistry(), Comparison()
-    answer = batch_handler(models, ServiceCounts())
-    waiting: Waiting = {}
+    ask, waiting = asking(models), Waiting()
     for record in log:
         if record.topic == "model":
             archive.add(record.message.file)
@@ -236,15 +232,13 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
             if instead is not None:
                 robot = log.robots.named(request.robot)
                 if robot is None:
-                    raise ReplayError(
-                        f"the log does not describe {request.robot!r}, and no such robot comes with the program"
-                    )
+                    raise ReplayError(f"{request.robot!r} is neither in the log nor a robot of the program")
                 _put_to_use(models, request, instead(robot))
                 if request.model not in ("", UNVERIFIED):
                     request.model = models.filters[request.robot].version
             elif logged.decision.model:  # without a model the reply is an error, and the registry stays
                 _put_to_use(models, request, archive.method(request.robot, logged.decision.model))
-        replies = _asked(answer, [request for request, _ in questions]) if questions else []
+        replies = ask([request for request, _ in questions]) if questions else []
         for (request, logged), reply in zip(questions, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
     return result
@@ -276,8 +270,3 @@ def _put_to_use(models: ModelRegistry, request: pb.Request, method: Method) -> N
     """Make the registry as it was: the plan of the request may be from a version in use before the log began."""
     models.filters[request.robot] = method
     models.known |= {method.version, request.model}
-
-
-def _asked(answer: Callable[[bytes], bytes], requests: Sequence[pb.Request]) -> list[pb.Reply]:
-    """Ask the core of the service, with the same bytes but without a bus."""
-    return list(pb.ReplyBatch.FromString(answer(pb.RequestBatch(requests=requests).SerializeToString())).replies)

@@ -27,7 +27,7 @@ import numpy as np
 import zenoh
 
 from benchmarks import situations
-from benchmarks.askers import cells, used
+from benchmarks.safety_processes import cells, used
 from benchmarks.timing import Figures, stalls
 from brakeline.deploy.interpreter import spawning
 from brakeline.errors import BusError, Late

@@ -27,8 +27,7 @@ import psutil
 
 from benchmarks import sitl
 from benchmarks.flights import SETUPS, switched_on
-from benchmarks.repeated import repeated
-from benchmarks.timing import Words
+from benchmarks.timing import Words, repeated
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
 from brakeline.actors.mavlink.telemetry import MOTION, TRUTH, Array

@@ -6,13 +6,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from brakeline.deploy.experiments.compare import ComparisonJob, cell_configs
 
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments.bootstrap import mean, ratio
-from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig, TrialConfig, quick, run
+from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig, TrialConfig, cell_configs, quick
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
+from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.report import analyse
 from brakeline.messaging.policy_weights import MLP
@@ -48,7 +48,7 @@ def rivals(data_folder):
 @pytest.fixture(scope="module")
 def cells(rivals, tmp_path_factory) -> dict[str, dict]:
     folder = tmp_path_factory.mktemp("cells")
-    return {m: run(replace(TINY, method=m), folder / m) | {"folder": folder / m} for m in METHODS}
+    return {m: replace(TINY, method=m).run(folder / m) | {"folder": folder / m} for m in METHODS}
 
 
 def stripped(value):
@@ -60,10 +60,10 @@ def stripped(value):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, method, tmp_path):
-    again = run(replace(TINY, method=method), tmp_path / "again")
+    again = replace(TINY, method=method).run(tmp_path / "again")
     assert stripped(again) == stripped(cells[method])
     if method == "none":
-        assert run(replace(TINY, seed=4), tmp_path / "other")["policy"] != again["policy"]
+        assert replace(TINY, seed=4).run(tmp_path / "other")["policy"] != again["policy"]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -77,7 +77,7 @@ def test_a_cell_says_what_its_logs_say(cells, method):
         assert found["mean_reward"] == pytest.approx(np.mean(episodes["reward"]), abs=1e-3)
         assert found["seed"] == TINY.seed and found["method"] == (method if name == "training" else name.split("-")[1])
     assert cell["training"]["steps"] == TINY.steps and cell["training"]["updates"] == TINY.steps - TINY.td3.warmup
-    assert json.loads(json.dumps(cell["study"])) == replace(TINY, method=method).config()
+    assert json.loads(json.dumps(cell["study"])) == configuration(replace(TINY, method=method))
     assert MLP.load(cell["folder"] / "policy.safetensors", GROUND).sizes == (26, 16, 16, 2)
 
 
@@ -94,7 +94,7 @@ def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
 def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp_path):
     """Of its own observation, in `many-walkers`; results from before there were walkers have no such rows."""
     study = replace(TINY, robot="ground+tracks", method="ddpc", arenas=("many-walkers",))
-    cell = run(study, tmp_path)
+    cell = study.run(tmp_path)
     tracking = robot_with_task("ground+tracks")
     assert MLP.load(tmp_path / "policy.safetensors", tracking).sizes == (50, 16, 16, 2)
     episodes = cell["evaluations"]["trained-ddpc-many-walkers"]["episodes"]
@@ -140,8 +140,8 @@ def test_the_studies_of_a_comparison():
     every = cell_configs("ground", (0, 1, 2))
     assert [s.name for s in every[:5]] == ["ddpc-s0", "sailr-s0", "secas-s0", "none-s0", "ddpc-s1"]
     assert len(every) == 12 and {s.episodes for s in every} == {500} and every[0].arenas == ("default", "dense")
-    assert len({json.dumps(s.config()) for s in every}) == 12
-    assert quick(every[0]).steps < 5000 and ComparisonJob(every[0]).name == "ddpc-s0"
+    assert len({json.dumps(configuration(s)) for s in every}) == 12
+    assert quick(every[0]).steps < 5000 and every[0].name == "ddpc-s0"
 
 
 # --- figures -------------------------------------------------------------------------------------------------------

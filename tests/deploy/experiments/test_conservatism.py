@@ -2,6 +2,7 @@
 
 from brakeline.deploy.experiments import conservatism
 from brakeline.deploy.experiments.conservatism import Conservatism
+from brakeline.deploy.experiments.experiment_jobs import configuration
 
 SAID = {"half_width_rest": 0.0056, "half_width_full": 0.0081, "violations": 2, "windows": 1981, "bound_plan": 0.0042}
 
@@ -27,7 +28,7 @@ def test_every_kind_of_row_has_all_columns():
         {"certificate": "residual", "mode": "recursion", "statement": SAID | {"half_width_full": 3e5}, "driving": None},
         {"certificate": "matrix-zonotope", "mode": "recursion", "refused": "poor data"},
     ]
-    study = Conservatism("ground", policies=("astar", "x")).config()
+    study = configuration(Conservatism("ground", policies=("astar", "x")))
     lines = conservatism.markdown({"study": study, "rows": rows}).splitlines()
     table = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in table}) == 1 and len(table) == 5

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from brakeline.deploy.experiments.experiment_jobs import complete, read, write
+from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, write
 from brakeline.errors import StaleResultError
 from tests.waiting import until
 
@@ -28,20 +28,17 @@ class Errand:
     def name(self) -> str:
         return f"errand-{self.number}"
 
-    def config(self) -> dict:
-        return {"number": self.number, "setting": self.setting}
-
     def run(self, folder: Path, say) -> dict:
         if self.number < 0:
             raise RuntimeError("no such number")
         folder.mkdir(parents=True)
         say("half way")
-        return {"study": self.config(), "square": self.number**2}
+        return {"study": configuration(self), "square": self.number**2}
 
 
 def test_what_is_there_is_not_run_again(tmp_path):
     jobs, told = [Errand(n) for n in (1, 2, 3)], []
-    write(tmp_path / "results", jobs[1], {"study": jobs[1].config(), "square": -1})
+    write(tmp_path / "results", jobs[1], {"study": configuration(jobs[1]), "square": -1})
     say = lambda name, text: told.append((name, text))  # noqa: E731
     found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=1, say=say)
     assert [result["square"] for result in found] == [1, -1, 9]

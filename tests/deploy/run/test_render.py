@@ -19,14 +19,15 @@ def film(data_folder) -> Film:
 def test_the_frames_are_what_was_decided(film):
     assert {frame.kind for frame in film.frames} <= {"allowed", "adjusted", "failsafe"}
     for frame, after in zip(film.frames, film.frames[1:], strict=False):
-        assert frame.low.shape == frame.high.shape == (GROUND.horizon, 2) and (frame.high > frame.low).all()
-        assert (after.position > frame.low[0]).all() and (after.position < frame.high[0]).all(), "the tube holds"
+        low, high = frame.boxes
+        assert low.shape == high.shape == (GROUND.horizon, 2) and (high > low).all()
+        assert (after.position > low[0]).all() and (after.position < high[0]).all(), "the tube holds"
 
 
 def test_without_a_filter_there_is_no_tube(data_folder):
     driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", method="none"))
     found = record(driver, policy, question, 1)
-    assert found.frames[0].kind == "no filter" and len(found.frames[0].low) == 0
+    assert found.frames[0].kind == "no filter" and len(found.frames[0].view.centers) == 0
     assert found.end in ("goal", "collision", "out of time")
 
 
