@@ -11,7 +11,8 @@ import difflib
 import importlib
 import os
 import sys
-from dataclasses import MISSING, Field, dataclass, field, fields
+from copy import copy
+from dataclasses import fields, make_dataclass
 from importlib.metadata import version
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
@@ -145,21 +146,9 @@ def command_class(name: str) -> Any:
 def abridged(command: Any) -> Any:
     """Return a command's dataclass whose help leaves out the expert options. tyro still parses them."""
     hints = get_type_hints(command, include_extras=True)
-    items = {item.name: item for item in fields(command)}
-    hidden = {name: Annotated[hints[name], tyro.conf.Suppress] for name in command.expert}
-    defaults = {name: _default(items[name]) for name in command.expert}
-    return dataclass(frozen=True)(type(command.__name__, (command,), {"__annotations__": hidden, **defaults}))
-
-
-def _default(item: Field[Any]) -> Any:
-    return field(default_factory=item.default_factory) if item.default_factory is not MISSING else item.default
-
-
-def expected_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions whose message tells the user enough. Whatever raised one has imported its module."""
-    from brakeline.errors import BusError, LogError
-
-    return BusError, LogError, ValueError, OSError, RuntimeError
+    expert = [item for item in fields(command) if item.name in command.expert]
+    hidden = [(item.name, Annotated[hints[item.name], tyro.conf.Suppress], copy(item)) for item in expert]
+    return make_dataclass(command.__name__, hidden, bases=(command,), frozen=True)
 
 
 def parse(name: str, arguments: list[str]) -> Any:
@@ -207,8 +196,10 @@ def main(arguments: list[str] | None = None) -> int:
         errors.print(f"[red]brakeline {name}:[/] {escape(str(missing))}", soft_wrap=True)
         return 1
     except Exception as error:
-        if not isinstance(error, expected_errors()):
-            raise
+        from brakeline.errors import BusError, LogError
+
+        if not isinstance(error, BusError | LogError | ValueError | OSError | RuntimeError):
+            raise  # the message of another exception does not tell the user enough
         errors.print(f"[red]brakeline {name}:[/] {escape(str(error))}", soft_wrap=True)
         return 1
 

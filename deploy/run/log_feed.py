@@ -98,8 +98,8 @@ class ReplayedActor:
     index: int = 0  # number of the last published step
 
 
-def feed(process: Process, settings: FeederSettings) -> bool:
-    """Publish the steps until the end of the logs or of the training. Returns False if a signal stopped the process.
+def main(settings: FeederSettings) -> bool:
+    """Run a feeder process until the end of the logs or of the training. Returns False if a signal stopped it.
 
     The health figures have the numbers of `published`, `known` (the learner has them already),
     `duplicate` and `unusable` steps.
@@ -108,6 +108,11 @@ def feed(process: Process, settings: FeederSettings) -> bool:
         RefusedByLearner: the learner does not accept the actors of the log.
         NoLog, NotALog: a path is no log.
     """
+    with Process(settings.bus, settings.name) as process:
+        return _feed(process, settings)
+
+
+def _feed(process: Process, settings: FeederSettings) -> bool:
     robot, stop = robot_with_task(settings.robot), process.stop.is_set
     steps, actors, figures = LoggedSteps(settings.logs, robot), dict[str, ReplayedActor](), Counter[str]()
 
@@ -156,9 +161,3 @@ def _await_last_updates(actors: dict[str, ReplayedActor], stop: Callable[[], boo
     deadline = time.monotonic() + LAST_UPDATES_TIMEOUT
     while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):
         time.sleep(0.05)
-
-
-def main(settings: FeederSettings) -> bool:
-    """Run a feeder process. Returns whether its work is done."""
-    with Process(settings.bus, settings.name) as process:
-        return feed(process, settings)

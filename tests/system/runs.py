@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, Self
 
 import psutil
 
+from brakeline.deploy import cli
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run.processes import client_settings, launcher_pid
 from brakeline.logs.metrics import Metrics
@@ -19,13 +22,22 @@ from brakeline.messaging.topics import RECORDED
 from tests.waiting import PATIENCE, until
 
 BRAKELINE = (*PYTHON, "-m", "brakeline.deploy.cli")
+OF_ITS_OWN = ("train", "safety", "learner")  # commands that are a process, or that start some
 STRIDE = 200  # steps of a run that take no longer
 
 
 def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
-    """A command from its start to its end."""
-    words = [*BRAKELINE, *map(str, arguments)]
-    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=timeout)
+    """Run a command to its end. In this process, where it can: a new one would import everything again."""
+    words = [*map(str, arguments)]
+    if words[0] in OF_ITS_OWN:
+        return subprocess.run([*BRAKELINE, *words], check=False, capture_output=True, text=True, timeout=timeout)
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            status = cli.main(words)
+        except SystemExit as end:
+            status = end.code
+    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
 
 
 class Run:

@@ -23,9 +23,9 @@ os.environ.setdefault("MAVLINK20", "1")  # read when pymavlink is imported
 from pymavlink import mavutil
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def system() -> Iterator[Any]:
-    """MAVSDK's view of a vehicle with PX4's rules."""
+    """Return MAVSDK's view of a vehicle with PX4's rules, which is on the ground before and after each test."""
     with autopilot("--rules", "px4") as port:
         configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
         with Mavsdk(configuration) as sdk:

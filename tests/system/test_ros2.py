@@ -114,9 +114,9 @@ def rammed(folder: Path, arena: str, seed: int, seconds: float, *node: object) -
 def run(
     late_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Path, tuple[dict[str, Any], ...]]]:
-    """Two simulated minutes, and the bag of them."""
+    """Simulate 80 s, and record a bag of them."""
     folder = tmp_path_factory.mktemp("ros2")
-    yield folder / "bag", rammed(folder, "default", 1, 120.0, "--bag", folder / "bag")
+    yield folder / "bag", rammed(folder, "default", 1, 80.0, "--bag", folder / "bag")
 
 
 def test_raw_commands_that_ram_hit_nothing(run: Any) -> None:
@@ -142,7 +142,7 @@ def test_a_bag_is_one_to_readers_of_bags(run: Any) -> None:
             *("/odom", "/scan", "/clock", "/tf_static", "/cmd_vel_raw", "/cmd_vel", "/diagnostics"),
             "/brakeline/markers",
         }
-        assert counts["/tf_static"] == 1 and counts["/cmd_vel"] >= 500 and counts["/scan"] >= 500
+        assert counts["/tf_static"] == 1 and counts["/cmd_vel"] >= 330 and counts["/scan"] >= 330
         stamps = [stamp for _, stamp, _ in reader.messages()]
         assert stamps == sorted(stamps) and len(stamps) == sum(counts.values())
     seen: Counter[str] = Counter()
