@@ -139,7 +139,7 @@ def main() -> None:
 
 
 def peak() -> float:
-    """Return the peak memory of this process in MiB. (getrusage would include the process that started it.)"""
+    """Return the peak memory of this process [MiB]; getrusage would include the process that started it."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
 

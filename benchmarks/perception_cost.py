@@ -51,6 +51,7 @@ class Weighed:
         self.times: dict[str, list[float]] = defaultdict(list)
 
     def __call__(self, requests: Sequence[pb.Request]) -> list[pb.Reply]:
+        """Ask, and note sizes and times."""
         before = process_time()
         replies = list(self._question(requests))
         self.times["answer"].append(1e3 * (process_time() - before) / len(requests))

@@ -68,8 +68,10 @@ def _measure(listen: bool, requests: list[pb.Request]) -> Figures:
 
 
 def run() -> Figures:
-    """Return a row for each policy and way. The filter allows most proposals of the trained policy at once; more than
-    half of the random policy's need a QP."""
+    """Return a row for each policy and way.
+
+    The filter allows most proposals of the trained policy at once. More than half of the random policy's need a QP.
+    """
     return {
         f"{policy} policy, {name}, {how}": row
         for policy in ("trained", "random")

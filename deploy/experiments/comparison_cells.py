@@ -63,6 +63,7 @@ class TrialConfig:
 
     @property
     def name(self) -> str:
+        """The name of its log, and of its figures in the cell's file."""
         return f"{self.policy}-{self.method}-{self.arena}"
 
 
@@ -83,6 +84,7 @@ class CellConfig:
 
     @property
     def name(self) -> str:
+        """The name of the cell's file."""
         return f"{self.method}-s{self.seed}"
 
     def trials(self) -> list[TrialConfig]:

@@ -42,6 +42,7 @@ class Conservatism:
 
     @property
     def name(self) -> str:
+        """The name of the result."""
         return "conservatism"
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:

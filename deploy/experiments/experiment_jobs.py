@@ -29,10 +29,15 @@ class Job(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
-    def robot(self) -> str: ...
+    def robot(self) -> str:
+        """The robot, whose folder gets the result."""
+
     @property
-    def name(self) -> str: ...
-    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]: ...
+    def name(self) -> str:
+        """The name of the result."""
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        """Run the job in a folder, and return its result. say: reports progress."""
 
 
 def configuration(job: Job) -> dict[str, Any]:

@@ -36,6 +36,7 @@ class ThresholdTrial:
     greedy_collisions: int
 
     def figures(self) -> dict[str, float]:
+        """Return the figures by name."""
         return asdict(self)
 
 

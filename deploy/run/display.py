@@ -46,6 +46,7 @@ class Display:
             self._live.stop()
 
     def __call__(self, run: Launcher) -> None:
+        """Show the run as it is now."""
         if self._live is None and (phase := run_phase(run)) != self._last_phase:
             self._last_phase = phase
             self.console.print(phase, markup=False)

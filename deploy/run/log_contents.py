@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from brakeline.deploy.data.data_paths import method_path
-from brakeline.deploy.run.mavlink_json import Derive, chain_derived, frames_as_json
+from brakeline.deploy.run.mavlink_json import Derive, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.mcap_container import model_attachment_name
@@ -66,4 +66,5 @@ def derive_entries(pictures: float, robots: RecordedRobots | None = None) -> Der
     """
     if pictures == 0.0:
         return frames_as_json
-    return chain_derived(FoxgloveConverter(pictures, robots).from_sample, frames_as_json)
+    draw = FoxgloveConverter(pictures, robots).from_sample
+    return lambda sample: [*draw(sample), *frames_as_json(sample)]

@@ -36,8 +36,3 @@ def frames_as_json(sample: Sample) -> list[Entry]:
             text = json.dumps(message.described).encode()
             entries.append(Entry(message.name, ENCODING, text, sample.received, frame.wall_time, 0))
     return entries
-
-
-def chain_derived(*derived: Derive) -> Derive:
-    """Return a function that joins the entries of several functions."""
-    return lambda sample: [entry for derive in derived for entry in derive(sample)]

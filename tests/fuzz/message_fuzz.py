@@ -29,13 +29,13 @@ from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.commands.watch_command import show_received
 from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
-from brakeline.deploy.run.mavlink_json import chain_derived, frames_as_json
+from brakeline.deploy.run.log_contents import derive_entries
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.errors import BadModel, BadRequest, BusError
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
-from brakeline.logs.foxglove import FoxgloveConverter
+from brakeline.logs.foxglove import RATE
 from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis
 from brakeline.logs.reader import Log
 from brakeline.logs.recorder import Inbox, Recording, Rotation
@@ -119,7 +119,7 @@ def recorder(folder: Path) -> Party:
         path.unlink(missing_ok=True)
         return Segment(path, path.open("wb", buffering=0), metadata)
 
-    derive = chain_derived(FoxgloveConverter().from_sample, frames_as_json)
+    derive = derive_entries(RATE)
     recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), rejected)
 
     def take(sample: Sample) -> None:
