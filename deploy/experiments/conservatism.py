@@ -12,17 +12,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.comparison_table import markdown_table
-from brakeline.deploy.experiments.evaluate import FRESH, in_process
+from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
-from brakeline.deploy.experiments.trials import run_trial
-from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.vehicle_factory import environment
+from brakeline.deploy.experiments.trials import EpisodeTable, fresh_trial
 from brakeline.errors import BadData, ErrorBoundError
-from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.error_bounds import KINDS
 from brakeline.safety.model.model_set import MODES, ModelConfig
 from brakeline.sim.arena_generator import arena_kind
@@ -64,22 +61,22 @@ class Conservatism:
                 driving = None
                 if statement.half_width_full <= arena_kind(robot, self.arena).half_width:
                     ask = in_process(model, ANY_BOUND)
-                    driving = {policy: self._drive(robot, policy, ask) for policy in self.policies}
+                    trials = {name: fresh_trial(robot, self.arena, name, ask, self.episodes) for name in self.policies}
+                    driving = {name: _figures_of(table) for name, table in trials.items()}
                 rows.append(row | {"driving": driving})
         return {"study": configuration(self), "data": data.digest(), "rows": rows}
 
-    def _drive(self, robot: RobotWithTask, policy: str, question: Any) -> dict[str, Any]:
-        """Evaluate the closed loop on the first fresh episodes."""
-        driver = EpisodeRunner(robot, environment(robot, self.arena, FRESH), ActorIdentity("conservatism", 0, 0))
-        table = run_trial(driver, policy_named(policy, robot, 0), question, self.episodes)
-        columns, steps = table.columns(), table.decisions
-        return {
-            "goals": sum(columns["goal"]),
-            "collisions": sum(columns["collision"]),
-            "interventions": sum(columns["interventions"]) / max(steps, 1),
-            "steps": steps,
-            "decision_ms": table.decision_ms(),
-        }
+
+def _figures_of(table: EpisodeTable) -> dict[str, Any]:
+    """Return the figures of the closed loop."""
+    columns, steps = table.columns(), table.decisions
+    return {
+        "goals": sum(columns["goal"]),
+        "collisions": sum(columns["collision"]),
+        "interventions": sum(columns["interventions"]) / max(steps, 1),
+        "steps": steps,
+        "decision_ms": table.decision_ms(),
+    }
 
 
 def markdown(result: dict[str, Any]) -> str:

@@ -9,11 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.experiments.evaluate import FRESH, in_process
-from brakeline.deploy.experiments.trials import run_trial
-from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.vehicle_factory import environment
+from brakeline.deploy.experiments.evaluate import in_process
+from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import SAILR
@@ -51,18 +48,15 @@ def try_threshold(
     """Evaluate the model with another threshold on fresh episodes."""
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    tables = {}
-    for name in (ORACLE, GREEDY):
-        driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("tune", 0, 0))
-        tables[name] = run_trial(driver, policy_named(name, robot, 0), question, episodes)
-    oracle, greedy = tables[ORACLE].columns(), tables[GREEDY].columns()
+    oracle, greedy = (fresh_trial(robot, arena, policy, question, episodes) for policy in (ORACLE, GREEDY))
+    reached, driven = oracle.columns(), greedy.columns()
     return ThresholdTrial(
         value,
         episodes,
-        int(sum(oracle["goal"])),
-        sum(oracle["interventions"]) / max(tables[ORACLE].decisions, 1),
-        int(sum(greedy["goal"])),
-        int(sum(greedy["collision"])),
+        oracle_goals=int(sum(reached["goal"])),
+        oracle_interventions=sum(reached["interventions"]) / max(oracle.decisions, 1),
+        greedy_goals=int(sum(driven["goal"])),
+        greedy_collisions=int(sum(driven["collision"])),
     )
 
 

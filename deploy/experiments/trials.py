@@ -18,11 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
-from brakeline.actors.episode_runner import EpisodeRunner
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.deploy.experiments.evaluate import FRESH
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.learner import Learner
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, STEP, Topic
 from brakeline.sim.scripted_policies import Policy, scripted
 
@@ -166,6 +170,12 @@ def run_trial(
             if log is not None:
                 log.put_step(step)
     return table
+
+
+def fresh_trial(robot: RobotWithTask, arena: str, policy: str, question: Ask | None, episodes: int) -> EpisodeTable:
+    """Run a policy by its name through fresh episodes, which no training has."""
+    driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("trial", 0, 0))
+    return run_trial(driver, policy_named(policy, robot, 0), question, episodes)
 
 
 class Trainer:

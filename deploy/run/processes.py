@@ -6,6 +6,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.messaging.atomic_files import write_atomically
@@ -63,7 +64,7 @@ def client_settings(folder: Path) -> BusSettings:
     Raises:
         OSError, ValueError, KeyError: the folder has no run.
     """
-    values = json.loads((folder / ENDPOINT).read_text())
+    values = _read_endpoint(folder)
     keys = values.get("keys")
     return BusSettings(connect=(values["endpoint"],), keys=Path(keys) if keys else None)
 
@@ -73,10 +74,15 @@ def metrics_address(folder: Path, number: int) -> str:
 
     The launcher has the first port, its processes have the next ones.
     """
-    host, colon, port = json.loads((folder / ENDPOINT).read_text()).get("metrics", "").rpartition(":")
+    host, colon, port = _read_endpoint(folder).get("metrics", "").rpartition(":")
     return f"{host}{colon}{int(port) + 1 + number}" if port else ""
 
 
 def launcher_pid(folder: Path) -> int:
     """Return the process id of the run's launcher. Raises as `client_settings`."""
-    return int(json.loads((folder / ENDPOINT).read_text())["pid"])
+    return int(_read_endpoint(folder)["pid"])
+
+
+def _read_endpoint(folder: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((folder / ENDPOINT).read_text())
+    return values
