@@ -1,11 +1,12 @@
-"""One finished run, for the tests that look at what it left."""
+"""One finished run for the tests that look at its log, and processes that end with their test."""
 
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.system.runs import Run
+from tests.system.runs import BRAKELINE, Run
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +22,20 @@ def whole_run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
 def logged_run(whole_run: tuple[Path, dict[str, Any]]) -> Path:
     """Its folder."""
     return whole_run[0]
+
+
+@pytest.fixture
+def start(tmp_path):
+    """`start("safety", "ground", ...)` runs a command until the end of the test."""
+    started = []
+
+    def run(*words):
+        name = f"{words[0]}-{len(started)}"
+        with (tmp_path / f"{name}.out").open("w") as out:
+            started.append(subprocess.Popen([*BRAKELINE, *map(str, words)], stdout=out, stderr=out))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.wait()

@@ -1,36 +1,16 @@
 """Each process started alone, by its command, as on machines of their own."""
 
 import signal
-import subprocess
-
-import pytest
 
 from brakeline.logs.report import analyse
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.service.client import SafetyClient
-from tests.system.runs import BRAKELINE, brakeline
+from tests.system.runs import brakeline
 from tests.waiting import until
 
 LEARNING = ("--learner.td3.hidden", 16, "--learner.td3.batch", 16, "--learner.td3.warmup", 100)
-
-
-@pytest.fixture
-def start(tmp_path):
-    """`start("safety", "ground", ...)` runs a command until the end of the test."""
-    started = []
-
-    def run(*words):
-        name = f"{words[0]}-{len(started)}"
-        with (tmp_path / f"{name}.out").open("w") as out:
-            started.append(subprocess.Popen([*BRAKELINE, *map(str, words)], stdout=out, stderr=out))
-        return started[-1]
-
-    yield run
-    for process in started:
-        process.kill()
-        process.wait()
 
 
 def test_safety_learner_actor_and_recorder_alone(start, data_folder, tmp_path):

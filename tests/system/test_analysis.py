@@ -6,7 +6,7 @@ from pathlib import Path
 
 from brakeline.logs.reader import find
 from tests.logs.sample_log import agree, counted, decoded
-from tests.system.runs import Run, brakeline
+from tests.system.runs import brakeline
 
 
 def test_analyse_agrees_with_a_count_by_another_reader_field_by_field(logged_run: Path) -> None:
@@ -32,11 +32,3 @@ def test_rows_of_runs_and_of_steps(logged_run: Path) -> None:
     assert "step" in brakeline("analyse", logged_run, "--episode", 1).stdout
     none = brakeline("analyse", logged_run, "--episode", 12345)
     assert none.returncode == 1 and "there is no episode 12345" in none.stderr
-
-
-def test_a_run_without_a_log_says_so(data_folder: Path, tmp_path: Path) -> None:
-    with Run(tmp_path / "run", "--no-record", "--steps", 300) as run:
-        figures = run.end()
-        assert run.popen.returncode == 0, run.errors.read_text()
-    assert figures["log"] is None and figures["steps"] >= 300 and "recorder" not in figures["processes"]
-    assert list(run.folder.glob("*.mcap")) == []

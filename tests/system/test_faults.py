@@ -176,13 +176,15 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
 
 
 def test_a_second_interrupt_leaves_nothing_either(data_folder, tmp_path):
-    with Run(tmp_path / "run") as run:
-        until(lambda: len(run.children()) >= 3, "some processes")
+    """Of a run without a recorder (`tests/deploy/run/test_launcher.py` has its figures)."""
+    with Run(tmp_path / "run", "--no-record") as run:
+        until(lambda: run.children().keys() == {"safety-0", "learner", "actor-0", "actor-1"}, "all processes")
         run.popen.send_signal(signal.SIGINT)
         time.sleep(1.5)
         run.popen.send_signal(signal.SIGINT)
         run.popen.wait(PATIENCE)
         until(lambda: run.children() == {}, "no process is left")
+    assert list(run.folder.glob("*.mcap")) == []
 
 
 def test_a_child_whose_launcher_is_gone_ends_without_a_word_to_the_bus(tmp_path):

@@ -11,11 +11,10 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 from tests.system.runs import brakeline
-from tests.system.test_alone import start  # noqa: F401 - a fixture
 from tests.waiting import until
 
 
-def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, tmp_path, monkeypatch):  # noqa: F811
+def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, tmp_path, monkeypatch):
     keys, parts, endpoint = tmp_path / "keys", tmp_path / "parts", free_endpoint("tls")
     made = brakeline("keys", keys, "safety", "client", "viewer", "actor-0", "certify", "--hand-out", parts)
     assert made.returncode == 0, made.stderr

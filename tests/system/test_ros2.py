@@ -58,6 +58,7 @@ class Bench:
 
     def __init__(self, folder: Path, *bridge: object, filtered: bool = True, node: tuple[object, ...] = ()) -> None:
         self.folder, self._endpoint = folder, free_endpoint()
+        self._started: list[subprocess.Popen[bytes]] = []
         self.port = self._endpoint.rsplit(":", 1)[1]
         self._home = folder / "home"  # the SDK may edit git's configuration there
         self._home.mkdir(parents=True)
@@ -75,10 +76,7 @@ class Bench:
             process.kill()
             process.wait()
 
-    _started: list[subprocess.Popen[bytes]]
-
     def start(self, name: str, *words: object) -> subprocess.Popen[bytes]:
-        self._started = getattr(self, "_started", [])
         environment = os.environ | ({"HOME": str(self._home)} if name in ("driver", "graph") else {})
         with (self.folder / f"{name}.out").open("w") as out, (self.folder / f"{name}.err").open("w") as err:
             process = subprocess.Popen([*map(str, words)], stdout=out, stderr=err, env=environment)

@@ -20,6 +20,11 @@ def launcher(tmp_path: Path) -> Launcher:
     return Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
 
 
+def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
+    launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
+    assert launcher.figures()["log"] is None and [child.spec.name for child in launcher.processes][0] == "safety-0"
+
+
 def say(launcher: Launcher, topic: Topic, message: object) -> None:
     payload = message if isinstance(message, bytes) else message.SerializeToString()
     launcher._inbox.append(Sample(topic, topic.at(robot="ground", source="a"), payload, 1))
