@@ -22,7 +22,7 @@ def launcher(tmp_path: Path) -> Launcher:
 
 def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
     launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
-    assert launcher.figures()["log"] is None and [child.spec.name for child in launcher.processes][0] == "safety-0"
+    assert launcher.figures()["log"] is None and launcher.processes[0].spec.name == "safety-0"
 
 
 def say(launcher: Launcher, topic: Topic, message: object) -> None:
