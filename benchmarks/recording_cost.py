@@ -77,10 +77,10 @@ def run() -> Figures:
             pairs.append((found[True], found[False]))
     recorded, bare = np.array(pairs).T
     cost = 100.0 * (1.0 - recorded / bare)
-    share = {"% of the run's processor time": 100 * float(np.mean(shares))}
+    recorder = {"% of the run's processor time": 100 * float(np.mean(shares))}
     spread = {"%, mean": float(cost.mean()), "%, least": float(cost.min()), "%, most": float(cost.max())}
     return {
-        "with a recorder": {"steps/s": float(recorded.mean())} | share,
+        "with a recorder": {"steps/s": float(recorded.mean())} | recorder,
         "without": {"steps/s": float(bare.mean())},
         "cost of recording": spread,
     }

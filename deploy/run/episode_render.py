@@ -219,7 +219,7 @@ class _FilmAxes:
         """Draw the proposed and the executed input, and the edge of the half-space that blocks the proposal."""
         drawn: list[Any] = []
         for label, way in (("proposed", why.proposed), ("executed", why.executed)):
-            style = {"width": 0.12 * self.robot.footprint, "color": ARROWS[label], "zorder": 9}
+            style: dict[str, Any] = {"width": 0.12 * self.robot.footprint, "color": ARROWS[label], "zorder": 9}
             arrow = FancyArrow(*frame.position[:2], *way[:2], length_includes_head=True, **style)
             drawn.append(self.axes.add_patch(arrow))
         flat = float(np.hypot(*why.normal[:2])) if len(why.at) else 0.0

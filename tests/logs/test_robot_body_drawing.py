@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from brakeline.deploy.run.episode_render import Film, Frame, _FilmAxes
 from brakeline.logs import foxglove_scene
-from brakeline.logs.decision_view import body_discs
+from brakeline.logs.decision_view import body_discs, decision_view
 from brakeline.logs.watch.dashboard import RobotPanel
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import staged_arena
 from tests.browser import CHROMIUM, Page
@@ -27,8 +28,7 @@ def test_foxglove_has_a_cylinder_for_each_disc() -> None:
 
 
 def test_a_film_draws_the_body_at_its_heading() -> None:
-    none = np.zeros((0, 2))
-    film = Film(CAR, staged_arena(), [Frame(AT, HEADING, "allowed", none, none, none, 0.0)], AT, "cut")
+    film = Film(CAR, staged_arena(), [Frame(AT, HEADING, "allowed", decision_view(None, pb.Exchange()))], AT, "cut")
     drawn = _FilmAxes(film, Figure().subplots())._body(AT, HEADING, "allowed")
     middles = np.array([circle.center for circle in drawn[:2]])
     assert np.allclose(middles, [(1.0, 2.11), (1.0, 1.89)]) and [c.radius for c in drawn[:2]] == [0.155, 0.155]
