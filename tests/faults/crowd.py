@@ -27,18 +27,15 @@ import numpy as np
 import zenoh
 
 from benchmarks import situations
-from benchmarks.safety_processes import cells, used
+from benchmarks.safety_processes import cells, keys_for, used, with_plan_tokens
 from benchmarks.timing import Figures, stalls
 from brakeline.deploy.interpreter import spawning
 from brakeline.errors import BusError, Late
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.bus_settings import open_session
-from brakeline.messaging.bus.certificate_authority import Authority
-from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE, STEP
 from brakeline.safety.service.client import query_service
-from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 
 RATE = 50.0  # Hz of the asker
 DEADLINE = 0.1  # s
@@ -164,14 +161,8 @@ def _ask(settings: BusSettings, questions: list[pb.Request]) -> dict[str, float]
 def run(rate: int = JUNK) -> Figures:
     """Compare answers without and with junk messages of each kind at `rate` [1/s]."""
     with tempfile.TemporaryDirectory() as name:
-        keys = Path(name) / "keys"
-        authority = Authority(keys)
-        for one in ("router-0", "safety-0", "client", "actor-0", "recorder"):
-            authority.issue(one)
-        write_key(keys)
-        authenticator, questions = PlanAuthenticator.of(keys), situations.messages("trained")
-        for question in questions:
-            question.plan_token = authenticator.plan_token(question, robot_named(question.robot))
+        keys = keys_for(Path(name) / "keys", "router-0", "safety-0", "client", "actor-0", "recorder")
+        questions = with_plan_tokens(situations.messages("trained"), keys)
         with cells(1, keys) as (endpoints, services, routers):
             settings = BusSettings(connect=tuple(endpoints), keys=keys)
             alone = _ask(settings, questions)
