@@ -8,23 +8,11 @@ service refuses the whole world, and all its robots brake inside their reservati
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from brakeline.errors import AskedApart
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
-
-
-@dataclass
-class FleetReservations:
-    """The current reservations of the robots of one world, by their actors' names."""
-
-    reservations: dict[str, Reservation]
-
-    def to(self, name: str) -> OtherReservations | None:
-        """Return the reservations of the other robots."""
-        return OtherReservations.to([reservation for other, reservation in self.reservations.items() if other != name])
 
 
 def check_fleet(requests: Sequence[pb.Request]) -> None:
@@ -66,18 +54,11 @@ def group_by_fleet(requests: Sequence[pb.Request]) -> list[list[int]]:
     return alone + list(shared.values())
 
 
-def joint_request(
-    requests: Sequence[pb.Request], reservation: Callable[[pb.Request], Reservation]
-) -> FleetReservations:
-    """Return the reservations of the robots of one world before any of them is decided.
-
-    Args:
-        requests: of the world.
-        reservation: returns the current reservation of a request's robot; raises BadRequest if it has none.
-
-    Raises:
-        AskedApart: the requests do not belong together.
-        BadRequest: a reservation is missing or not valid.
-    """
-    check_fleet(requests)
-    return FleetReservations({request.actor: reservation(request) for request in requests})
+def reservations_for(
+    name: str, reservations: Mapping[str, Reservation] | None
+) -> tuple[Reservation | None, OtherReservations | None]:
+    """Return the robot's own reservation and those of the others; None for a robot without a fleet."""
+    if reservations is None:
+        return None, None
+    others = [reservation for other, reservation in reservations.items() if other != name]
+    return reservations[name], OtherReservations.to(others)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -14,15 +14,15 @@ from brakeline.errors import BadModel, BadRequest, BusError, NoModel, StaleModel
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import check_for_filter
+from brakeline.safety.filter.request import Decision, check_for_filter
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.methods import Method, Model, load, ready
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.joint_request import FleetReservations, group_by_fleet, joint_request
+from brakeline.safety.service.joint_request import check_fleet, group_by_fleet, reservations_for
 from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.request_digest import digest
 from brakeline.safety.service.signature import SignedModel, TrustedSigners
@@ -110,26 +110,28 @@ class ServiceCounts:
 
     decisions: int = 0
     errors: int = 0
-    violations: int = 0
     compared: int = 0
+    violations: int = 0
     unverified: int = 0
     token_rejected: int = 0
     not_finite: int = 0  # decisions on proposals with NaN or infinity
     decide_ms: float = 0.0
     busy_time: float = 0.0  # s
 
+    def add(self, decision: Decision, finite: bool) -> None:
+        """Count a decision; finite: whether its proposal was."""
+        self.decisions += 1
+        self.decide_ms += decision.time_ms
+        self.compared += decision.compared
+        self.violations += not decision.contained
+        self.unverified += not decision.verified
+        self.not_finite += not finite
+
     def figures(self) -> dict[str, float]:
-        mean = self.decide_ms / max(self.decisions, 1)
-        return {
-            "decisions": self.decisions,
-            "errors": self.errors,
-            "compared": self.compared,
-            "violations": self.violations,
-            "unverified": self.unverified,
-            "token_rejected": self.token_rejected,
-            "not_finite": self.not_finite,
-            "decide_ms": mean,
-        }
+        """Return the counters, with the mean time of a decision [ms]."""
+        figures = dataclasses.asdict(self) | {"decide_ms": self.decide_ms / max(self.decisions, 1)}
+        del figures["busy_time"]
+        return figures
 
 
 def batch_handler(
@@ -145,84 +147,97 @@ def batch_handler(
         authenticator: checks the plan tokens. Without one (in process, or when a log is replayed), every plan counts as
             verified by the model that the request names.
     """
+    return BatchHandler(models, counts, authenticator).handle
 
-    def decide(message: pb.Request, received: int, shared: FleetReservations | None = None) -> pb.Reply:
-        try:
-            method = models.method_for(message)
-            authentic = authenticator is None or authenticator.is_authentic(message, method.robot)
-            if not authentic:
-                counts.token_rejected += 1
-                message.model = UNVERIFIED
-            if shared is None:
-                request = request_of(message, method.robot)
-            else:
-                own = shared.reservations[message.actor]
-                request = request_of(message, method.robot, own, shared.to(message.actor))
-            queue_ms = (perf_counter_ns() - received) * 1e-6
-            decision = method.decide(request)
-        except (BadRequest, UnknownRobot) as error:
-            counts.errors += 1
-            return error_reply(error)
-        except Exception as error:  # the robot brakes on the error reply, and the service goes on
-            counts.errors += 1
-            log.exception("decide failed for %s", message.actor or message.robot)
-            return error_reply(error)
-        counts.decisions += 1
-        counts.decide_ms += decision.time_ms
-        counts.compared += decision.compared
-        counts.unverified += not decision.verified
-        counts.not_finite += not request.finite
-        if not decision.contained:
-            counts.violations += 1
-            log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
-        if shared is not None and decision.reservation is not None:
-            shared.reservations[message.actor] = decision.reservation
-        reply = decision_reply(decision, queue_ms)
-        reply.robot, reply.decision.token_rejected = method.robot.name, not authentic
-        if authenticator is not None and decision.verified:
-            reply.decision.plan_tokens.extend(authenticator.plan_tokens(message, reply.decision, method.robot))
+
+@dataclass(frozen=True)
+class BatchHandler:
+    """The stages from a batch to its replies. See `batch_handler` for the attributes."""
+
+    models: ModelRegistry
+    counts: ServiceCounts
+    authenticator: PlanAuthenticator | None
+
+    def handle(self, payload: bytes) -> bytes:
+        """Return the replies to a batch. Raises BadRequest if the bytes are not a batch."""
+        received = perf_counter_ns()
+        batch = batch_of(payload)
+        replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
+        for world in group_by_fleet(batch.requests):
+            messages = [batch.requests[i] for i in world]
+            for i, reply in zip(world, self._decide_world(messages, received), strict=True):
+                replies[i] = reply
+        reply = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
+        self.counts.busy_time += (perf_counter_ns() - received) * 1e-9
         return reply
 
-    def current_reservation(message: pb.Request) -> Reservation:
+    def _decide_world(self, messages: Sequence[pb.Request], received: int) -> list[pb.Reply]:
+        """Return the replies about the robots of one world; received: time of receipt [ns]."""
+        if not messages[0].fleet:
+            return [self._decide(message, received) for message in messages]
+        try:
+            check_fleet(messages)
+            reservations = {message.actor: self._current_reservation(message) for message in messages}
+        except (BadRequest, UnknownRobot) as error:
+            return [self._refuse(error) for _ in messages]
+        return [self._decide(message, received, reservations) for message in messages]
+
+    def _current_reservation(self, message: pb.Request) -> Reservation:
         """Return the reservation of a fleet's robot. One that stands without it reserves the space it stands in."""
-        method = models.method_for(message)
+        method = self.models.method_for(message)
         if not isinstance(method, Filter):
             raise BadRequest("fleet", "only the filter makes reservations: the rivals predict nothing")
         robot = method.robot
         if robot.late:
-            raise BadRequest(
-                "fleet", f"{robot.name}: a robot in real time gets its decisions too late for reservations"
-            )
+            why = f"{robot.name}: a robot in real time gets its decisions too late for reservations"
+            raise BadRequest("fleet", why)
         if message.HasField("reservation"):
             return reservation_of(message.reservation, robot)
         request = request_of(message, robot)
         check_for_filter(robot, request)
         if not request.still(robot):
-            raise BadRequest(
-                "reservation", f"{message.actor} moves without a reservation: no robot can keep away from it"
-            )
+            why = f"{message.actor} moves without a reservation: no robot can keep away from it"
+            raise BadRequest("reservation", why)
         return method.standing_reservation(request.state)
 
-    def answer(payload: bytes) -> bytes:
-        received = perf_counter_ns()
-        batch = batch_of(payload)
-        replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
-        for world in group_by_fleet(batch.requests):
-            members = [batch.requests[i] for i in world]
-            try:
-                shared = joint_request(members, current_reservation) if members[0].fleet else None
-            except (BadRequest, UnknownRobot) as error:
-                counts.errors += len(members)
-                for i in world:
-                    replies[i] = error_reply(error)
-                continue
-            for i, request in zip(world, members, strict=True):
-                replies[i] = decide(request, received, shared)
-        reply = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
-        counts.busy_time += (perf_counter_ns() - received) * 1e-9
+    def _decide(
+        self, message: pb.Request, received: int, reservations: dict[str, Reservation] | None = None
+    ) -> pb.Reply:
+        """Return the reply about one robot; reservations: of its world's robots, in which its own is replaced."""
+        try:
+            method = self.models.method_for(message)
+            token_rejected = self._reject_token(message, method.robot)
+            own, others = reservations_for(message.actor, reservations)
+            request = request_of(message, method.robot, own, others)
+            queue_ms = (perf_counter_ns() - received) * 1e-6
+            decision = method.decide(request)
+        except (BadRequest, UnknownRobot) as error:
+            return self._refuse(error)
+        except Exception as error:  # the robot brakes on the error reply, and the service goes on
+            log.exception("decide failed for %s", message.actor or message.robot)
+            return self._refuse(error)
+        self.counts.add(decision, request.finite)
+        if not decision.contained:
+            log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
+        if reservations is not None and decision.reservation is not None:
+            reservations[message.actor] = decision.reservation
+        reply = decision_reply(decision, queue_ms)
+        reply.robot, reply.decision.token_rejected = method.robot.name, token_rejected
+        if self.authenticator is not None and decision.verified:
+            reply.decision.plan_tokens.extend(self.authenticator.plan_tokens(message, reply.decision, method.robot))
         return reply
 
-    return answer
+    def _reject_token(self, message: pb.Request, robot: Robot) -> bool:
+        """Return whether a request's plan token does not match its plan. If so, mark the plan as unverified."""
+        rejected = self.authenticator is not None and not self.authenticator.is_authentic(message, robot)
+        if rejected:
+            self.counts.token_rejected += 1
+            message.model = UNVERIFIED
+        return rejected
+
+    def _refuse(self, error: Exception) -> pb.Reply:
+        self.counts.errors += 1
+        return error_reply(error)
 
 
 @dataclass(frozen=True)
