@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from brakeline.errors import BadRequest, SafetyError
-from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
@@ -16,11 +15,11 @@ from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import check_for_filter
 from brakeline.safety.service.client import SafetyClient, read_reply, request_message
-from brakeline.safety.service.filter_client import Answer, FilterClient, accept
+from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.in_process import InProcess
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.robots import GROUND
 from tests.safety.asked import cylinder, request
+from tests.safety.served import ServiceClient
 
 LATE = GROUND.in_real_time()
 AHEAD = cylinder(0.34, 0.0)
@@ -35,26 +34,6 @@ def late(data_folder):
     return model_for(LATE, ModelConfig())
 
 
-class Wire:
-    """A client and the service's core, without a bus."""
-
-    def __init__(self, model):
-        models = ModelRegistry(accept_bound=1.0)
-        models.install(model)
-        self.ask, self.robot, self.backup_plan = (
-            batch_handler(models, ServiceCounts()),
-            model.robot,
-            BackupPlan(model.robot),
-        )
-
-    def decide(self, state, action, obstacles=None, **more):
-        asked = request_message(self.backup_plan, state, action, obstacles, **more)
-        batch = pb.ReplyBatch.FromString(self.ask(pb.RequestBatch(requests=[asked]).SerializeToString()))
-        answer = read_reply(batch.replies[0], asked, self.robot)
-        accept(self.backup_plan, answer)
-        return answer
-
-
 def equal(one, other):
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other)
@@ -64,7 +43,7 @@ def equal(one, other):
 
 
 def test_an_answer_in_process_is_the_answer_of_a_service(model):
-    alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
+    alone, asked = InProcess(Filter(model), accept_bound=1.0), ServiceClient(model)
     kinds = set()
     for action, away in (([0.1, 0.1], 3.0), ([float("nan"), 0.0], 3.0), ([0.25, 0.0], 0.4), ([0.25, 0.0], 0.3)):
         one, other = (client.decide(np.zeros(5), action, [cylinder(away, 0.0)]) for client in (alone, asked))
@@ -77,7 +56,7 @@ def test_an_answer_in_process_is_the_answer_of_a_service(model):
 
 
 @pytest.mark.parametrize(
-    "ask", [lambda model: InProcess(Filter(model), accept_bound=1.0), Wire], ids=["in process", "service"]
+    "ask", [lambda model: InProcess(Filter(model), accept_bound=1.0), ServiceClient], ids=["in process", "service"]
 )
 def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
     client = ask(late)
@@ -152,7 +131,7 @@ def test_a_value_of_another_type_is_refused_with_its_field(client, field, more, 
 
 def test_a_request_without_obstacles_scan_or_map_is_refused(model):
     """An empty list or a dropped scan does not mean that space is free."""
-    alone, asked = InProcess(Filter(model), accept_bound=1.0), Wire(model)
+    alone, asked = InProcess(Filter(model), accept_bound=1.0), ServiceClient(model)
     blocked = [client.decide(np.zeros(5), [0.25, 0.0], [], scan=WALL) for client in (alone, asked)]
     assert [answer.kind for answer in blocked] == ["failsafe", "failsafe"]
     for nothing in ((), (None,), ([],)):
@@ -185,11 +164,10 @@ def test_the_quick_check_and_the_full_check_both_need_known_space(ready, predict
 
 
 def test_a_tube_of_another_robot_is_refused(model):
-    asked = Wire(model)
+    asked = ServiceClient(model)
     question = request_message(asked.backup_plan, np.zeros(5), [0.1, 0.0], [AHEAD])
-    payload = pb.RequestBatch(requests=[question]).SerializeToString()
     for change in (lambda d: d.tube_center.pop(), lambda d: d.tube_half_width.__setitem__(0, float("inf"))):
-        (reply,) = pb.ReplyBatch.FromString(asked.ask(payload)).replies
+        (reply,) = asked.service.replies(question)
         change(reply.decision)
         with pytest.raises(SafetyError, match="tube") as caught:
             read_reply(reply, question, GROUND)

@@ -11,7 +11,7 @@ from brakeline.messaging.topics import DECIDE
 from brakeline.safety.service.fleet_client import FleetClient
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
-from tests.safety.test_server import Service
+from tests.safety.served import Service
 from tests.safety.unicycle import Unicycle
 
 POST = Obstacle("cylinder", (0.0, 0.8), (0.1,))

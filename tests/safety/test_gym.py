@@ -1,4 +1,4 @@
-"""The wrapper, its vector form, the filter without an environment, and data collected through environments."""
+"""The wrapper and its vector form in front of small environments, and data that these environments record."""
 
 import gymnasium
 import numpy as np
@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.deploy.data.environment_episodes import collect
-from brakeline.errors import BadData, BadRequest, Mismatch
+from brakeline.errors import BadData, BadRequest, Mismatch, NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, normalised
@@ -24,6 +24,18 @@ from tests.safety.toys import Toy, car, discs, near, puck, seen
 
 CAR, PUCK = car("gym-car"), puck("gym-puck")
 HOW = {"state": seen, "obstacles": near, "actions": normalised(CAR)}
+SCANNED = {"state": seen, "actions": normalised(CAR)}
+BOTH = pytest.mark.parametrize("many", [False, True], ids=["one", "vector"])
+
+
+def wrapped(env, ready, many=False, penalty=0.0, **how):
+    """Wrap one environment, or a vector that holds it alone, and reset it."""
+    if many:
+        one = env
+        env = gymnasium.vector.SyncVectorEnv([lambda: one])
+    env = (VectorSafetyWrapper if many else SafetyWrapper)(env, ready, penalty, accept_bound=1.0, **how)
+    env.reset(seed=0)
+    return env
 
 
 @pytest.fixture(scope="module")
@@ -73,16 +85,12 @@ def test_an_action_space_of_another_kind_is_refused_unless_mapped(space):
 
 
 def test_an_error_names_the_missing_entry(ready):
-    env = SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, actions=normalised(CAR))
     with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(np.zeros(2))
-    env.reset(seed=0)
+        SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, **HOW).step(np.zeros(2))
     with pytest.raises(Mismatch, match=r"no 'state' \(the measured state.*give state=, a callable"):
-        env.step(np.zeros(2))
-    env = SafetyWrapper(Toy(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
-    env.reset(seed=0)
+        wrapped(Toy(CAR), ready, actions=normalised(CAR)).step(np.zeros(2))
     with pytest.raises(Mismatch, match="no 'obstacles'"):
-        env.step(np.zeros(2))
+        wrapped(Toy(CAR), ready, **SCANNED).step(np.zeros(2))
     assert STATE(None, None, {"state": 3}) == 3
 
 
@@ -98,36 +106,25 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     assert ModelSet.load(tmp_path / "model.safetensors").version == told["model"]
 
 
-def test_the_client_in_process_decides_like_the_wrapper(ready):
-    env, alone = SafetyWrapper(Toy(CAR, discs()), ready, accept_bound=1.0, **HOW), InProcess(ready, accept_bound=1.0)
-    observation, _ = env.reset(seed=1)
-    for _ in range(30):
-        alone.decide(observation, [0.6, 0.0], discs())
-        observation, _, _, _, info = env.step(np.array([1.0, 0.0]))
-        assert np.array_equal(alone.backup_plan.next_input, info["diagnostics"]["executed"])
-    assert np.array_equal(alone.fallback(), alone.backup_plan.input_in_force)
-    alone.reset()
-    assert not alone.backup_plan.input_in_force.any()
-
-
 class Silent(SafetyClient):
     """A client whose service does not answer."""
 
     def __init__(self):
         self.robot, self.backup_plan = CAR, BackupPlan(CAR)
 
-    def decide(self, *asked, **more):
-        from brakeline.errors import NoReply
-
+    def decide(self, *values, **more):
+        self.asked = more
         raise NoReply("nobody serves")
 
 
 def test_without_a_service_the_backup_plan_continues():
-    env = SafetyWrapper(Toy(CAR), Silent(), **HOW)
-    env.reset(seed=0)
+    client = Silent()
+    env = SafetyWrapper(Toy(CAR), client, **HOW)
+    observation, _ = env.reset(seed=0)
     *_, info = env.step(np.array([1.0, 0.0]))
     assert info["diagnostics"]["kind"] == UNANSWERED and "nobody serves" in info["diagnostics"]["reason"]
-    assert not info["diagnostics"]["executed"].any(), "that is standing still"
+    assert not info["diagnostics"]["executed"].any(), "the robot stands"
+    assert np.array_equal(client.asked["observation"], observation.astype(np.float32)), "the rivals need it"
 
 
 @pytest.mark.parametrize("mode", list(gymnasium.vector.AutoresetMode))
@@ -182,37 +179,23 @@ class Walled(Toy):
 
 
 def test_a_vector_decides_by_scans_too(ready):
-    many = gymnasium.vector.SyncVectorEnv([lambda: Walled(CAR)] * 2)
-    vector = VectorSafetyWrapper(many, ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
-    vector.reset(seed=0)
-    *_, infos = vector.step(np.ones((2, 2), np.float32))
-    alone = SafetyWrapper(Walled(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
-    alone.reset(seed=0)
-    *_, info = alone.step(np.ones(2, np.float32))
-    assert info["diagnostics"]["margin"] < 0.3, "it is near"
-    assert infos["diagnostics"]["margin"][0] == info["diagnostics"]["margin"]
+    margins = []
+    for many in (False, True):
+        *_, info = wrapped(Walled(CAR), ready, many, **SCANNED).step(np.ones((1, 2) if many else 2, np.float32))
+        margins.append(float(np.squeeze(info["diagnostics"]["margin"])))
+    assert margins[0] == margins[1] < 0.3, "the wall is near"
 
 
 def test_a_vector_view_without_lists_is_refused(ready):
-    vector = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR, discs())] * 2)
-    env = VectorSafetyWrapper(
-        vector, ready, accept_bound=1.0, state=seen, obstacles=lambda *_: [], actions=normalised(CAR)
-    )
-    env.reset(seed=0)
-    with pytest.raises(Mismatch, match="0 lists for 2 environments: give a list for each"):
-        env.step(np.ones((2, 2), np.float32))
+    env = wrapped(Toy(CAR, discs()), ready, many=True, obstacles=lambda *_: [], **SCANNED)
+    with pytest.raises(Mismatch, match="0 lists for 1 environments: give a list for each"):
+        env.step(np.ones((1, 2), np.float32))
 
 
-@pytest.mark.parametrize("many", [False, True])
+@BOTH
 def test_an_empty_list_means_free_space_and_none_means_unknown_space(ready, many):
     def stepped(near):
-        env = Toy(CAR)
-        if many:
-            env = gymnasium.vector.SyncVectorEnv([lambda: Toy(CAR)])
-        wrapper = VectorSafetyWrapper if many else SafetyWrapper
-        how = {"state": seen, "actions": normalised(CAR)}
-        env = wrapper(env, ready, accept_bound=1.0, obstacles=lambda *_: [near] if many else near, **how)
-        env.reset(seed=0)
+        env = wrapped(Toy(CAR), ready, many, obstacles=lambda *_: [near] if many else near, **SCANNED)
         *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
         return info["diagnostics"]["kind"]
 
@@ -222,8 +205,7 @@ def test_an_empty_list_means_free_space_and_none_means_unknown_space(ready, many
 
 
 def test_a_missing_scan_frees_nothing(ready):
-    env = SafetyWrapper(Walled(CAR), ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
-    env.reset(seed=0)
+    env = wrapped(Walled(CAR), ready, **SCANNED)
     *_, before = env.step(np.array([-1.0, 0.0]))
     env.unwrapped.blind = True
     for _ in range(3):
@@ -232,22 +214,16 @@ def test_a_missing_scan_frees_nothing(ready):
     assert after["diagnostics"]["margin"] == pytest.approx(before["diagnostics"]["margin"], abs=0.02)
     for _ in range(round(MAX_SCAN_AGE / CAR.period) + CAR.horizon):
         *_, after = env.step(np.array([1.0, 0.0]))
-    told = after["diagnostics"]
-    assert told["kind"] == "failsafe" and "s old" in told["reason"] and CAR.is_stop_input(told["executed"]), (
-        "nor is an old one"
-    )
+    figures = after["diagnostics"]
+    assert figures["kind"] == "failsafe" and "s old" in figures["reason"], "an old scan frees nothing either"
+    assert CAR.is_stop_input(figures["executed"])
 
 
-@pytest.mark.parametrize("many", [False, True])
+@BOTH
 def test_before_the_first_scan_nothing_is_free(ready, many):
     env = Walled(CAR)
     env.blind = True
-    if many:
-        env = gymnasium.vector.SyncVectorEnv([lambda: env])
-    wrap = VectorSafetyWrapper if many else SafetyWrapper
-    env = wrap(env, ready, accept_bound=1.0, state=seen, actions=normalised(CAR))
-    env.reset(seed=0)
-    *_, info = env.step(np.ones((1, 2) if many else 2, np.float32))
+    *_, info = wrapped(env, ready, many, **SCANNED).step(np.ones((1, 2) if many else 2, np.float32))
     assert np.all(info["diagnostics"]["kind"] == "failsafe")
 
 
@@ -284,15 +260,10 @@ def test_a_stop_by_feedback_follows_the_measured_state():
 @given(st.floats(0.0, 0.05), st.floats(-1.0, 1.0))
 def test_a_puck_keeps_still_only_by_its_feedback(residual, push):
     state = np.array([0.0, 0.0, residual, 0.0])
-    kept = BackupPlan(PUCK)
-    kept.seen = state
-    plan = np.zeros((PUCK.horizon, 2))
-    plan[0] = PUCK.stop_by_feedback(plan[0], state, plan[0])
-    moving = plan.copy()
-    moving[0, 1] = push
-    kept.accept(plan, "v", None, True)
-    assert (kept.model == "") == (residual <= PUCK.stopped)
-    other = BackupPlan(PUCK)
-    other.seen = state
-    other.accept(moving, "v", None, True)
-    assert other.model == ("" if residual <= PUCK.stopped and abs(push) <= 2e-6 else "v"), "a push is no standing"
+    for sideways, standing in ((0.0, residual <= PUCK.stopped), (push, residual <= PUCK.stopped and abs(push) <= 2e-6)):
+        backup_plan, plan = BackupPlan(PUCK), np.zeros((PUCK.horizon, 2))
+        backup_plan.seen = state
+        plan[0] = PUCK.stop_by_feedback(plan[0], state, plan[0])
+        plan[0, 1] += sideways
+        backup_plan.accept(plan, "v", None, True)
+        assert backup_plan.model == ("" if standing else "v")

@@ -1,24 +1,15 @@
 """The wrapper passes safe actions and replaces unsafe ones."""
 
-from dataclasses import replace
-
 import gymnasium
 import numpy as np
 import pytest
 
-from brakeline.errors import NoReply
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.gym import SafetyWrapper
-from brakeline.safety.service.client import SafetyClient
-from brakeline.sim.navigation_env import NavigationEnv
-from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
 from tests.safety.unicycle import Unicycle
 
-NAN, INF = float("nan"), float("inf")
 AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
 
 
@@ -77,7 +68,7 @@ def test_the_wrapper_replaces_and_penalises_unsafe_actions(ready):
     assert max(costs) > 1.0
 
 
-@pytest.mark.parametrize("wrong", [NAN, INF, -INF])
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf")])
 def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     env = SafetyWrapper(Yard(), ready, penalty=1.0, accept_bound=1.0)
     env.reset(seed=2)
@@ -96,27 +87,3 @@ def test_every_episode_starts_standing(ready):
     env.reset(seed=4)
     assert not env.backup_plan.input_in_force.any()
     assert env.backup_plan.predicted is None
-
-
-def test_a_filter_needs_only_the_model_set(model):
-    assert Filter(replace(model, about={})).version == model.version
-
-
-class Hearing(SafetyClient):
-    """A client of a service that does not answer."""
-
-    def __init__(self) -> None:
-        self.robot, self.backup_plan, self.asked = GROUND, BackupPlan(GROUND), {}
-
-    def decide(self, *asked, **more):
-        self.asked = more
-        raise NoReply("nobody serves")
-
-
-def test_the_wrapper_sends_the_observation_to_a_service():
-    """The rivals refuse every request without it."""
-    client = Hearing()
-    env = SafetyWrapper(NavigationEnv(GROUND), client)
-    observation, _ = env.reset(seed=0)
-    env.step(np.zeros(2, np.float32))
-    assert np.array_equal(client.asked["observation"], observation)

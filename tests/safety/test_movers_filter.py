@@ -7,12 +7,12 @@ import pytest
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
-from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.obstacle_motion import Motion, Sighting
-from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
+from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import obstacles_of
 from brakeline.sim.arena import room_boundary
 from brakeline.sim.traffic import Crowd, CrowdSensor, MoverKind
@@ -37,14 +37,14 @@ def ask(obstacles, **more):
     return request(obstacles=still, movers=movers, **more)
 
 
-def test_one_that_comes_is_stopped_for_and_one_that_leaves_is_followed(ready):
+def test_the_robot_stops_for_a_mover_that_comes_and_follows_one_that_leaves(ready):
     assert ready.decide(ask([walker(0.9, velocity=(-1.0, 0.0))])).kind != ALLOWED
     assert ready.decide(ask([walker(0.9, velocity=(1.0, 0.0))])).kind == ALLOWED
     assert ready.decide(request(obstacles=[Obstacle("cylinder", (0.9, 0.0), (0.2,))])).kind == ALLOWED
 
 
-def test_who_can_only_come_once_it_stands_is_let_come(ready, model):
-    """After two of three periods it stands: who may be there in the third stops no plan."""
+def test_a_mover_that_arrives_after_the_robot_stands_stops_no_plan(ready, model):
+    """The robot stands after two of three periods."""
     never = Filter(replace(model, stands=0))
     at = [walker(0.9 + far, velocity=(-1.0, 0.0)) for far in np.arange(0.0, 0.6, 0.02)]
     soon, late = ([f.decide(ask([one])).kind == ALLOWED for one in at] for f in (ready, never))
@@ -58,7 +58,7 @@ def test_no_obstacle_that_stands_does_not_mean_that_nothing_is_near(ready):
     assert decision.kind in (ADJUSTED, FAILSAFE) and decision.verified
 
 
-def test_who_breaks_its_bound_is_counted_and_the_robot_brakes(ready):
+def test_a_mover_that_breaks_its_bound_is_counted_and_the_robot_brakes(ready):
     before = Sighting((5.0, 0.0), (0.0, 0.0), 0.2)
     driving = {"state": (0, 0, 0, 0.25, 0), "plan": np.zeros((3, 2)), "model": ready.version}
     good = ready.decide(ask([walker(0.9, before=replace(before, position=(0.9, 0.0)))], **driving))
@@ -70,12 +70,12 @@ def test_who_breaks_its_bound_is_counted_and_the_robot_brakes(ready):
     assert near.kind == FAILSAFE and not near.verified and not near.plan.any()
 
 
-def test_who_stands_needs_nobodys_word_though_somebody_comes(ready):
+def test_a_standing_robot_needs_no_verified_plan_when_a_mover_comes(ready):
     decision = ready.decide(ask([walker(0.31, velocity=(-1.0, 0.0))], action=(0.2, 0.0)))
     assert decision.kind == FAILSAFE and decision.verified and not decision.plan.any()
 
 
-def test_what_cannot_move_is_as_one_that_stands(ready):
+def test_a_mover_with_speed_zero_counts_as_a_standing_obstacle(ready):
     rng = np.random.default_rng(0)
     for _ in range(40):
         at = rng.uniform(-0.6, 0.6, 2)
@@ -89,8 +89,7 @@ def test_what_cannot_move_is_as_one_that_stands(ready):
         assert np.allclose(one.plan, other.plan, atol=1e-3)
 
 
-def test_a_request_without_movers_is_decided_as_ever(ready):
-    """Whether the field is there or not: to the last bit."""
+def test_a_mover_out_of_reach_changes_no_bit_of_the_decision(ready):
     rng = np.random.default_rng(1)
     for _ in range(20):
         near = Shapes.of([Obstacle("cylinder", tuple(rng.uniform(0.2, 0.6, 2)), (0.1,))], 2)
@@ -108,7 +107,7 @@ def test_movers_of_another_dimension_are_refused(ready):
     assert error.value.field == "obstacles"
 
 
-def test_a_motion_crosses_the_wire_whole():
+def test_a_motion_survives_the_wire():
     sent = [
         Obstacle("wall", (1.0, 0.0)),
         walker(0.5, age=0.1),
@@ -130,66 +129,52 @@ def pushing(k, rng, near):
 
 
 def contacts(ready, policy, seed, sees=True, steps=300):
-    """(touched while moving, touched while standing), judged by the discs at every substep."""
+    """Return the contacts while the robot moved and while it stood, judged by the discs at every substep."""
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed)
     rng = np.random.default_rng(seed)
-    robot, watch, kept = Unicycle((0.0, 0.0, 0.0), rng), CrowdSensor(crowd, rng), BackupPlan(GROUND)
+    robot, watch, safety = Unicycle((0.0, 0.0, 0.0), rng), CrowdSensor(crowd, rng), InProcess(ready, accept_bound=1.0)
     moving = standing = 0
     touching = False
     for k in range(steps):
         state = robot.measure()
         seen = watch.measure(k * GROUND.period)
-        still, movers = split_moving([*ROOM, *(seen if sees else ())], 2)
         places = np.array([o.position for o in seen]) - state[:2]
         nearest = places[np.argmin(np.linalg.norm(places, axis=1))]
         bearing = (np.arctan2(nearest[1], nearest[0]) - state[2] + np.pi) % (2 * np.pi) - np.pi
-        decision = ready.decide(
-            request(
-                state,
-                policy(k, rng, bearing),
-                still,
-                input_in_force=kept.input_in_force,
-                plan=kept.plan,
-                model=kept.model,
-                predicted=kept.predicted,
-                movers=movers,
-            )
-        )
-        u = kept.accept(decision.plan, decision.model, decision.predicted, decision.verified)
-        start, before = robot.state.copy(), robot.state[3]
+        u = safety.decide(state, policy(k, rng, bearing), [*ROOM, *(seen if sees else ())]).action
+        start = robot.state.copy()
         path, _ = robot.step(u)
-        cos, sin = np.cos(start[2]), np.sin(start[2])
-        for i, (x, y) in enumerate(path):
-            at = start[:2] + np.array([cos * x - sin * y, sin * x + cos * y])
+        for i, at in enumerate(start[:2] + rotate(path, start[2])):
             there, _ = crowd.at(k * GROUND.period + (i + 1) * DT)
             now = bool((np.linalg.norm(there - at, axis=1) < KIND.radius + GROUND.footprint).any())
             if now and not touching:
-                still_stood = not u.any() and max(abs(before), abs(robot.state[3])) <= STANDING
+                still_stood = not u.any() and max(abs(start[3]), abs(robot.state[3])) <= STANDING
                 moving, standing = moving + (not still_stood), standing + still_stood
             touching = now
     return moving, standing
 
 
-def test_a_filter_that_takes_a_robot_for_standing_too_soon_touches_them(model):
-    early = Filter(replace(model, stands=1))
-    assert sum(contacts(early, policy, seed)[0] for policy in (wild, pushing) for seed in range(2)) > 0
+def touches_in_motion(ready):
+    return sum(contacts(ready, policy, seed)[0] for policy in (wild, pushing) for seed in range(2)) > 0
+
+
+def test_a_filter_that_counts_a_robot_as_standing_too_soon_touches_movers(model):
+    assert touches_in_motion(Filter(replace(model, stands=1)))
 
 
 @pytest.mark.parametrize("policy", [wild, pushing])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_it_never_touches_anybody_while_it_moves(ready, policy, seed):
+def test_the_robot_touches_no_mover_while_it_moves(ready, policy, seed):
     moving, standing = contacts(ready, policy, seed)
     assert moving == 0
-    assert standing > 0  # else nobody came near, and this says nothing
+    assert standing > 0, "no mover came near"
 
 
-def test_who_does_not_see_them_does(ready):
+def test_a_robot_that_does_not_see_the_movers_touches_them(ready):
     assert contacts(ready, pushing, 0, sees=False)[0] > 0
 
 
-def test_a_filter_that_takes_them_for_standing_touches_them(model, monkeypatch):
-    """The mutant: as if nothing moved after it was measured."""
+def test_a_filter_that_ignores_motion_touches_movers(model, monkeypatch):
     monkeypatch.setattr(MovingObstacles, "moved", lambda self, times: np.zeros((len(self), len(times), 2)))
     monkeypatch.setattr(MovingObstacles, "radius", lambda self, times: np.zeros((len(self), len(times))))
-    blind = Filter(model)
-    assert sum(contacts(blind, policy, seed)[0] for policy in (wild, pushing) for seed in range(2)) > 0
+    assert touches_in_motion(Filter(model))

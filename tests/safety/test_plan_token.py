@@ -14,40 +14,29 @@ from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.filter_client import Answer, accept
 from brakeline.safety.service.plan_token import SIZE, PlanAuthenticator, write_key
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.safety.service.wire import decision_of
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.served import Service
 
 KEY = bytes(range(32))
 WALL = Obstacle("cylinder", (0.24, 0.0), (0.1,))  # so near that nothing but a stop could be verified before it
 LATE = QUADROTOR.in_real_time()
 
 
-class Service:
-    def __init__(self, model: ModelSet, key: bytes = KEY) -> None:
-        self.counts, models = ServiceCounts(), ModelRegistry(accept_bound=1.0)
-        models.install(model)
-        self._answer = batch_handler(models, self.counts, PlanAuthenticator(key))
-
-    def __call__(self, request: pb.Request) -> pb.Reply:
-        payload = pb.RequestBatch(requests=[request]).SerializeToString()
-        return pb.ReplyBatch.FromString(self._answer(payload)).replies[0]
-
-
 def driving(service: Service) -> tuple[BackupPlan, pb.Request]:
     """Return the backup plan of a driving robot, and its next honest request, in front of a wall that has come up."""
     backup_plan = BackupPlan(GROUND)
     request = request_message(backup_plan, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0")
-    accept(backup_plan, read_reply(service(request), request, GROUND))
+    accept(backup_plan, read_reply(service.replies(request)[0], request, GROUND))
     state = np.array(backup_plan.predicted.center)
     return backup_plan, request_message(backup_plan, state, [0.25, 0.0], [WALL], actor="actor-0")
 
 
 def test_a_request_with_its_token_counts_as_verified(model: ModelSet) -> None:
-    service = Service(model)
+    service = Service(model, key=KEY)
     _, request = driving(service)
     assert len(request.plan_token) == SIZE
-    decision = service(request).decision
+    decision = service.decision(request)
     assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, True, False)
     assert service.counts.token_rejected == 0
 
@@ -68,7 +57,7 @@ FORGERIES = {
 @pytest.mark.parametrize("changes", FORGERIES.values(), ids=FORGERIES.keys())
 def test_a_forged_request_does_not_count_as_verified(model: ModelSet, changes: dict[str, object]) -> None:
     """In front of a wall, where no new plan can be verified."""
-    service = Service(model)
+    service = Service(model, key=KEY)
     _, request = driving(service)
     for name, value in changes.items():
         if isinstance(value, list):
@@ -76,28 +65,18 @@ def test_a_forged_request_does_not_count_as_verified(model: ModelSet, changes: d
             getattr(request, name).extend(value)
         else:
             setattr(request, name, value)
-    decision = service(request).decision
+    decision = service.decision(request)
     assert (decision.kind, decision.verified, decision.token_rejected) == (pb.FAILSAFE, False, True)
     assert not decision.plan_tokens, "an unverified plan gets no token"
     assert service.counts.token_rejected == 1
-    trusting = ModelRegistry(accept_bound=1.0)
-    trusting.install(model)
-    payload = pb.RequestBatch(requests=[request]).SerializeToString()
-    believed = pb.ReplyBatch.FromString(batch_handler(trusting, ServiceCounts())(payload)).replies[0].decision
-    assert believed.verified, "without a key it would have counted"
+    assert Service(model).decision(request).verified, "without a key it counts"
 
 
 def test_replicas_share_the_key_and_others_do_not(model: ModelSet) -> None:
-    first, replica, stranger = Service(model), Service(model), Service(model, KEY[::-1])
+    first, replica, stranger = Service(model, key=KEY), Service(model, key=KEY), Service(model, key=KEY[::-1])
     _, request = driving(first)
-    assert replica(request).decision.verified
-    assert not stranger(request).decision.verified
-
-
-def test_standing_still_needs_no_token(model: ModelSet) -> None:
-    request = request_message(BackupPlan(GROUND), np.zeros(5), [0.0, 0.0], [WALL], actor="actor-0")
-    decision = Service(model)(request).decision
-    assert decision.verified and not decision.token_rejected
+    assert replica.decision(request).verified
+    assert not stranger.decision(request).verified
 
 
 def plan_of(robot: Robot, rng: np.random.Generator) -> np.ndarray:
@@ -133,10 +112,10 @@ def test_each_period_has_its_token_until_the_robot_stands(robot: Robot) -> None:
 
 
 def test_an_unverified_plan_gets_no_token_and_needs_none(model: ModelSet) -> None:
-    service = Service(model)
+    service = Service(model, key=KEY)
     _, request = driving(service)
     request.model, request.plan_token = UNVERIFIED, b""
-    decision = service(request).decision
+    decision = service.decision(request)
     assert not decision.verified and not decision.token_rejected and not decision.plan_tokens
 
 
@@ -144,14 +123,12 @@ def test_the_key_of_the_tokens_is_in_the_folder_of_keys(tmp_path: Path) -> None:
     write_key(tmp_path)
     first = (tmp_path / "vouchers.key").read_bytes()
     write_key(tmp_path)
-    assert (tmp_path / "vouchers.key").read_bytes() == first, "it is not drawn anew"
+    assert (tmp_path / "vouchers.key").read_bytes() == first, "a second call keeps the key"
     assert (tmp_path / "vouchers.key").stat().st_mode & 0o077 == 0
-    said = pb.Decision(plan=[0.1, 0, 0, 0, 0, 0], model="abc")
-    asked = pb.Request(robot="ground")
-    made = [
-        PlanAuthenticator.of(folder).plan_tokens(asked, said, GROUND) for folder in (tmp_path, tmp_path, None, None)
-    ]
-    assert made[0] == made[1] and made[2] != made[3] and made[0] != made[2]
+    decision, request = pb.Decision(plan=[0.1, 0, 0, 0, 0, 0], model="abc"), pb.Request(robot="ground")
+    authenticators = map(PlanAuthenticator.of, (tmp_path, tmp_path, None, None))
+    tokens = [one.plan_tokens(request, decision, GROUND) for one in authenticators]
+    assert tokens[0] == tokens[1] and tokens[2] != tokens[3] and tokens[0] != tokens[2]
     (tmp_path / "vouchers.key").write_bytes(b"short")
     with pytest.raises(BadKey):
         PlanAuthenticator.of(tmp_path)

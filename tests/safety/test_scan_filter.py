@@ -1,4 +1,4 @@
-"""Decisions from scans alone: what is not seen free is kept off, in the closed loop too."""
+"""Decisions from scans alone: the filter keeps off all space that the scan does not show to be free."""
 
 import math
 from dataclasses import fields, replace
@@ -14,8 +14,9 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE, check_for_filter
-from brakeline.safety.perception.visibility_memory import FanMemory
+from brakeline.safety.perception.image_memory import memory_of
 from brakeline.safety.service.client import request_message
+from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import batch_of, request_of
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
@@ -37,7 +38,7 @@ def taken(true, measured, rng, blind=0.0):
     return Scan(ranges, FAN, tuple(measured[:3].tolist()), far=FAR, least_width=WIDTH, **error)
 
 
-def test_an_image_without_known_beams_leaves_nothing_free(ready):
+def test_a_scan_without_known_beams_leaves_nothing_free(ready):
     blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
     decision = ready.decide(request(scan=blind))
     assert decision.kind == FAILSAFE and not decision.plan.any()
@@ -50,8 +51,8 @@ def test_obstacles_count_beside_a_scan(ready):
     assert ready.decide(request(scan=clear, obstacles=ahead)).kind != ALLOWED
 
 
-def test_who_stands_where_something_comes_near_stays_where_it_is(ready):
-    """It turned about before a walker, `recovering`, and was touched in motion: only what stands is a corner."""
+def test_a_standing_robot_stays_where_it_is_when_something_comes_near(ready):
+    """It must not recover: only a standing obstacle can corner it."""
     for away in (0.25, 0.4, 0.55, -0.25, -0.4, -0.55):
         comes = [Obstacle("cylinder", (away + math.copysign(0.2, away), 0.0), (0.2,))]
         ranges = cast(comes, np.zeros(2), FAN)
@@ -63,27 +64,17 @@ def test_who_stands_where_something_comes_near_stays_where_it_is(ready):
 @pytest.mark.parametrize("blind", [0.0, math.radians(30.0)])
 def test_a_hostile_driver_touches_nothing_and_is_not_held_for_good(ready, blind):
     rng = np.random.default_rng(1)
-    robot, kept, memory = Unicycle((0.0, 0.0, 0.5), rng), BackupPlan(GROUND), FanMemory(GROUND.footprint)
+    robot, safety, memory = Unicycle((0.0, 0.0, 0.5), rng), InProcess(ready, accept_bound=1.0), memory_of(GROUND)
     shapes, closest, turned = Shapes.of(ROOM, 2), math.inf, 0.0
     for k in range(100):
         state = robot.measure()
-        way = shapes.towards(state[:2])
-        nearest = way[np.argmin(np.linalg.norm(way, axis=1))]
+        away = shapes.towards(state[:2])
+        nearest = away[np.argmin(np.linalg.norm(away, axis=1))]
         turn = math.remainder(math.atan2(nearest[1], nearest[0]) - state[2], math.tau)
         action = (0.25, np.clip(turn / 0.2, -0.5, 0.5)) if k % 40 < 25 else (0.25, 0.5)
-        decision = ready.decide(
-            request(
-                state,
-                action,
-                scan=memory.fill(taken(robot.state, state, rng, blind), GROUND.period),
-                input_in_force=kept.input_in_force,
-                plan=kept.plan,
-                model=kept.model,
-                predicted=kept.predicted,
-            )
-        )
+        scan = memory.fill(taken(robot.state, state, rng, blind), GROUND.period)
         before = robot.state[2]
-        robot.step(kept.accept(decision.plan, decision.model, decision.predicted, decision.verified))
+        robot.step(safety.decide(state, action, scan=scan).action)
         turned += abs(robot.state[2] - before)
         closest = min(closest, shapes.distance(robot.state[:2]).min())
     assert closest > GROUND.footprint
@@ -101,33 +92,33 @@ def test_a_scan_crosses_the_wire():
     assert request_of(message, GROUND).scan is not None and message.ByteSize() < 3500
 
 
-def test_scans_that_are_none_are_refused(ready):
-    message = request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), scan=Scan(np.ones(360), FAN, (0.0,) * 3))
-    message.scan.ranges[5] = -1.0
-    with pytest.raises(BadRequest) as error:
-        request_of(message, GROUND)
-    assert error.value.field == "scan"
-    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3))
-    message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
-    with pytest.raises(BadRequest) as error:
-        check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
-    assert error.value.field == "scan"
+GROUND_SCAN, SPACE_IMAGE = Scan(np.ones(360), FAN, (0.0,) * 3), RangeImage(np.ones((45, 90)), (0.0,) * 3)
 
 
-def test_an_image_is_for_robots_in_space(ready):
-    image = RangeImage(np.ones((45, 90)), (0.0, 0.0, 0.0))
-    message = request_message(BackupPlan(GROUND), np.zeros(5), np.zeros(2), scan=image)
+@pytest.mark.parametrize(
+    ("robot", "sensed", "change", "field"),
+    [
+        (GROUND, GROUND_SCAN, lambda m: m.scan.ranges.__setitem__(5, -1.0), "scan"),
+        (QUADROTOR, GROUND_SCAN, lambda m: None, "scan"),
+        (GROUND, SPACE_IMAGE, lambda m: None, "image"),
+        (QUADROTOR, SPACE_IMAGE, lambda m: m.scan.CopyFrom(scan_message(GROUND_SCAN)), "scan"),
+    ],
+    ids=["negative range", "scan in space", "image in the plane", "both"],
+)
+def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robot, sensed, change, field):
+    message = request_message(BackupPlan(robot), np.zeros(robot.state_dim), np.zeros(robot.action_dim), scan=sensed)
+    change(message)
     with pytest.raises(BadRequest) as error:
-        check_for_filter(GROUND, request_of(message, GROUND))
-    assert error.value.field == "image"
-    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
+        check_for_filter(robot, request_of(message, robot))
+    assert error.value.field == field
+
+
+def test_a_robot_in_space_may_send_an_image():
+    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=SPACE_IMAGE)
     check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
-    message.scan.CopyFrom(scan_message(Scan(np.ones(360), FAN, (0.0,) * 3)))
-    with pytest.raises(BadRequest, match="not both"):
-        request_of(message, QUADROTOR)
 
 
-def test_an_actors_batch_of_many_images_is_none_too_large():
+def test_a_batch_may_hold_24_images_but_not_48():
     image = RangeImage(np.ones((90, 180)), (0.0, 0.0, 0.0))
     message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=image)
     assert len(batch_of(pb.RequestBatch(requests=[message] * 24).SerializeToString()).requests) == 24

@@ -11,12 +11,11 @@ from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE
-from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import SafetyClient, query_service, read_reply, request_message
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
-from brakeline.safety.service.wire import MAX_BATCH_SIZE, request_of
+from brakeline.safety.service.wire import MAX_BATCH_SIZE
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.served import Service
 from tests.safety.unicycle import Unicycle
 
 NAN, INF = float("nan"), float("inf")
@@ -27,51 +26,22 @@ def good(**more):
     return request_message(BackupPlan(GROUND), np.zeros(5), [0.2, 0.1], [AHEAD], actor="actor-0", **more)
 
 
-class Service:
-    """The service's core, called with bytes."""
-
-    def __init__(self, *models: ModelSet, archive=None):
-        self.models, self.counts = ModelRegistry(archive, accept_bound=1.0), ServiceCounts()
-        for model in models:
-            self.models.install(model)
-        self.answer = batch_handler(self.models, self.counts)
-
-    def replies(self, *requests):
-        payload = pb.RequestBatch(requests=requests).SerializeToString()
-        return list(pb.ReplyBatch.FromString(self.answer(payload)).replies)
-
-    def error(self, request):
-        reply = self.replies(request)[0]
-        assert reply.WhichOneof("result") == "error"
-        return reply.error
-
-
 @pytest.fixture
 def service(model):
     return Service(model)
 
 
-def test_replies_are_in_the_order_of_the_requests(service, model):
-    replies = service.replies(*(good(step=i) for i in range(5)), good(time=2.0))
-    assert len(replies) == 6
-    for reply in replies:
+def test_each_request_of_a_batch_has_its_reply_in_order(service, model):
+    """A bad request does not affect the others."""
+    replies = service.replies(good(), bad(action=[0.0]), good(time=2.0))
+    assert [reply.WhichOneof("result") for reply in replies] == ["decision", "error", "decision"]
+    for reply in replies[::2]:
         answer = read_reply(reply, good(), GROUND)
-        assert answer.kind in ("allowed", "adjusted")
+        assert answer.kind in ("allowed", "adjusted") and answer.verified
         assert answer.model == model.version
-        assert answer.verified
         assert answer.time_ms > 0
-    assert service.counts.figures()["decisions"] == 6
-    assert service.counts.errors == 0
-
-
-def test_the_wire_changes_no_decision(service, ready):
-    message = good()
-    direct = ready.decide(request_of(message, GROUND))
-    answer = read_reply(service.replies(message)[0], message, GROUND)
-    assert np.array_equal(answer.plan, direct.plan)
-    assert answer.kind == direct.kind
-    assert answer.margin == direct.margin
-    assert list(answer.predicted.half_width) == list(direct.predicted.half_width)
+    figures = service.counts.figures()
+    assert (figures["decisions"], figures["errors"]) == (2, 1) and figures["decide_ms"] > 0.0
 
 
 def bad(**changes):
@@ -96,22 +66,17 @@ def with_obstacle(**changes):
     ("field", "message"),
     [
         ("state", bad(state=[NAN, 0, 0, 0, 0])),
-        ("state", bad(state=[INF, 0, 0, 0, 0])),
         ("state", bad(state=[0.0] * 4)),
         ("state", bad(state=[])),
         ("action", bad(action=[0.0] * 3)),
         ("action", bad(action=[NAN])),
-        ("input_in_force", bad(input_in_force=[INF, 0])),
         ("input_in_force", bad(input_in_force=[5.0, 0])),
         ("plan", bad(plan=[0.0] * 5)),
         ("plan", bad(plan=[0.0] * 600)),
-        ("plan", bad(plan=[NAN] * 6)),
-        ("plan", bad(plan=[9.0, 0, 0, 0, 0, 0])),
         ("plan", bad(plan=[0.1, 0, 0.1, 0, 0.1, 0])),
         ("observation", bad(observation=[NAN] * 3)),
         ("predicted_center", bad(predicted_center=[0.0] * 2, predicted_half_width=[0.0] * 2)),
         ("predicted_half_width", bad(predicted_center=[0.0] * 5)),
-        ("predicted_half_width", bad(predicted_center=[0.0] * 5, predicted_half_width=[NAN] * 5)),
         ("robot", bad(robot="submarine")),
         ("robot", bad(robot="")),
         ("obstacles", bad(obstacles=[])),
@@ -136,23 +101,11 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert read_reply(service.replies(good())[0], good(), GROUND).verified
 
 
-def test_a_bad_request_does_not_affect_the_others_of_its_batch(service):
-    replies = service.replies(good(), bad(action=[0.0]), good())
-    assert [reply.WhichOneof("result") for reply in replies] == ["decision", "error", "decision"]
-
-
-def test_bytes_that_are_no_batch_are_refused_and_the_service_goes_on(service):
+def test_the_service_refuses_bytes_that_are_not_a_batch_and_goes_on(service):
     rng = np.random.default_rng(0)
     whole = pb.RequestBatch(requests=[good()]).SerializeToString()
-    for payload in (
-        rng.bytes(10 << 20),
-        bytes(MAX_BATCH_SIZE + 1),
-        b"",
-        b"\xff" * 50,
-        rng.bytes(500),
-        whole[:-3],
-        whole[:40],
-    ):
+    too_large = rng.bytes(10 << 20), bytes(MAX_BATCH_SIZE + 1)
+    for payload in (*too_large, b"", b"\xff" * 50, rng.bytes(500), whole[:-3], whole[:40]):
         with pytest.raises(BadRequest) as caught:
             service.answer(payload)
         assert caught.value.field in ("payload", "requests")
@@ -160,7 +113,7 @@ def test_bytes_that_are_no_batch_are_refused_and_the_service_goes_on(service):
 
 
 def test_random_damage_never_gets_an_unchecked_decision(service):
-    """A flipped byte may make another valid request; whatever comes back is an error or a plan within bounds."""
+    """A changed byte may make another valid request. The reply is an error or a plan within bounds."""
     rng = np.random.default_rng(1)
     whole = bytearray(pb.RequestBatch(requests=[good()]).SerializeToString())
     for _ in range(300):
@@ -233,7 +186,7 @@ def test_violations_and_unverified_decisions_are_counted(service, caplog):
     assert (figures["violations"], figures["compared"], figures["unverified"]) == (2, 2, 1)
 
 
-# --- what the client believes -------------------------------------------------------------------------------------
+# --- replies that the client refuses ----------------------------------------------------------------------------------
 
 
 def test_the_client_refuses_a_bad_reply(service):
@@ -292,8 +245,7 @@ def test_a_replayed_reply_is_refused(service):
 
 
 def test_a_plan_that_violates_the_slew_limit_is_refused():
-    """Its first input must follow the one in force within the slew, every other the one before; and it is about this
-    robot."""
+    """The client compares each input with the one before, and the robot's name with its own."""
     flying = BackupPlan(QUADROTOR)
     question = request_message(flying, np.zeros(QUADROTOR.state_dim), [1.0, 0.0, 0.0], known_free=True)
     zero = np.zeros(QUADROTOR.state_dim)

@@ -10,18 +10,18 @@ import pytest
 from brakeline.errors import TooLoose
 from brakeline.logs.decision_explanation import bound_in, explain
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.stated_share import describe_verification, percent, rounded_up
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound, plans_needed, refusal, stated_bound
 from brakeline.safety.service.in_process import InProcess
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import ModelRegistry
 from brakeline.safety.service.wire import decision_of, decision_reply
 from tests.robots import GROUND
+from tests.safety.asked import request
 from tests.safety.rivals.test_sailr import known as rival
+from tests.safety.served import Service
 
 FLOWN = {"bound_plan": "0.2613", "windows": "15", "violations": "0", "minutes": "15"}
 TIGHT = {"bound_plan": "0.0042", "windows": "1981", "violations": "2", "minutes": "200"}
@@ -134,18 +134,13 @@ def test_a_rival_states_nothing_and_is_not_asked_to():
 
 def test_every_decision_carries_the_bound_there_and_back(model):
     for about, bound in ((TIGHT, 0.0042), ({}, 1.0), ({"bound_plan": "nan"}, 1.0)):
-        models = ModelRegistry(accept_bound=1.0)
-        models.install(said(model, about))
-        batch = pb.RequestBatch(requests=[message()]).SerializeToString()
-        reply = pb.ReplyBatch.FromString(batch_handler(models, ServiceCounts())(batch)).replies[0]
-        assert bound_in(reply.decision) == bound
-        assert decision_of(reply.decision, GROUND).bound == bound
+        decision = Service(said(model, about)).decision(message())
+        assert bound_in(decision) == bound
+        assert decision_of(decision, GROUND).bound == bound
 
 
 def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
-    state = np.zeros(5)
-    plan = np.zeros((GROUND.horizon, 2))
-    decision = Filter(model).decide(Request(state, np.zeros(2), np.zeros(2), plan, Shapes.of([], 2), known_free=True))
+    decision = Filter(model).decide(request())
     old = decision_reply(dataclasses.replace(decision, bound=None), 0.0).decision
     assert not old.HasField("bound") and decision_of(old, GROUND).bound is None
     old.bound = math.nan
@@ -159,9 +154,9 @@ def test_verified_is_said_with_what_it_is_worth(model):
     )
     assert describe_verification(False, 0.001) == "not verified"
     assert "no bound" in describe_verification(True, None) and "states no bound" in describe_verification(True, 1.0)
-    request = message()
+    question = message()
     decision = pb.Decision(kind=pb.ALLOWED, verified=True, plan=[0.0] * 6, bound=0.26)
-    assert "at most 26 %" in explain(GROUND, request, decision).trust
+    assert "at most 26 %" in explain(GROUND, question, decision).trust
     decision.kind, decision.reason = pb.FAILSAFE, "the proposal's tube comes too near"
-    about = explain(GROUND, request, decision)
+    about = explain(GROUND, question, decision)
     assert "verified before (at most 26 % of such plans leave their tube)" in about.said and not about.trust

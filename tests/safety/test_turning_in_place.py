@@ -1,4 +1,4 @@
-"""Turning on the spot: a robot that sweeps nothing by it may do so beside anything, and one that would may not."""
+"""Turning in place: a round robot may turn beside anything, and a long one may not sweep an obstacle."""
 
 from dataclasses import replace
 
@@ -8,20 +8,19 @@ import pytest
 from brakeline.messaging.obstacle import Shapes, rotate
 from brakeline.messaging.robot import Disc
 from brakeline.messaging.robot_description import robot_from_description
-from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
-from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.turning_in_place import standing_limits
 from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import FREE, PLAN
+from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder
 from tests.safety.test_closed_loop import ROOM
 from tests.safety.unicycle import Unicycle
-from tests.safety.unicycle import record as record_ground
 
 ROBOT = robot_from_description(
     {
@@ -48,7 +47,7 @@ FAST = 1.5  # rad/s
 
 
 def wandering(rng, count):
-    """Inputs that follow no plan: targets held for a while, some of them turns on the spot, and stops."""
+    """Return inputs that follow no plan: targets held for a while, some of them turns in place, and stops."""
     inputs = []
     while len(inputs) < count:
         target = rng.uniform(ROBOT.low(), ROBOT.high())
@@ -60,7 +59,7 @@ def wandering(rng, count):
     return np.array(inputs[:count])
 
 
-def record(seed, trajectories=30, robot=ROBOT, turns=True):
+def record(seed, trajectories=30, turns=True):
     parts = []
     for i in range(trajectories):
         rng = np.random.default_rng((seed, i))
@@ -68,14 +67,8 @@ def record(seed, trajectories=30, robot=ROBOT, turns=True):
         inputs = wandering(rng, 200)
         if not turns:
             inputs[inputs[:, 0] == 0.0] = 0.0
-        states, paths, turned = [vehicle.measure()], [], []
-        for u in inputs:
-            path, turn = vehicle.step(u)
-            states.append(vehicle.measure())
-            paths.append(path)
-            turned.append(turn)
-        parts.append(Trajectory(np.array(states), inputs, np.array(paths), np.array(turned)))
-    return Dataset(robot, tuple(parts))
+        parts.append(vehicle.trajectory(inputs))
+    return Dataset(ROBOT, tuple(parts))
 
 
 @pytest.fixture(scope="module")
@@ -102,33 +95,31 @@ def pillars(gap, count, radius=0.1, body=0.15):
     return [cylinder(away * np.cos(a), away * np.sin(a), radius) for a in angles]
 
 
-def turn(ready, obstacles, rate, noise=0.0, steps=80, seed=1, sides=(-1.0, 1.0)):
-    """Proposals to turn on the spot to these sides in closed loop; (decisions, angle turned [rad], least distance of
-    the body to an obstacle [m])."""
-    rng = np.random.default_rng(seed)
-    robot = ready.robot
-    vehicle, kept, shapes = Unicycle((0.0, 0.0, 0.0), rng), BackupPlan(robot), Shapes.of(obstacles, 2)
-    decisions, angle, least, side = [], 0.0, np.inf, 0.0
+def turn(ready, obstacles, rate, noise=0.0, steps=80, sides=(-1.0, 1.0)):
+    """Propose turns in place to these sides in closed loop.
+
+    Returns the answers, the angle turned [rad], and the least distance of the body to an obstacle [m].
+    """
+    rng = np.random.default_rng(1)
+    vehicle, safety = Unicycle((0.0, 0.0, 0.0), rng), InProcess(ready, accept_bound=1.0)
+    shapes, answers, angle, least, side = Shapes.of(obstacles, 2), [], 0.0, np.inf, 0.0
     for k in range(steps):
         side = rng.choice(sides) if k % 5 == 0 else side
         proposal = np.array([abs(rng.normal(0.0, noise)) if noise else 0.0, side * rate])
-        answer = ready.decide(
-            Request(vehicle.measure(), proposal, kept.input_in_force, kept.plan, shapes, kept.model, kept.predicted)
-        )
-        decisions.append(answer)
-        _, turned = vehicle.step(kept.accept(answer.plan, answer.model, answer.predicted, answer.verified))
+        answers.append(safety.decide(vehicle.measure(), proposal, obstacles))
+        _, turned = vehicle.step(answers[-1].action)
         angle += abs(turned)
-        for disc in robot.body:
-            centre = vehicle.state[:2] + rotate(np.array(disc.at), vehicle.state[2])
-            least = min(least, float(shapes.distance(centre).min()) - disc.radius)
-    return decisions, angle, least
+        for disc in ready.robot.body:
+            center = vehicle.state[:2] + rotate(np.array(disc.at), vehicle.state[2])
+            least = min(least, float(shapes.distance(center).min()) - disc.radius)
+    return answers, angle, least
 
 
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("gap", [0.05, 0.04, 0.03])
 @pytest.mark.parametrize("rate", [0.5, FAST])
 def test_a_round_robot_turns_on_the_spot_between_pillars(turner, gap, count, rate):
-    """All predictors in one: 80 of 80 decisions braked or slowed the turn at 3 cm, as if turning led aside by 0.2 m."""
+    """With one bound for all plans, the filter would brake each turn at 3 cm."""
     decisions, angle, least = turn(Filter(turner), pillars(gap, count), rate)
     assert {decision.kind for decision in decisions} == {ALLOWED}
     assert all(decision.verified for decision in decisions)
@@ -145,13 +136,13 @@ def test_a_proposal_that_also_creeps_is_adjusted_to_turning(turner, rate):
     assert angle > 0.6 * 80 * ROBOT.period * rate and least > 0.0
 
 
-def test_the_shipped_kind_of_recording_supports_it_too(ready):
+def test_the_ground_robot_turns_in_place_too(ready):
     for gap in (0.05, 0.04, 0.03):
         decisions, angle, _ = turn(ready, pillars(gap, 4, body=GROUND.footprint), 0.5)
         assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 6.0
 
 
-def test_what_the_predictors_in_place_state_holds_on_fresh_data(turner, driving):
+def test_the_predictors_in_place_hold_on_fresh_data(turner, driving):
     found = validate(turner, driving, record(1, trajectories=120))
     assert found.in_place_windows > 500
     assert found.bound_in_place == upper_bound(found.in_place_violations, found.in_place_windows)
@@ -164,30 +155,26 @@ def test_what_the_predictors_in_place_state_holds_on_fresh_data(turner, driving)
 
 
 def test_fresh_turns_stay_in_the_tubes_that_were_verified_for_them(turner):
-    """Of plans from standing and from turning, every period's end: true positions against the decision's sets."""
-    ready, rng, outside, plans = Filter(turner), np.random.default_rng(5), 0, 400
-    shapes = Shapes.of(pillars(0.04, 4), 2)
+    """Compare true positions at the end of every period with the decision's sets, from standing and from turning."""
+    ready, rng, outside, plans, obstacles = Filter(turner), np.random.default_rng(5), 0, 400, pillars(0.04, 4)
     for _ in range(plans):
-        vehicle, kept = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng), BackupPlan(ROBOT)
+        vehicle, safety = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng), InProcess(ready, accept_bound=1.0)
         for _ in range(int(rng.integers(4))):  # in force before
             vehicle.step(before := np.array([0.0, rng.uniform(-FAST, FAST)]))
-            kept.input_in_force = before
-        ask = Request(
-            vehicle.measure(), np.array([0.0, rng.uniform(-FAST, FAST)]), kept.input_in_force, kept.plan, shapes
-        )
-        answer = ready.decide(ask)
+            safety.backup_plan.input_in_force = before
+        answer = safety.decide(vehicle.measure(), np.array([0.0, rng.uniform(-FAST, FAST)]), obstacles)
         assert answer.kind == ALLOWED
         left = False
-        for u, centre, half in zip(answer.plan, answer.tube_center, answer.tube_half_width, strict=True):
+        for u, center, half in zip(answer.plan, answer.tube_center, answer.tube_half_width, strict=True):
             vehicle.step(u)
-            left |= bool((np.abs(vehicle.state[:2] - centre) > half).any())
+            left |= bool((np.abs(vehicle.state[:2] - center) > half).any())
         outside += left
     assert outside <= 0.01 * plans
 
 
 @pytest.mark.parametrize("rate", [0.5, FAST])
 def test_a_body_that_would_sweep_something_does_not_turn_into_it(long_turner, rate):
-    """Its nose would hit the pillars beside it, which a round body of the same width passes."""
+    """Its nose would hit the pillars that a round body of the same width passes."""
     assert long_turner.in_place is not None
     for side in (-1.0, 1.0):
         decisions, angle, least = turn(Filter(long_turner), pillars(0.04, 2), rate, sides=[side])
@@ -197,7 +184,7 @@ def test_a_body_that_would_sweep_something_does_not_turn_into_it(long_turner, ra
         assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 0.9 * 80 * ROBOT.period * rate
 
 
-def test_they_are_used_for_plans_in_place_of_a_standing_robot_and_no_others(turner):
+def test_the_predictors_in_place_serve_a_standing_robots_plans_in_place_and_no_others(turner):
     ready = Filter(turner)
     box, own = ready.in_place
     standing = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 1.0])  # [v, w, inputs in force, chosen inputs]
@@ -209,12 +196,12 @@ def test_they_are_used_for_plans_in_place_of_a_standing_robot_and_no_others(turn
     assert box.shape == (2, 6)
 
 
-def test_a_robot_without_such_plans_or_such_data_has_none():
+def test_a_robot_that_never_turns_in_place_has_no_predictors_in_place():
     assert standing_limits(QUADROTOR) is None
     assert fit_model_set(record(2, turns=False), ModelConfig(windows=FREE)).in_place is None
 
 
-def test_a_file_without_them_is_read_and_decides_by_one_tube(turner):
+def test_a_model_set_without_predictors_in_place_decides_by_one_tube(turner):
     before = replace(turner, in_place=None)
     again = ModelSet.decode(before.encode())
     assert again.in_place is None and again.version == before.version != turner.version
@@ -235,35 +222,29 @@ def wild(k, rng):
 
 @pytest.mark.parametrize("policy", [pushing, wild])
 def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, policy):
-    """It keeps a tenth of the clearance that one bound for all plans asks for."""
-    ready, rng, shapes = Filter(turner), np.random.default_rng(2), Shapes.of(ROOM, 2)
-    vehicle, kept, least, waiting, longest, way = Unicycle((0, 0, 0), rng), BackupPlan(ROBOT), np.inf, 0, 0, 0.0
-    failsafe = 0
+    rng, shapes, safety = np.random.default_rng(2), Shapes.of(ROOM, 2), InProcess(Filter(turner), accept_bound=1.0)
+    vehicle, least, waiting, longest, driven, failsafe = Unicycle((0, 0, 0), rng), np.inf, 0, 0, 0.0, 0
     for k in range(700):
         action = np.array(policy(k, rng))
-        answer = ready.decide(
-            Request(vehicle.measure(), action, kept.input_in_force, kept.plan, shapes, kept.model, kept.predicted)
-        )
+        answer = safety.decide(vehicle.measure(), action, ROOM)
         failsafe += answer.kind == FAILSAFE
         before = vehicle.state.copy()
-        path, turned = vehicle.step(kept.accept(answer.plan, answer.model, answer.predicted, answer.verified))
+        path, turned = vehicle.step(answer.action)
         waiting = waiting + 1 if abs(action[1]) > 0.5 and abs(turned) < 0.02 else 0
-        longest, way = max(longest, waiting), way + float(np.linalg.norm(path[-1]))
+        longest, driven = max(longest, waiting), driven + float(np.linalg.norm(path[-1]))
         least = min(least, float(shapes.distance(before[:2] + rotate(path, before[2])).min()) - 0.15)
-    assert 0.0 < least < 0.1 and longest < 12 and way > 4.0 and failsafe < 70
+    assert 0.0 < least < 0.1 and longest < 12 and driven > 4.0 and failsafe < 70
 
 
 @pytest.mark.parametrize("certificate", ["set-membership", "matrix-zonotope"])
-def test_the_other_certificates_have_them_too(driving, certificate):
+def test_the_other_error_bounds_have_predictors_in_place_too(driving, certificate):
     model = fit_model_set(driving, ModelConfig(certificate, windows=FREE))
     decisions, angle, _ = turn(Filter(model), pillars(0.05, 4), 0.5, steps=20)
     assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 1.4
 
 
-def test_recorded_plans_have_them_too():
-    """The ground robot's plans, whose windows have fewer regressors than all inputs."""
-    data = record_ground(trajectories=40, periods=300)
-    model = fit_model_set(data, ModelConfig())
+def test_recorded_plans_have_predictors_in_place_too(model, data, held_out):
+    """The windows of the ground robot's plans have fewer regressors than all inputs."""
     assert model.model_config.windows == PLAN and model.in_place is not None
-    found = validate(model, data, record_ground(trajectories=40, periods=300, seed=3))
-    assert found.in_place_windows > 100 and found.in_place_violations <= 0.02 * found.in_place_windows
+    report = validate(model, data, held_out)
+    assert report.in_place_windows > 100 and report.in_place_violations <= 0.02 * report.in_place_windows

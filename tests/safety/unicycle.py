@@ -1,4 +1,4 @@
-"""A kinematic robot for the tests of the filter: no physics engine, exact in its own way, and fast."""
+"""A kinematic robot for the tests of the filter: exact and fast, without a physics engine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Unicycle:
         return self.state + self.rng.uniform(-bound, bound)
 
     def step(self, u):
-        """One period; returns positions relative to the start in its frame (S, 2), and the heading change."""
+        """Drive for one period; return the positions (S, 2) in the frame of the start, and the change of heading."""
         dt = GROUND.period / SUBSTEPS
         start, path = self.state.copy(), np.zeros((SUBSTEPS, 2))
         x, y, heading, v, w = self.state
@@ -41,19 +41,23 @@ class Unicycle:
         self.state = np.array([x, y, heading, v, w])
         return path, heading - start[2]
 
+    def trajectory(self, inputs) -> Trajectory:
+        """Execute the inputs and record the trajectory."""
+        states, done, paths, turned = [self.measure()], [], [], []
+        for u in inputs:
+            path, turn = self.step(u)
+            states.append(self.measure())
+            done.append(u)
+            paths.append(path)
+            turned.append(turn)
+        return Trajectory(*(np.array(part) for part in (states, done, paths, turned)))
+
 
 def record(trajectories=40, periods=300, seed=0, **options) -> Dataset:
-    """A data set of this robot, excited as `brakeline collect` excites a real one."""
+    """Return a data set of this robot, excited as `brakeline collect` excites a real one."""
     parts = []
     for i in range(trajectories):
         rng = np.random.default_rng((seed, i))
         robot = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng, **options)
-        states, inputs, paths, turned = [robot.measure()], [], [], []
-        for u in itertools.islice(excitation(GROUND, rng), periods):
-            path, turn = robot.step(u)
-            states.append(robot.measure())
-            inputs.append(u)
-            paths.append(path)
-            turned.append(turn)
-        parts.append(Trajectory(*(np.array(a) for a in (states, inputs, paths, turned))))
+        parts.append(robot.trajectory(itertools.islice(excitation(GROUND, rng), periods)))
     return Dataset(GROUND, tuple(parts), {"origin": "unicycle"})

@@ -8,18 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.errors import BadModel, BadRequest
-from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import planar_rays
-from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
+from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.request import NOT_FINITE, Request
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
-from brakeline.safety.service.client import read_reply, request_message
-from brakeline.safety.service.filter_client import accept
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.served import ServiceClient
 
 WIDE = np.full(3, 10.0)
 SAME = 5e-3  # of scaled input: where the price of a violation ends is known to the solver's accuracy by its curvature
@@ -208,17 +205,10 @@ def test_a_model_without_rays_has_those_of_the_robots_usual_task():
         Secas(replace(known(), rays=None, robot=replace(GROUND, name="cart")))
 
 
-def test_the_service_answers_with_it_and_the_asker_brakes_when_it_falls_silent():
-    models = ModelRegistry()
-    models.install(known())
-    answer, backup_plan = batch_handler(models, ServiceCounts()), BackupPlan(GROUND)
-    for _ in range(2):  # the second request carries a plan that nobody vouches for
-        message = request_message(
-            backup_plan, np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist()
-        )
-        payload = pb.RequestBatch(requests=[message]).SerializeToString()
-        reply = read_reply(pb.ReplyBatch.FromString(answer(payload)).replies[0], message, GROUND)
-        executed = accept(backup_plan, reply)
-        assert reply.kind == "adjusted" and executed == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
-        assert backup_plan.model == UNVERIFIED and backup_plan.predicted is None
-    assert not backup_plan.fallback().any()
+def test_a_service_decides_by_secas_and_without_a_reply_the_client_brakes():
+    client = ServiceClient(known())
+    for _ in range(2):  # the second request has an unverified plan
+        answer = client.decide(np.zeros(5), [0.25, 0.3], known_free=True, observation=seen(0.25).tolist())
+        assert answer.kind == "adjusted" and answer.action == pytest.approx((0.25 * 0.05 / 0.06, 0.3), abs=1e-5)
+        assert client.backup_plan.model == UNVERIFIED and client.backup_plan.predicted is None
+    assert not client.backup_plan.fallback().any()
