@@ -82,15 +82,20 @@ class VectorSafetyWrapper(VectorWrapper):
             near = [None] * self.num_envs
         if len(near) != self.num_envs:
             raise Mismatch(f"obstacles has {len(near)} lists for {self.num_envs} environments: give a list for each")
-        answers = self.client.decide_all(
-            [self.backup_plans[i] for i in deciding],
-            [states[i] for i in deciding],
-            [proposed[i] for i in deciding],
-            [near[i] for i in deciding],
-            scans=[self._scans[i] for i in deciding],
-            observations=[request_observation(now[0][i] if isinstance(now[0], np.ndarray) else None) for i in deciding],
-            known_free=[near[i] is not None for i in deciding],
-        )
+        vectors = now[0] if isinstance(now[0], np.ndarray) else [None] * self.num_envs
+        requests = [
+            self.client.request(
+                self.backup_plans[i],
+                states[i],
+                proposed[i],
+                near[i],
+                scan=self._scans[i],
+                observation=request_observation(vectors[i]),
+                known_free=near[i] is not None,
+            )
+            for i in deciding
+        ]
+        answers = self.client.decide_all([self.backup_plans[i] for i in deciding], requests)
         executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
         space = self.env.action_space

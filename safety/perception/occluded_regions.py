@@ -23,7 +23,6 @@ Single = NDArray[np.float32]
 PLANES = 32  # half-spaces of a period at most; a period that needs more has no free space
 GIVE = 0.05  # share of the gap to a shadow that is given up for fewer half-spaces; it doubles after every eight
 DIRECTION_ERROR = 1e-6  # rad: largest error of a direction in single precision
-FACES = np.vstack([np.eye(3), -np.eye(3)])  # normals of a box
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ from brakeline.messaging.sensor_messages import RangeMeasurement, set_measuremen
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
-from brakeline.safety.service.request_digest import digest
-from brakeline.safety.service.wire import decision_of, reservation_message, reservation_of
+from brakeline.safety.service.wire import decision_of, digest, reservation_message, reservation_of
 
 Array = NDArray[np.float64]
 

@@ -66,33 +66,17 @@ class InProcess:
         Raises:
             BadRequest, BadShape: a value is missing, not finite, or has the wrong size or type; `field` names it.
         """
-        return self.decide_all(
-            [self.backup_plan],
-            [state],
-            [action],
-            [obstacles],
-            scans=[scan],
-            observations=[observation],
-            known_free=[known_free],
-        )[0]
+        request = self.request(
+            self.backup_plan, state, action, obstacles, scan=scan, observation=observation, known_free=known_free
+        )
+        return self.decide_all([self.backup_plan], [request])[0]
 
-    def decide_all(
-        self,
-        backup_plans: Sequence[BackupPlan],
-        states: Sequence[ArrayLike],
-        actions: Sequence[ArrayLike],
-        obstacles: Sequence[Iterable[Obstacle] | None],
-        *,
-        scans: Sequence[RangeMeasurement | None],
-        observations: Sequence[ArrayLike | None],
-        known_free: Sequence[bool],
-    ) -> list[Answer]:
-        """Decide for several robots of the kind, each with its own backup plan.
+    def decide_all(self, backup_plans: Sequence[BackupPlan], requests: Sequence[Request]) -> list[Answer]:
+        """Decide for several robots of the kind, each with its own backup plan and its `request`.
 
         It raises as `decide` does, before it commits to any plan.
         """
-        robots = zip(backup_plans, states, actions, obstacles, scans, observations, known_free, strict=True)
-        answers = [Answer.of(self.method.decide(self._request(*arguments)), self.robot) for arguments in robots]
+        answers = [Answer.of(self.method.decide(request), self.robot) for request in requests]
         for backup_plan, answer in zip(backup_plans, answers, strict=True):
             accept(backup_plan, answer)
         return answers
@@ -105,16 +89,18 @@ class InProcess:
         """Begin an episode with a robot that stands still."""
         self.backup_plan.reset()
 
-    def _request(
+    def request(
         self,
         backup_plan: BackupPlan,
         state: ArrayLike,
         action: ArrayLike,
-        obstacles: Iterable[Obstacle] | None,
-        scan: RangeMeasurement | None,
-        observation: ArrayLike | None,
-        known_free: bool,
+        obstacles: Iterable[Obstacle] | None = None,
+        *,
+        scan: RangeMeasurement | None = None,
+        observation: ArrayLike | None = None,
+        known_free: bool = False,
     ) -> Request:
+        """Return the request about a robot with this backup plan. Raises BadRequest if a value has another type."""
         measured = np.asarray(state, dtype=float)
         backup_plan.measured(measured)
         standing, moving = split_moving(obstacles_in(obstacles), self.robot.position_dim)

@@ -24,9 +24,8 @@ from brakeline.safety.methods import Method, Model, load, ready
 from brakeline.safety.model.stated_bound import check_bound
 from brakeline.safety.service.joint_request import check_fleet, group_by_fleet, reservations_for
 from brakeline.safety.service.plan_token import PlanAuthenticator
-from brakeline.safety.service.request_digest import digest
 from brakeline.safety.service.signature import SignedModel, TrustedSigners
-from brakeline.safety.service.wire import batch_of, decision_reply, error_reply, request_of, reservation_of
+from brakeline.safety.service.wire import batch_of, decision_reply, digest, error_reply, request_of, reservation_of
 
 log = logging.getLogger("brakeline.safety")
 

@@ -5,6 +5,7 @@ This module or `Filter.decide` checks every field of a request before its use.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 
 import numpy as np
@@ -31,6 +32,17 @@ MAX_BATCH_SIZE = 2**20  # bytes: about thirty requests with a range image each
 MAX_REQUESTS = 64  # of a batch
 MAX_OBSTACLES = 1000  # of all requests of a batch
 FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # wire types of protobuf; the others are one varint
+DIGEST_SIZE = 16  # bytes
+# Fields with the same name and value in a decision and in its message.
+SAME_FIELDS = (
+    *("margin", "at_least", "model", "reason", "verified", "contained", "compared"),
+    *("time_ms", "solve_ms", "verify_ms", "solver", "iterations", "broken"),
+)
+
+
+def digest(batch: bytes) -> bytes:
+    """Return a digest that names a batch of requests, nonce included, so that a reply can state its batch."""
+    return hashlib.sha256(batch).digest()[:DIGEST_SIZE]
 
 
 def batch_of(payload: bytes) -> pb.RequestBatch:
@@ -92,7 +104,7 @@ def request_of(
         message: about the robot.
         robot: of the method that decides.
         reservation: current one of a fleet's robot.
-        promised: reservations of the fleet's other robots.
+        other_reservations: of the fleet's other robots.
 
     Raises:
         BadRequest: an obstacle, a size or a value is wrong; `field` names it.
@@ -169,29 +181,15 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
         predicted_center=decision.predicted.center.tolist(),
         predicted_half_width=decision.predicted.half_width.tolist(),
         predicted_heading=decision.predicted.heading,
-        margin=decision.margin,
-        at_least=decision.at_least,
-        model=decision.model,
-        reason=decision.reason,
-        verified=decision.verified,
-        contained=decision.contained,
-        compared=decision.compared,
-        time_ms=decision.time_ms,
-        solve_ms=decision.solve_ms,
-        verify_ms=decision.verify_ms,
         queue_ms=queue_ms,
-        solver=decision.solver,
-        iterations=decision.iterations,
-        broken=decision.broken,
+        for_clearance=decision.for_clearance,
+        bound=decision.bound,
+        **{name: getattr(decision, name) for name in SAME_FIELDS},
     )
-    if decision.for_clearance is not None:
-        message.for_clearance = decision.for_clearance
     if (stopped := decision.blocked_by) is not None:
         message.stopped.by, message.stopped.room, message.stopped.after = stopped.by, stopped.room, stopped.after
         message.stopped.normal.extend(stopped.normal.tolist())
         message.stopped.at.extend(stopped.at.tolist())
-    if decision.bound is not None:
-        message.bound = decision.bound
     if decision.reservation is not None:
         message.reservation.CopyFrom(reservation_message(decision.reservation))
     return pb.Reply(decision=message)
@@ -221,19 +219,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         tube_center=tube[0].reshape(-1, d),
         tube_half_width=tube[1].reshape(-1, d),
         predicted=Prediction(array_of(m.predicted_center), array_of(m.predicted_half_width), m.predicted_heading),
-        margin=m.margin,
-        at_least=m.at_least,
-        model=m.model,
-        reason=m.reason,
-        verified=m.verified,
-        contained=m.contained,
-        compared=m.compared,
-        time_ms=m.time_ms,
-        solve_ms=m.solve_ms,
-        verify_ms=m.verify_ms,
-        solver=m.solver,
-        iterations=m.iterations,
-        broken=m.broken,
+        **{name: getattr(m, name) for name in SAME_FIELDS},
         blocked_by=stopped,
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,

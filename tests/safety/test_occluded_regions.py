@@ -13,7 +13,6 @@ from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.safety.perception.image_coverage import GridWindow, patch_free_ranges
 from brakeline.safety.perception.image_memory import DISTANCES, ImageMemory, _StoredImage
 from brakeline.safety.perception.occluded_regions import (
-    FACES,
     PLANES,
     PlanBoxes,
     _patches,
@@ -35,6 +34,7 @@ from tests.messaging.test_range_image import (
 )
 
 BODY, ORIGIN = 0.2, np.zeros(3)
+FACES = np.vstack([np.eye(3), -np.eye(3)])  # normals of a box
 
 
 def room(size=2.0, last=2.4):
