@@ -1,4 +1,4 @@
-"""What is left when nothing new can be verified: the committed plan, and who vouches for it."""
+"""The backup plan: the filter falls back to it, and only a verified one counts as verified."""
 
 from dataclasses import replace
 
@@ -13,12 +13,12 @@ from tests.safety.asked import STILL, cylinder, request
 
 
 def moving(tail=((0, 0), (0, 0), (0, 0)), x=0.215, **more):
-    """At full speed before an obstacle so near that only the committed plan is left."""
+    """Return a request at full speed, so near an obstacle that only the backup plan is left."""
     more = {"input_in_force": np.array([0.25, 0.0]), "plan": np.array(tail, float)} | more
     return request((0, 0, 0, 0.25, 0.0), (0.25, 0.0), [cylinder(x, 0)], **more)
 
 
-def test_failsafe_is_the_committed_plans_next_input(ready):
+def test_a_failsafe_is_the_backup_plans_next_input(ready):
     tail = ((0.0, 0.1), (0, 0), (0, 0))
     decision = ready.decide(moving(tail, model=ready.version))
     assert decision.kind == FAILSAFE
@@ -28,28 +28,23 @@ def test_failsafe_is_the_committed_plans_next_input(ready):
     assert "no verified input" in decision.reason
 
 
-def test_a_plan_that_nobody_vouches_for_is_not_called_verified(ready):
-    """No model's version although something moves; a plan marked as unverified; a prediction that did not hold."""
-    tail = ((0.2, 0.0), (0, 0), (0, 0))
-    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
-    for more in (
-        {"model": ""},
-        {"model": UNVERIFIED},
-        {"model": "0123456789ab"},
-        {"model": ready.version, "predicted": wrong},
-        {"model": "", "plan": STILL},
-    ):
-        decision = ready.decide(moving(tail, **more) if "plan" not in more else moving(**more))
-        assert decision.kind == FAILSAFE
-        assert not decision.verified
+@pytest.mark.parametrize("prediction", [False, True])
+@pytest.mark.parametrize("model", ["", UNVERIFIED, "0123456789ab", None], ids=str)
+def test_a_plan_counts_as_unverified_without_its_model_or_prediction(ready, model, prediction):
+    """The robot moves without a model's version, with another one, or outside its predicted set."""
+    if model is None and not prediction:
+        return
+    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0) if prediction else None
+    for tail in (((0.2, 0.0), (0, 0), (0, 0)), STILL):
+        decision = ready.decide(moving(tail, model=ready.version if model is None else model, predicted=wrong))
+        assert (decision.kind, decision.verified) == (FAILSAFE, False)
         assert not decision.plan.any(), "brake"
-        assert decision.contained == ("predicted" not in more)
-    assert not ready.decide(moving(model="", plan=STILL)).verified
+        assert decision.contained == (not prediction)
 
 
 @pytest.mark.parametrize("version", ["0123456789ab", UNVERIFIED])
 def test_an_older_models_tail_is_verified_anew(ready, version):
-    """Where there is room for it; but a tube from outside the recorded domain verifies nothing."""
+    """A tube from outside the recorded domain verifies nothing."""
     for x, in_domain, verified in ((0.6, True, True), (0.6, False, False), (0.215, True, False)):
         ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
@@ -86,26 +81,24 @@ def test_standing_still_needs_no_token(ready):
     assert not decision.plan.any()
 
 
-def test_what_was_not_verified_stays_so_until_the_robot_stands():
-    kept = BackupPlan(GROUND)
-    assert kept.model == ""
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v1", None, True)
-    assert kept.model == "v1"
-    assert np.array_equal(kept.input_in_force, [0.2, 0.1])
-    kept.fallback()
-    assert kept.model == "", "it stands on a verified plan"
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v1", None, True)
-    kept.accept(STILL, "v1", None, False)
-    assert kept.model == UNVERIFIED
-    kept.accept(STILL, "v1", None, False)
-    assert kept.model == UNVERIFIED
-    kept.fallback()
-    assert kept.model == "", "it has stood for a whole plan"
-    kept.accept(STILL, "v1", None, False)
-    kept.accept(np.array([[0.2, 0.1], [0, 0], [0, 0]]), "v2", None, True)
-    assert kept.model == "v2"
-    kept.reset()
-    assert (kept.model, kept.predicted) == ("", None)
+def test_an_unverified_plan_stays_unverified_until_the_robot_stands():
+    backup_plan, turning = BackupPlan(GROUND), np.array([[0.2, 0.1], [0, 0], [0, 0]])
+    assert backup_plan.model == ""
+    backup_plan.accept(turning, "v1", None, True)
+    assert backup_plan.model == "v1" and np.array_equal(backup_plan.input_in_force, [0.2, 0.1])
+    backup_plan.fallback()
+    assert backup_plan.model == "", "it stands on a verified plan"
+    backup_plan.accept(turning, "v1", None, True)
+    for _ in range(2):
+        backup_plan.accept(STILL, "v1", None, False)
+        assert backup_plan.model == UNVERIFIED
+    backup_plan.fallback()
+    assert backup_plan.model == "", "it has stood for a whole plan"
+    backup_plan.accept(STILL, "v1", None, False)
+    backup_plan.accept(turning, "v2", None, True)
+    assert backup_plan.model == "v2"
+    backup_plan.reset()
+    assert (backup_plan.model, backup_plan.predicted) == ("", None)
 
 
 def test_predictions_are_boxes_in_their_own_frame():
@@ -116,25 +109,21 @@ def test_predictions_are_boxes_in_their_own_frame():
     assert not box.contains(GROUND, np.array([np.nan, 2.0, 3.1, 0.1, 0.0]))
 
 
-def test_a_prediction_that_did_not_hold_is_not_forgotten_because_nobody_answered(ready):
-    """A robot that slid out of its set while the service was away has no verified plan any more."""
+@pytest.mark.parametrize(("x", "verified"), [(0.05, True), (0.2, False), (None, True)], ids=["in", "out", "unmeasured"])
+def test_a_robot_outside_its_predicted_set_has_no_verified_plan_after_a_missing_reply(ready, x, verified):
     driven = Prediction(np.array([0.05, 0.0, 0.0, 0.25, 0.0]), np.full(5, 0.01), 0.0)
-    tail = np.array(((0.2, 0.0), (0, 0), (0, 0)), float)
-    for x, model in ((0.05, ready.version), (0.2, UNVERIFIED)):
-        kept = BackupPlan(GROUND)
-        kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True, (b"word",) * 3)
-        kept.measured(np.array([x, 0.0, 0.0, 0.25, 0.0]))
-        kept.fallback()
-        assert kept.model == model and bool(kept.plan_token) == (model == ready.version)
-    kept = BackupPlan(GROUND)
-    kept.accept(np.vstack([[0.25, 0.0], tail[:-1]]), ready.version, driven, True)
-    kept.fallback()  # nothing was measured where the prediction speaks of it
-    assert kept.model == ready.version
+    backup_plan, plan = BackupPlan(GROUND), np.array([[0.25, 0.0], [0.2, 0.0], [0.0, 0.0]])
+    backup_plan.accept(plan, ready.version, driven, True, (b"word",) * 3)
+    if x is not None:
+        backup_plan.measured(np.array([x, 0.0, 0.0, 0.25, 0.0]))
+    backup_plan.fallback()
+    assert backup_plan.model == (ready.version if verified else UNVERIFIED)
+    assert bool(backup_plan.plan_token) == verified
 
 
 @pytest.mark.parametrize("bad", [np.full(5, np.nan), np.zeros(4), np.array([0.0, 0.0, np.inf, 0.0, 0.0])])
-def test_what_is_no_state_is_not_kept(bad):
-    kept = BackupPlan(GROUND)
-    kept.measured(np.arange(5.0))
-    kept.measured(bad)
-    assert np.array_equal(kept.seen, np.arange(5.0))
+def test_a_malformed_state_is_ignored(bad):
+    backup_plan = BackupPlan(GROUND)
+    backup_plan.measured(np.arange(5.0))
+    backup_plan.measured(bad)
+    assert np.array_equal(backup_plan.seen, np.arange(5.0))

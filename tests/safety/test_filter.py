@@ -1,4 +1,4 @@
-"""`decide`: what it lets through is clear of the obstacles and closest to the proposal, and what it refuses."""
+"""`Filter.decide`: verified plans keep off the obstacles and are closest to the proposal; bad requests are refused."""
 
 from dataclasses import replace
 
@@ -20,41 +20,35 @@ from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
 
 
-def test_far_from_everything_the_proposal_is_allowed(ready):
-    decision = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(2, 0)]))
+@pytest.mark.parametrize(
+    ("action", "executed"), [((0.2, -0.3), (0.2, -0.3)), ((7.0, -3.0), (0.25, -0.5))], ids=["within", "clipped"]
+)
+def test_far_from_everything_the_proposal_is_allowed_within_its_bounds(ready, action, executed):
+    decision = ready.decide(request(action=action, obstacles=[cylinder(2, 0)]))
     assert decision.kind == ALLOWED
     assert decision.reason == decision.solver == ""
-    assert np.array_equal(decision.plan, [[0.2, -0.3], [0, 0], [0, 0]])
-    assert decision.verified
-    assert decision.contained
-    assert not decision.compared
+    assert np.array_equal(decision.plan, [executed, [0, 0], [0, 0]])
+    assert decision.verified and decision.contained and not decision.compared
+    assert correction_penalty(GROUND, action, np.zeros(2), decision.plan[0], 1.0) == 0.0
 
 
 @pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])
-def test_the_margin_is_the_way_to_the_obstacle_however_far_it_is(model, ready, way):
-    """Obstacles beyond the reach of any plan decide nothing, but they are what is near."""
+def test_the_margin_is_the_distance_to_the_obstacle_even_beyond_the_reach(model, ready, way):
     ask = request(obstacles=[cylinder(way, 0.0)])
     decision = ready.decide(ask)
     clear = fits(model, ask, decision.plan[0])
     assert clear - 0.01 <= decision.margin <= clear + 1e-3
-    assert decision.at_least == (way - 0.1 > ready.reach), "beyond the reach it is a lower bound, and said to be"
+    assert decision.at_least == (way - 0.1 > ready.reach), "beyond the reach, the margin is a lower bound"
 
 
-def test_where_nothing_is_near_the_margin_says_that_it_is_only_a_bound(ready):
+def test_where_nothing_is_near_the_margin_is_a_lower_bound(ready):
     for obstacles in ([], [cylinder(2.0, 0.0)]):
         decision = ready.decide(request(action=(0.2, -0.3), obstacles=obstacles))
         assert decision.at_least
         assert ready.reach < decision.margin < GROUND.sight - GROUND.footprint
     behind = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(-0.31, 0.0), cylinder(0.34, 0.0)]))
     alone = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(0.34, 0.0)]))
-    assert behind.margin == alone.margin < ready.reach, "near but behind, one farther away is closer to the tube"
-
-
-def test_allowed_is_the_proposal_clipped_to_the_bounds(ready):
-    decision = ready.decide(request(action=(7.0, -3.0)))
-    assert decision.kind == ALLOWED
-    assert np.array_equal(decision.plan[0], [0.25, -0.5])
-    assert correction_penalty(GROUND, (7.0, -3.0), np.zeros(2), decision.plan[0], 1.0) == 0.0
+    assert behind.margin == alone.margin < ready.reach, "the obstacle behind is nearer, but not to the tube"
 
 
 def test_the_penalty_counts_from_what_bounds_and_slew_let_pass():
@@ -65,7 +59,7 @@ def test_the_penalty_counts_from_what_bounds_and_slew_let_pass():
 
 
 def test_a_slew_limit_is_kept():
-    """On a robot that has one; the model set is a made-up integrator's."""
+    """The model set is that of an invented integrator."""
     robot = replace(GROUND, action_slew=(0.05, 0.1))
 
     def certificate(C, w):
@@ -91,7 +85,7 @@ def test_a_slew_limit_is_kept():
 
 
 def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
-    """Against a fine grid of inputs, each checked by the filter's own exact check of it as a proposal's tube."""
+    """Compare with a fine grid of inputs, each checked by the exact check of its own tube."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(0, 0.25, 41), np.linspace(-0.5, 0.5, 41)), -1).reshape(-1, 2)
     width = GROUND.high() - GROUND.low()
@@ -136,7 +130,7 @@ def test_a_verified_proposal_is_allowed_or_replaced_for_clearance_and_the_decisi
 
 
 def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margin(ready, monkeypatch):
-    """Before, the solver's failure to find a better input braked the robot, though its proposal was verified."""
+    """If the solver finds no better input, the robot must not brake: its proposal was verified."""
     rng = np.random.default_rng(5)
     replaced = [ask for ask in (random_request(rng) for _ in range(200)) if ready.decide(ask).for_clearance]
     assert len(replaced) > 5
@@ -148,7 +142,7 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_plan_that_leaves_is_clear_and_ends_in_a_stop(models, kind):
+def test_every_plan_keeps_clear_and_ends_in_a_stop(models, kind):
     model = models[kind, "direct"]
     ready = Filter(model)
     rng = np.random.default_rng(1)
@@ -168,8 +162,8 @@ def test_every_plan_that_leaves_is_clear_and_ends_in_a_stop(models, kind):
     assert {ALLOWED, ADJUSTED} <= kinds
 
 
-def test_clearance_apart_a_proposal_is_only_changed_if_its_tube_does_not_fit(ready, model):
-    """The price of half-spaces: with one obstacle there is none."""
+def test_beside_one_obstacle_every_proposal_with_enough_clearance_is_allowed(ready, model):
+    """Half-spaces cost space only between several obstacles."""
     rng = np.random.default_rng(2)
     for _ in range(300):
         ask = random_request(rng, count=1)
@@ -239,11 +233,17 @@ NAN, INF = float("nan"), float("inf")
         ("obstacles", Shapes.of([Obstacle("sphere", (0, 0, 0), (1,))], 3)),
         ("observation", np.full(26, NAN, np.float32)),
         ("observation", np.zeros(MOST_OBSERVED + 1, np.float32)),
+        ("predicted_center", Prediction(np.full(5, NAN), np.ones(5), 0.0)),
+        ("predicted_center", Prediction(np.zeros(4), np.ones(4), 0.0)),
+        ("predicted_half_width", Prediction(np.zeros(5), np.full(5, INF), 0.0)),
+        ("predicted_half_width", Prediction(np.zeros(5), np.zeros(0), 0.0)),
+        ("predicted_half_width", Prediction(np.zeros(5), -np.ones(5), 0.0)),
+        ("predicted_heading", Prediction(np.zeros(5), np.ones(5), NAN)),
     ],
 )
-def test_bad_requests_are_refused_by_the_field(ready, field, value):
+def test_a_bad_request_is_refused_with_its_field(ready, field, value):
     with pytest.raises(BadRequest) as caught:
-        ready.decide(replace(request(), **{field: value}))
+        ready.decide(replace(request(), **{"predicted" if field.startswith("predicted") else field: value}))
     assert caught.value.field == field
     assert ready.decide(request()).kind == ALLOWED
 
@@ -260,24 +260,7 @@ def test_a_proposal_that_is_not_finite_brakes_along_the_committed_plan(ready, ac
     assert ready.decide(request(action=(0.2, 0.0))).kind == ALLOWED
 
 
-@pytest.mark.parametrize(
-    ("field", "center", "half", "heading"),
-    [
-        ("predicted_center", np.full(5, NAN), np.ones(5), 0.0),
-        ("predicted_center", np.zeros(4), np.ones(4), 0.0),
-        ("predicted_half_width", np.zeros(5), np.full(5, INF), 0.0),
-        ("predicted_half_width", np.zeros(5), np.zeros(0), 0.0),
-        ("predicted_half_width", np.zeros(5), -np.ones(5), 0.0),
-        ("predicted_heading", np.zeros(5), np.ones(5), NAN),
-    ],
-)
-def test_bad_predictions_are_refused_by_the_field(ready, field, center, half, heading):
-    with pytest.raises(BadRequest) as caught:
-        ready.decide(request(predicted=Prediction(center, half, heading)))
-    assert caught.value.field == field
-
-
-def test_an_obstacle_whose_distance_is_no_number_is_never_overlooked(ready):
+def test_an_obstacle_with_nan_is_never_overlooked(ready):
     near = Shapes.of([cylinder(0.4, 0)], 2)
     broken = replace(near, center=near.center * NAN)
     decision = ready.decide(request(obstacles=broken))
@@ -286,7 +269,7 @@ def test_an_obstacle_whose_distance_is_no_number_is_never_overlooked(ready):
 
 
 def test_the_reach_covers_every_plan(ready):
-    """No obstacle beyond the reach can matter: the farthest point of any plan's tube, by brute force."""
+    """Find the farthest point of any plan's tube by brute force."""
     rng = np.random.default_rng(17)
     farthest = 0.0
     for _ in range(2000):
@@ -310,7 +293,7 @@ def test_the_same_request_has_the_same_answer_whatever_came_between(model):
 
 
 def test_a_moved_and_turned_scene_has_the_same_answer(model):
-    """But for Z_v, a box in the world's axes."""
+    """The measurement error is zero here, because its box is aligned with the world's axes."""
     ready = Filter(replace(model, robot=replace(GROUND, measurement_bound=(0.0,) * 5)))
     rng = np.random.default_rng(7)
     for _ in range(50):

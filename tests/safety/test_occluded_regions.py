@@ -46,6 +46,12 @@ def clear(**more):
     return RangeImage(at=(0.0, 0.0, 0.0), low=-EDGE, high=EDGE, **more)
 
 
+def planes(image, nominal, boxes=None, keep_off=0.0, measured=ORIGIN):
+    """Return the half-spaces that keep a body off the image's shadows on a path from the origin."""
+    regions = occluded_regions(image, room() if boxes is None else boxes, BODY, ORIGIN)
+    return half_spaces(regions, ORIGIN, nominal, keep_off, measured, 0.2)
+
+
 def bounded(seed, dropped):
     """Half-spaces in a hall, for errors of the pose as large as they may be, and a body that reaches out of the room:
     normals (rows, 6, 3), offsets (rows, 6), and what is solid within reach (points, 3)."""
@@ -60,7 +66,7 @@ def bounded(seed, dropped):
         [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0, 0, 1]]
     )
     nominal = np.cumsum(rng.uniform(-0.3, 0.3, (6, 3)), axis=0)
-    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, nominal, 0.0, ORIGIN, 0.2)
+    normals, offsets = planes(image, nominal)
     return normals, offsets, points[(np.abs(points) < 2.0 + BODY / math.sqrt(3.0)).all(axis=1)]
 
 
@@ -89,9 +95,7 @@ def test_no_body_in_the_boxes_of_a_period_touches_an_obstacle(seed):
     size = np.linspace(0.05, 1.0, 7)[:, None]
     ways = np.vstack([ORIGIN, nominal]) + rng.uniform(-0.5, 0.5, (7, 3)) * size
     boxes = np.stack([ways - size, ways + size])
-    normals, offsets = half_spaces(
-        occluded_regions(image, PlanBoxes(boxes, 2.4), BODY, ORIGIN), ORIGIN, nominal, BODY, ORIGIN, 0.2
-    )
+    normals, offsets = planes(image, nominal, PlanBoxes(boxes, 2.4), BODY)
     if np.isneginf(offsets).all():
         return
     for k in range(6):
@@ -120,7 +124,7 @@ def test_all_space_that_is_not_shown_to_be_free_is_beyond_some_half_space(seed, 
     rng = np.random.default_rng(seed)
     image = clear(ranges=np.repeat(np.repeat(rng.uniform(1.5, 6.0, (RINGS // 5, COLUMNS // 5)), 5, 0), 5, 1))
     nominal = np.cumsum(rng.uniform(-0.1, 0.1, (3, 3)), axis=0)
-    normals, offsets = half_spaces(occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, nominal, 0.0, ORIGIN, 0.2)
+    normals, offsets = planes(image, nominal)
     points = rng.uniform(-2.0, 2.0, (20_000, 3))
     free, far = free_towards(image, points)
     hidden = points[far >= free]
@@ -133,12 +137,12 @@ def test_half_spaces_keep_the_body_off_and_recede_with_time_from_what_may_move()
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
     rng = np.random.default_rng(0)
     nominal = np.zeros((3, 3))
-    still, moving = (occluded_regions(taken(rng, wall, speed=s, age=0.1), room(), BODY, ORIGIN) for s in (0.0, 0.5))
-    ahead = half_spaces(still, ORIGIN, nominal, 0.0, ORIGIN, 0.2)[1][0]
+    still, moving = (taken(rng, wall, speed=s, age=0.1) for s in (0.0, 0.5))
+    ahead = planes(still, nominal)[1][0]
     assert 0.8 < ahead[0] <= 1.0
-    kept = half_spaces(still, ORIGIN, nominal, BODY, np.full(3, 0.01), 0.2)[1][0]
+    kept = planes(still, nominal, None, BODY, np.full(3, 0.01))[1][0]
     assert (ahead - kept >= BODY + 0.01 - 0.02).all()
-    lost = ahead - half_spaces(moving, ORIGIN, nominal, 0.0, ORIGIN, 0.2)[1][0]
+    lost = ahead - planes(moving, nominal)[1][0]
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
 
 
@@ -176,25 +180,20 @@ def test_no_direction_is_farther_from_its_patch_than_half_a_meshes_diagonal(low)
 
 
 def test_in_empty_space_only_the_boxes_faces_remain():
-    normals, offsets = half_spaces(
-        occluded_regions(clear(), room(), BODY, ORIGIN), ORIGIN, np.zeros((2, 3)), BODY, ORIGIN, 0.2
-    )
+    normals, offsets = planes(clear(), np.zeros((2, 3)), keep_off=BODY)
     assert np.array_equal(normals[:, 0], FACES) and (offsets == 2.0).all()
 
 
 @pytest.mark.parametrize("image", [clear(ranges=np.zeros((RINGS, COLUMNS))), clear(range_error=FAR)])
 def test_an_image_without_known_beams_leaves_nothing_free(image):
-    _, offsets = half_spaces(
-        occluded_regions(image, room(), BODY, ORIGIN), ORIGIN, np.full((2, 3), 0.1), BODY, ORIGIN, 0.2
-    )
+    _, offsets = planes(image, np.full((2, 3), 0.1), keep_off=BODY)
     assert (offsets.min(axis=0) < 0.0).all()
 
 
 def test_a_path_through_a_shadow_keeps_the_half_spaces_from_before_it():
     wall = [Obstacle("box", (2.0, 0.0, 0.0), (2.0, 20.0, 20.0))]
-    seen = occluded_regions(taken(np.random.default_rng(0), wall), room(4.0), BODY, ORIGIN)
     nominal = np.array([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
-    normals, offsets = half_spaces(seen, ORIGIN, nominal, 0.0, ORIGIN, 0.2)
+    normals, offsets = planes(taken(np.random.default_rng(0), wall), nominal, room(4.0))
     assert (normals[:, 1:] == normals[:, :1]).all() and (offsets[:, 1:] == offsets[:, :1]).all()
     assert (nominal[1] @ normals[:, 1].T > offsets[:, 1]).any()
 
@@ -212,7 +211,7 @@ def test_a_window_holds_all_beams_within_its_angle(seed, within):
     assert (window.minimum(values) <= least).all()
 
 
-# --- what is remembered ----------------------------------------------------------------------------------------------
+# --- memory ----------------------------------------------------------------------------------------------
 
 
 def behind():
