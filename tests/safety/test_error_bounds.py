@@ -120,7 +120,7 @@ def test_the_bound_on_the_measurement_noise_holds_for_the_true_matrix():
     assert (half > with_estimate).all()  # the estimate alone gives no bound
 
 
-# --- relations between the bounds ---------------------------------------------------------------------------------------
+# --- relations between the bounds ---------------------------------------------------------------------------------
 
 
 def test_the_factored_form_is_the_matrix_zonotope_multiplied_out():

@@ -1,10 +1,5 @@
 """Each compiled kernel of the filter gives what its plain NumPy twin gives."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,7 +7,6 @@ from brakeline.safety.filter import plan_inputs
 from brakeline.safety.filter.kernels import active_set_kernels, halfspace_kernels, tube_kernels
 from tests.safety import kernel_twins
 
-HERE = Path(__file__).resolve().parent
 N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors, free inputs
 MAGNITUDES = L + N + 1
 MODULES = {"halfspace": halfspace_kernels, "tube": tube_kernels, "active set": active_set_kernels, "input": plan_inputs}
@@ -121,17 +115,3 @@ def test_the_presolve_cases_have_rows_that_rule_out_and_rows_that_are_left():
 def test_a_value_that_is_not_a_number_is_never_the_least():
     assert np.isnan(halfspace_kernels.least(np.array([1.0, np.nan, -1.0]), 0.5))
     assert not tube_kernels.within(np.array([0.0, np.nan]), np.array([[-1.0, -1.0], [1.0, 1.0]]))
-
-
-@pytest.mark.skipif(os.environ.get("NUMBA_BOUNDSCHECK") == "1", reason="this process checks the indices already")
-def test_no_kernel_reads_or_writes_outside_its_arrays(tmp_path):
-    """Run the twins' tests once more with kernels that check every index. Compiled kernels do not, by default."""
-    environment = os.environ | {
-        "NUMBA_BOUNDSCHECK": "1",
-        "NUMBA_CACHE_DIR": str(tmp_path),
-        "PYTHONPATH": str(HERE.parents[1]),
-    }
-    tests = [str(HERE / name) for name in ("test_filter_kernels.py", "test_halfspace_kernels.py")]
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *tests]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stdout[-3000:]

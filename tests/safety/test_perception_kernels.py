@@ -1,10 +1,5 @@
 """The compiled kernels of perception compute what their plain NumPy twins do."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,8 +14,6 @@ from brakeline.safety.perception.kernels.shadow_kernels import AXIS_X, EXTENT, L
 from tests.safety import perception_twins as twins
 
 SEEDS = st.integers(0, 100_000)
-HERE = Path(__file__).parent
-CHECKED = ("test_perception_kernels.py", "test_occlusion_kernels.py", "test_occluded_regions.py")
 
 
 def capsules_around(rng, n):
@@ -190,25 +183,3 @@ def test_without_a_folder_for_the_cache_each_process_compiles(monkeypatch):
 
     monkeypatch.setattr(compilation, "njit", njit)
     assert compilation.compiled("f8(f8)")(abs) is abs and len(tried) == 2
-
-
-@pytest.mark.skipif("NUMBA_BOUNDSCHECK" in os.environ, reason="this is the run with checked indices")
-def test_no_kernel_reads_or_writes_out_of_bounds(tmp_path):
-    """Run the tests of the kernels once with checked indices, in an interpreter and with a cache of their own."""
-    environment = os.environ | {
-        "NUMBA_BOUNDSCHECK": "1",
-        "NUMBA_CACHE_DIR": str(tmp_path),
-        "PYTHONPATH": str(HERE.parents[1]),
-    }
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        *(str(HERE / name) for name in CHECKED),
-    ]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]

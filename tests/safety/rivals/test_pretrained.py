@@ -1,4 +1,4 @@
-"""A rival's file: what was written is what is read, and nothing else is."""
+"""A rival's file: a saved model is read back, and a damaged one is refused."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 
 from brakeline.errors import BadModel, BadPerceptrons
 from brakeline.messaging.perceptrons import Perceptrons
+from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.safety.methods import decode, load, ready
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -34,7 +35,7 @@ def test_a_saved_model_is_read_back(pretrained, tmp_path):
         assert found.rays.range == pretrained.rays.range
 
 
-def test_the_version_is_of_all_that_decisions_depend_on(pretrained):
+def test_the_version_covers_everything_that_decisions_depend_on(pretrained):
     network = next(iter(pretrained.networks))
     layers = [(w + np.float32(1e-6), b) for w, b in pretrained.networks[network].layers]
     other = replace(pretrained, networks=dict(pretrained.networks) | {network: Perceptrons(layers)})
@@ -44,7 +45,7 @@ def test_the_version_is_of_all_that_decisions_depend_on(pretrained):
     assert len(versions) == 4 and replace(pretrained, about={}).version == pretrained.version
 
 
-def test_what_is_damaged_or_of_another_kind_is_refused(pretrained, tmp_path):
+def test_a_damaged_file_or_one_of_another_kind_is_refused(pretrained, tmp_path):
     whole = pretrained.encode()
     name = f'"{pretrained.method}\\"'.encode()
     for wrong in (b"", whole[:40], whole[:-4], whole[:-1] + bytes([whole[-1] ^ 1]), whole.replace(name, name[::-1])):
@@ -60,9 +61,9 @@ def test_what_is_damaged_or_of_another_kind_is_refused(pretrained, tmp_path):
         ready(replace(pretrained, method="prayer"))
 
 
-def test_our_own_model_sets_are_still_read(data_folder):
-    found = load(data_folder / "ground" / "residual-direct.safetensors")
-    assert isinstance(found, ModelSet) and ready(found).version == found.version
+def test_the_shipped_model_set_is_read():
+    model = load(ROBOTS_FOLDER / "ground.model.safetensors")
+    assert isinstance(model, ModelSet) and ready(model).version == model.version
 
 
 def test_perceptrons_by_their_definition():
