@@ -1,4 +1,4 @@
-"""What is drawn of a robot's surroundings: never more free space than there is, and no mover outside of its discs."""
+"""The displayed map: it shows no occupied space as free, and every mover stays in its discs."""
 
 import math
 from dataclasses import replace
@@ -19,22 +19,20 @@ from brakeline.sim.sim_conditions import Perception
 from tests.robots import GROUND, QUADROTOR
 
 
-def scanned(seed: int) -> tuple[pb.Request, object]:
-    """A question with a scan without errors, from the middle of a room with a few obstacles."""
+def scanned(seed):
+    """Return a request with an exact scan from the middle of a room with obstacles, and the arena."""
     rng = np.random.default_rng(seed)
     angles = np.arange(4) * 0.5 * math.pi + rng.uniform(0.0, 1.0, 4)
-    places = [
-        tuple(r * np.array([math.cos(a), math.sin(a)])) for r, a in zip(rng.uniform(0.6, 2.5, 4), angles, strict=True)
-    ]
-    obstacles = [Obstacle(CYLINDER, place, (0.15,)) for place in places[:2]]
-    obstacles += [Obstacle(BOX, place, (0.3, 0.2), yaw=float(rng.uniform(0.0, 3.0))) for place in places[2:]]
+    places = np.column_stack([np.cos(angles), np.sin(angles)]) * rng.uniform(0.6, 2.5, 4)[:, None]
+    obstacles = [Obstacle(CYLINDER, tuple(place), (0.15,)) for place in places[:2]]
+    obstacles += [Obstacle(BOX, tuple(place), (0.3, 0.2), yaw=float(rng.uniform(0.0, 3.0))) for place in places[2:]]
     arena, state = staged_arena(*obstacles, half_width=3.0), np.array([0.0, 0.0, 0.7, 0.0, 0.0])
     scan = FanScanner(GROUND, arena, rng, 0.0, Perception("scan")).scan(state, state, 0.0)
     return pb.Request(state=state, scan=scan_message(scan)), arena
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed: int) -> None:
+def test_space_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed):
     request, arena = scanned(seed)
     about = map_for_display(GROUND, request, corners=60)
     assert 20 < len(about.free) <= 60 and len(about.hits) > 100
@@ -45,15 +43,15 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed: int) -> No
     edge = corners[k] + share * (np.roll(corners, -1, axis=0)[k] - corners[k])
     inside = sensor + np.sqrt(rng.random((2000, 1))) * (edge - sensor)
     assert arena.shapes.distance(inside).min() > 0.0
-    assert np.linalg.norm(corners - sensor, axis=1).max() > 1.5, "and that is not nothing"
+    assert np.linalg.norm(corners - sensor, axis=1).max() > 1.5, "some space is free"
 
 
-def test_without_a_scan_there_is_none_of_it() -> None:
+def test_a_request_without_scan_and_obstacles_has_an_empty_map():
     about = map_for_display(GROUND, pb.Request(state=[0.0] * 5))
     assert all(told == [] for told in about.flat().values())
 
 
-def test_discs_hold_wherever_a_mover_may_be() -> None:
+def test_the_discs_contain_every_position_of_a_mover():
     motion = Motion((0.5, -0.2), 0.03, 0.05, acceleration=1.0, age=0.1)
     crate = Obstacle(BOX, (1.0, 0.5), (0.4, 0.3), yaw=0.4, motion=motion)
     request = pb.Request(obstacles=obstacle_messages([crate, Obstacle(CYLINDER, (0.0, 1.0), (0.2,))]))
@@ -71,23 +69,23 @@ def test_discs_hold_wherever_a_mover_may_be() -> None:
         assert away.max() <= radius + 1e-9 and away.max() > radius - 0.1
 
 
-def test_a_flat_view_of_what_flies_has_the_radius_last() -> None:
+def test_the_flat_map_of_a_flying_mover_has_the_radius_last():
     plane = Obstacle("sphere", (1.0, 2.0, 3.0), (0.5,), motion=Motion((0.0, 1.0, 0.0), 0.1, speed=1.0))
     request = pb.Request(obstacles=obstacle_messages([plane]))
     assert map_for_display(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 0.5]]
 
 
-def test_a_promise_is_the_new_one_or_what_is_left_of_the_old() -> None:
+def test_the_reserved_boxes_are_the_new_ones_or_the_rest_of_the_old_ones():
     old, new = (pb.Reservation(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
     asked = pb.Exchange(request=pb.Request(reservation=old))
     assert reserved_boxes(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
     asked.reply.decision.reservation.CopyFrom(new)
     assert reserved_boxes(GROUND, asked)[0, 0] == 2.0
     asked.reply.decision.reservation.radius.append(1.0)
-    assert len(reserved_boxes(GROUND, asked)) == 0, "that is none"
+    assert len(reserved_boxes(GROUND, asked)) == 0, "the sizes do not match"
 
 
-def test_what_a_scan_was_followed_to_move_is_drawn_where_it_may_go() -> None:
+def test_a_tracked_surface_is_drawn_where_it_may_go():
     request, _ = scanned(0)
     plain = map_for_display(GROUND, request)
     scan = scan_of(request.scan)

@@ -14,7 +14,7 @@ AHEAD = Obstacle("cylinder", (0.34, 0.0), (0.1,))
 
 
 class Yard(gymnasium.Env):
-    """The kinematic robot before one obstacle; reward 1 a step."""
+    """The kinematic robot before one obstacle. The reward is 1 a step."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)
     action_space = gymnasium.spaces.Box(np.array([0, -0.5], np.float32), np.array([0.25, 0.5], np.float32))

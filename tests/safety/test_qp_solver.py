@@ -1,4 +1,4 @@
-"""The QP: another solver finds the same answers, and the solver's own word counts for nothing."""
+"""The QP: another solver finds the same solutions, and the filter recomputes the residual itself."""
 
 import json
 from pathlib import Path
@@ -7,13 +7,14 @@ import daqp
 import numpy as np
 import pytest
 
-from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter import qp_solver
 from brakeline.safety.filter.halfspaces import half_spaces
 from brakeline.safety.filter.kernels.active_set_kernels import hildreth_active_set
 from brakeline.safety.filter.qp import ObstacleRows, QPBuilder
 from brakeline.safety.filter.qp_solver import ACCURACY, QuadraticProgram, Solution, solve
 from brakeline.safety.model.model_set import ModelSet
+from tests.safety.asked import cylinder
 
 
 def programs(model: ModelSet, count, seed=0):
@@ -23,34 +24,22 @@ def programs(model: ModelSet, count, seed=0):
     layout, builder = ObstacleRows(tube.position, tube.directions), QPBuilder(model.robot, outer)
     for _ in range(count):
         angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
-        near = Shapes.of(
-            [
-                Obstacle("cylinder", (r * np.cos(a), r * np.sin(a)), (0.1,))
-                for a, r in zip(angles, distance, strict=True)
-            ],
-            2,
-        )
+        posts = [cylinder(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, distance, strict=True)]
         v, w = rng.uniform(0, 0.25), rng.uniform(-0.5, 0.5)
         z_0, r = np.array([v, w, v, w]), rng.uniform([0.0, -0.5], [0.25, 0.5])
-        normals, offsets = half_spaces(
-            near, np.zeros(2), tube.centers(np.concatenate([z_0, r])), 0.105, np.full(2, 0.004)
-        )
+        nominal = tube.centers(np.concatenate([z_0, r]))
+        normals, offsets = half_spaces(Shapes.of(posts, 2), np.zeros(2), nominal, 0.105, np.full(2, 0.004))
         program = builder.program(layout.rows(normals, offsets), z_0, r)
         if program is not None:
             yield builder, program
 
 
 def by_daqp(program):
-    n = len(program.h)
-    x, _, flag, _ = daqp.solve(
-        np.diag(program.h),
-        program.g,
-        np.ascontiguousarray(program.A),
-        program.b,
-        np.full(len(program.b), -1e30),
-        np.zeros(len(program.b), dtype=np.int32),
-    )
-    return x[:n], flag
+    """Return DAQP's solution and its flag: 1 or more if it solved the program."""
+    rows, below = np.ascontiguousarray(program.A), np.full(len(program.b), -1e30)
+    kinds = np.zeros(len(program.b), dtype=np.int32)
+    x, _, flag, _ = daqp.solve(np.diag(program.h), program.g, rows, program.b, below, kinds)
+    return x[: len(program.h)], flag
 
 
 def value(program, x):
@@ -58,7 +47,7 @@ def value(program, x):
 
 
 def crowded(rng, rows=160, n=6):
-    """A projection onto a body that many faces bound, some of them nearly the same; at times there is no such body."""
+    """Return a projection onto a body with many faces, some of them nearly equal. Sometimes the body is empty."""
     A = rng.normal(size=(rows, n))
     A[: rows // 2] = A[0] + 0.05 * A[: rows // 2]
     A = np.vstack([A / np.linalg.norm(A, axis=1, keepdims=True), np.eye(n), -np.eye(n)])
@@ -69,12 +58,18 @@ def crowded(rng, rows=160, n=6):
     )
 
 
-def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
-    programs = [crowded(np.random.default_rng(seed)) for seed in range(200)]
-    parts = []
+@pytest.fixture
+def parts(monkeypatch):
+    """The numbers of rows that the solver was called with, in order."""
+    sizes = []
     monkeypatch.setattr(
-        qp_solver, "_solved", lambda part, of=qp_solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
+        qp_solver, "_solved", lambda part, of=qp_solver._solved, **how: sizes.append(len(part.b)) or of(part, **how)
     )
+    return sizes
+
+
+def test_the_active_rows_alone_give_the_solution_of_all_rows(parts):
+    programs = [crowded(np.random.default_rng(seed)) for seed in range(200)]
     impossible = 0
     for program in programs:
         ours, (theirs, flag) = solve(program), by_daqp(program)
@@ -84,16 +79,13 @@ def test_of_many_rows_those_that_decide_give_the_answer_to_all(monkeypatch):
             assert ours.residual <= ACCURACY and (program.A @ ours.x - program.b).max() <= ACCURACY
             assert np.abs(ours.x - theirs)[:3].max() < 1e-4
             assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-5)
-        assert (solve(program).x == ours.x).all(), "always the same"
-    assert 20 < impossible < 180 and np.median(parts) < 30, "by few of 172"
+        assert (solve(program).x == ours.x).all(), "it is deterministic"
+    assert 20 < impossible < 180 and np.median(parts) < 30, "few of 172 rows"
 
 
-def test_rows_that_are_come_by_save_rounds_and_change_no_answer(monkeypatch):
+def test_the_guessed_active_set_saves_rounds_and_changes_no_solution(parts, monkeypatch):
     found = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
-    parts, rounds = [], []
-    monkeypatch.setattr(
-        qp_solver, "_solved", lambda part, of=qp_solver._solved, **how: parts.append(len(part.b)) or of(part, **how)
-    )
+    rounds = []
     for steps in (qp_solver.STEPS, 0):
         parts.clear()
         monkeypatch.setattr(qp_solver, "STEPS", steps)
@@ -103,13 +95,13 @@ def test_rows_that_are_come_by_save_rounds_and_change_no_answer(monkeypatch):
     assert rounds[0] < 0.9 * rounds[1]
 
 
-def test_a_row_that_is_no_number_is_not_come_by():
+def test_the_active_set_holds_no_row_with_nan():
     A, b = np.array([[1.0, 0.0], [np.nan, 1.0], [0.0, 1.0], [0.0, 0.0]]), np.array([-1.0, -5.0, np.nan, -1.0])
     assert hildreth_active_set(np.ones(2), np.zeros(2), A, b, 20).tolist() == [True, False, False, False]
 
 
-def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
-    """The solver is quicker to say so of few rows, exactly, and is wrong at times."""
+def test_an_infeasible_verdict_on_few_rows_is_checked_on_all_rows(monkeypatch):
+    """The solver is sometimes wrong about few rows."""
     program = next(one for one in map(crowded, map(np.random.default_rng, range(200))) if by_daqp(one)[1] >= 1)
     rows, whole = len(program.b), qp_solver._solved
 
@@ -120,8 +112,8 @@ def test_that_few_can_not_be_met_is_not_taken_for_granted(monkeypatch):
     assert solve(program).status == "solved"
 
 
-def test_few_rows_are_not_called_solved_before_they_are():
-    """Rows that decided for a quadrotor behind a scan: by the residuals alone the answer was 0.07 of a range off."""
+def test_few_rows_are_solved_accurately():
+    """A quadrotor's program. By its residuals alone, the solution was off by 0.07 of an input's range."""
     stored = json.loads((Path(__file__).parents[1] / "stored" / "few-rows.json").read_text())
     program = QuadraticProgram(*(np.array(stored[name]) for name in ("h", "g", "A", "b")))
     ours, (theirs, flag) = qp_solver._solved(program, few=True), by_daqp(program)
@@ -150,10 +142,10 @@ def test_an_infeasible_problem_comes_back_with_its_residual():
     program = QuadraticProgram(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
     solution = solve(program)
     assert solution.residual > 0.5
-    assert solution.found  # a candidate: whoever uses it must check
+    assert solution.found  # a candidate that the caller must check
 
 
-def test_without_rows_nothing_holds_the_answer_off():
+def test_a_program_without_rows_is_solved():
     solution = solve(QuadraticProgram(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
     assert solution.status == "solved" and solution.x == pytest.approx([1.0, -2.0], abs=1e-6)
 
@@ -174,8 +166,7 @@ def test_the_answer_depends_on_the_program_alone(model):
 
 
 @pytest.mark.parametrize("kind", ["residual", "matrix-zonotope"])
-def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
-    """Against the same programs with every row in them."""
+def test_rows_that_the_presolve_drops_change_no_solution(models, kind, monkeypatch):
     pruned = [program for _, program in programs(models[kind, "direct"], 150)]
     monkeypatch.setattr(QPBuilder, "reachable", lambda self, before: (np.zeros(self.free), np.full(self.free, 1e3)))
     full = [program for _, program in programs(models[kind, "direct"], 150)]
@@ -186,7 +177,7 @@ def test_rows_that_are_left_out_change_no_answer(models, kind, monkeypatch):
         whole = by_daqp(program)
         if not answers:
             left_out += 1
-            assert whole[1] < 1, "ruled out, though there is a solution"
+            assert whole[1] < 1, "the presolve dropped a feasible program"
         elif whole[1] >= 1:
             assert value(program, answers[0].x) == pytest.approx(value(program, whole[0]), abs=2e-3)
             assert np.allclose(answers[0].x[:2], whole[0][:2], atol=4e-2)  # of the range

@@ -1,4 +1,4 @@
-"""What makes a question one that can't be decided on: looked at all at once, it is the same as field by field."""
+"""The fast check of a request passes nothing that the check field by field refuses."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ ODD = np.nan, np.inf, -np.inf, -1.0, 1e-9, 0.99e-9, 0.5, 1e30, 2.0 * FARTHEST, 1
 
 
 def usual(robot, seed, predicted):
-    """One that all is well with."""
+    """Return a valid request."""
     rng = np.random.default_rng(seed)
     low, high = robot.low(), robot.high()
     plan = rng.uniform(low, high, (robot.horizon, robot.action_dim))
@@ -41,7 +41,7 @@ def usual(robot, seed, predicted):
 
 
 def with_(request, field, change):
-    """The same with another value in a field."""
+    """Return the request with another value in a field."""
     if field in ("center", "half_width", "heading"):
         if request.predicted is None:
             return request
@@ -62,7 +62,7 @@ def lets_pass(robot, request):
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 @settings(max_examples=300)
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from(FIELDS), st.sampled_from(ODD), st.integers(0, 50))
-def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field, odd, at):
+def test_a_request_that_passes_the_fast_check_passes_field_by_field(robot, seed, predicted, field, odd, at):
     ordinary, sound = FastRequestCheck(robot), usual(robot, seed, predicted)
     assert lets_pass(robot, sound)
     assert ordinary(sound)
@@ -82,7 +82,7 @@ def test_what_passes_at_once_passes_field_by_field(robot, seed, predicted, field
 
 @pytest.mark.parametrize("field", [field for field in FIELDS[:-1] if field != "observation"])
 @pytest.mark.parametrize("change", [lambda v: v[:-1], lambda v: np.append(v, 0.0), lambda v: v[None]])
-def test_what_has_another_size_does_not_pass_at_once(field, change):
+def test_an_array_of_another_size_fails_the_fast_check(field, change):
     robot = robot_named("ground")
     sound = usual(robot, 1, True)
     assert FastRequestCheck(robot)(sound)
@@ -90,7 +90,7 @@ def test_what_has_another_size_does_not_pass_at_once(field, change):
 
 
 @pytest.mark.parametrize("observed", [np.zeros((1, 26)), np.zeros(MOST_OBSERVED + 1), np.float32(0.0)])
-def test_the_filter_refuses_an_observation_that_is_no_list_of_bounded_size(observed):
+def test_the_filter_refuses_an_observation_that_is_not_a_vector_of_bounded_size(observed):
     robot = robot_named("ground")
     sound = usual(robot, 1, True)
     for size in (0, 1, MOST_OBSERVED):
@@ -100,7 +100,7 @@ def test_the_filter_refuses_an_observation_that_is_no_list_of_bounded_size(obser
     assert not FastRequestCheck(robot)(asked) and not lets_pass(robot, asked)
 
 
-def test_arrays_of_any_type_and_layout_are_decided_on_as_usual(ready):
+def test_the_type_and_layout_of_arrays_do_not_change_the_decision(ready):
     sound = request(action=(0.25, 0.5), obstacles=[cylinder(1.0, 0.0)])
     expected = ready.decide(sound)
     stridden = {name: np.repeat(getattr(sound, name), 2, axis=0)[::2] for name in ("state", "action", "input_in_force")}

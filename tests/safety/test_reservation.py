@@ -1,4 +1,4 @@
-"""Promises: what they contain, and that half-spaces keep off them."""
+"""Reservations contain the tube that they come from, and half-spaces keep off them."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def drawn(rng, middle=0.0, size=0.05):
 
 
 @given(st.integers(0, 10**6))
-def test_a_promise_contains_every_way_between_the_sets_that_it_was_made_of(seed):
+def test_a_reservation_contains_every_path_between_its_sets(seed):
     rng = np.random.default_rng(seed)
     centers, half, radius = drawn(rng)
     reservation = Reservation.of(centers, half, radius)
@@ -27,7 +27,7 @@ def test_a_promise_contains_every_way_between_the_sets_that_it_was_made_of(seed)
         assert (np.abs(between - reservation.center[k]) <= reservation.half_width[k] + 1e-12).all()
 
 
-def test_time_takes_the_first_box_and_the_last_stays():
+def test_each_period_removes_the_first_box_and_keeps_the_last():
     rng = np.random.default_rng(0)
     reservation = Reservation.of(*drawn(rng))
     later = reservation.later()
@@ -40,8 +40,7 @@ def test_time_takes_the_first_box_and_the_last_stays():
 
 @settings(max_examples=200)
 @given(st.integers(0, 10**6))
-def test_who_keeps_to_the_half_spaces_keeps_off_the_promise_in_every_period(seed):
-    """Any two points within period k's half-space, and all between them, are off period k's box."""
+def test_points_in_a_periods_half_space_keep_off_the_reservation_of_that_period(seed):
     rng = np.random.default_rng(seed)
     others = [Reservation.of(*drawn(rng, middle=rng.uniform(-0.6, 0.6, 2))) for _ in range(3)]
     start, nominal = np.zeros(2), np.cumsum(rng.normal(scale=0.06, size=(N, 2)), axis=0)
@@ -55,8 +54,8 @@ def test_who_keeps_to_the_half_spaces_keeps_off_the_promise_in_every_period(seed
             assert (np.linalg.norm(away, axis=1) >= 0.105 + other.radius[k] - 1e-9).all()
 
 
-def test_a_promise_that_passes_by_leaves_room_behind_it():
-    """A box is there in its own period only: one that was hit by all of them would have nowhere to go."""
+def test_a_reservation_that_passes_by_leaves_room_behind_it():
+    """Each box counts in its own period only."""
     centers = np.array([[0.35, 0.0], [0.35, 0.6], [0.35, 1.2], [0.35, 1.8]])
     gone = Reservation.of(centers, np.full((4, 2), 0.01), np.full(3, 0.1))
     nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.15, 0.0]])
@@ -65,7 +64,7 @@ def test_a_promise_that_passes_by_leaves_room_behind_it():
     assert room[0] < 0.2 and room[2] > 0.8
 
 
-def test_a_promise_that_is_touched_leaves_no_room():
+def test_a_reservation_that_the_robot_touches_leaves_no_room():
     here = Reservation.of(np.zeros((4, 2)), np.full((4, 2), 0.05), np.full(3, 0.1))
     _, offsets = reservation_half_spaces(
         OtherReservations.to([here]), np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2)
@@ -74,7 +73,7 @@ def test_a_promise_that_is_touched_leaves_no_room():
 
 
 @pytest.mark.parametrize("away", [0.2, 0.5, 2.0])
-def test_only_what_is_within_reach_counts(away):
+def test_the_distances_of_reservations(away):
     other = Reservation.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
     assert (OtherReservations.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
     assert OtherReservations.to([]) is None

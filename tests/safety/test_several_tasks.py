@@ -1,4 +1,4 @@
-"""Several tasks of one robot in one process: none changes what the others get."""
+"""Several tasks of one robot in one process do not affect each other."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,6 @@ import pytest
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadRequest, BadWeights, UnknownRobot
-from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -17,9 +16,10 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.methods import Method
 from brakeline.safety.methods import decode as read_model
 from brakeline.safety.methods import ready as made_ready
-from brakeline.safety.model.model_config import SAILR, SECAS, ModelConfig
+from brakeline.safety.model.model_config import SECAS, ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 from tests.safety.asked import cylinder, request, same
+from tests.safety.rivals.test_sailr import known
 
 NAMES = ("ground", "ground+tracks")
 OBSERVED = (26, 50)
@@ -45,13 +45,8 @@ def test_two_environments_observe_each_by_its_own_task():
 
 
 def sailr(robot: RobotWithTask) -> Pretrained:
-    """Every proposal is as risky as braking."""
-    seen = robot.task.observation_dim
-    networks = {
-        name: Perceptrons([(np.zeros((2, 1, inputs), np.float32), np.zeros((2, 1), np.float32))])
-        for name, inputs in (("q", seen + robot.action_dim), ("v", seen))
-    }
-    return Pretrained(robot, SAILR, networks, {"threshold": 0.1})
+    """Return a rival that allows every proposal."""
+    return known(threshold=1.0, robot=robot)
 
 
 def test_two_rivals_read_each_the_observation_of_their_own_task():
@@ -68,10 +63,8 @@ def test_two_rivals_read_each_the_observation_of_their_own_task():
 
 def test_rivals_of_two_tasks_lie_in_two_files():
     usual, other = (robot_with_task(name) for name in NAMES)
-    assert (
-        method_path(usual, SECAS, ModelConfig()).name == method_path(robot_named("ground"), SECAS, ModelConfig()).name
-    )
-    assert method_path(usual, SECAS, ModelConfig()) != method_path(other, SECAS, ModelConfig())
+    paths = [method_path(robot, SECAS, ModelConfig()) for robot in (usual, robot_named("ground"), other)]
+    assert paths[0].name == paths[1].name and paths[0] != paths[2]
 
 
 def test_two_policies_are_read_each_by_its_own_task():
