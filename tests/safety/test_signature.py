@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from brakeline.deploy.run.run_keys import newest_model
-from brakeline.errors import BadModel, Untrusted
+from brakeline.errors import Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
@@ -98,7 +98,7 @@ def test_the_claim_must_match_the_file(model: ModelSet, keys: Path, field: str) 
     """Even if a trusted key signed the claim: the file must agree with each entry."""
     signed, trust = ModelSigner.load(keys).sign(model), TrustedSigners.load(keys)
     domain = {"domain": (0.5 * model.domain).tolist()} if field == "domain" else {"domain": None}
-    with pytest.raises(BadModel):
+    with pytest.raises(Untrusted):
         trust.open(resigned(keys, signed, **(domain if "domain" in field else {field: "quadrotor"})))
     assert trust.open(resigned(keys, signed))
 
