@@ -1,17 +1,22 @@
-"""Robots of every kind of description, from data collected through their environment to a closed loop with an
-adversary; whether anything was hit is the simulator's word."""
+"""Robots of every kind of description, from recorded data to a closed loop with an adversary.
+
+The simulator judges whether the robot hits anything.
+"""
+
+from functools import cache
 
 import numpy as np
 import pytest
 
 from brakeline.deploy.data.environment_episodes import collect
-from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
+from tests.safety.asked import cylinder
 from tests.safety.toys import Toy, car, discs, hostile, near, puck, seen
 
 LONG = (((0.15, 0.0), 0.12), ((-0.15, 0.0), 0.12))
@@ -30,27 +35,25 @@ ROBOTS = {
         "toy-boxed-puck", limit=[*KEEP_IN, {"name": "slow", "weights": {"vx": 0.6, "vy": 0.8}, "most": 0.4}]
     ),
 }
-_made = {}
 
 
+@cache
 def ready(name):
-    if name not in _made:
-        robot = ROBOTS[name]
-        periods, held = (9000, 6) if robot.feedback else (6000, 5)
-        env = Toy(robot, steps=10_000)
-        data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
-        _made[name] = Filter(fit_model_set(data, ModelConfig()))
-    return _made[name]
+    robot = ROBOTS[name]
+    periods, held = (9000, 6) if robot.feedback else (6000, 5)
+    env = Toy(robot, steps=10_000)
+    data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
+    return Filter(fit_model_set(data, ModelConfig()))
 
 
 def drive(env, filter, episodes=8, target=None):
-    """An adversary at the obstacles in turn (or at targets); returns the kinds of decisions and the farthest way."""
+    """Drive at the obstacles in turn, or at targets. Return the decisions' kinds and the largest distance."""
     robot, kinds, farthest = filter.robot, [], 0.0
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
         aims = target or [disc.position for disc in env.unwrapped.obstacles]
         aim = aims[episode % len(aims)]
-        if robot.heading is not None and target is None:  # the one ahead: it can't turn on the spot
+        if robot.heading is not None and target is None:  # the one ahead: the car can't turn in place
             aim = max(aims, key=lambda at: np.cos(np.arctan2(at[1], at[0]) - observation[2]))
         ended = False
         while not ended:
@@ -58,15 +61,11 @@ def drive(env, filter, episodes=8, target=None):
             observation, _, terminated, truncated, info = env.step(action.astype(np.float32))
             ended = terminated or truncated
             if "safety" in info:
-                kinds.append(info["diagnostics"]["kind"])
-                assert info["safety"].verified, f"{name_of(info)}"
+                kinds.append(info["safety"].kind)
+                assert info["safety"].verified, f"{info['safety'].kind}: {info['safety'].reason}"
                 assert info["safety"].contained
             farthest = max(farthest, float(np.linalg.norm(observation[:2])))
     return kinds, farthest
-
-
-def name_of(info):
-    return f"{info['safety'].kind}: {info['safety'].reason}"
 
 
 def filtered(env, filter):
@@ -74,14 +73,14 @@ def filtered(env, filter):
 
 
 @pytest.mark.parametrize("name", ["hold", "profile", "discs", "feedback"])
-def test_no_stop_rule_and_no_body_lets_an_adversary_hit_anything(name):
+def test_an_adversary_hits_nothing_with_any_stop_rule_and_body(name):
     capsule = (LONG[0][0], LONG[1][0], 0.12) if name == "discs" else ((0.0, 0.0), (0.0, 0.0), 0.1)
     bare = Toy(ROBOTS[name], discs(), capsule)
     drive(bare, ready(name), 3)
-    assert bare.worst < 0.0, "without the filter it hits"
+    assert bare.worst < 0.0, "without the filter, it hits"
     env = Toy(ROBOTS[name], discs(), capsule)
     kinds, farthest = drive(filtered(env, ready(name)), ready(name))
-    assert 0.0 < env.worst < 0.15, "it comes near, and no nearer"
+    assert 0.0 < env.worst < 0.15, "it comes near and does not hit"
     assert farthest > 0.3
     assert {"allowed", "adjusted"} <= set(kinds)
 
@@ -102,37 +101,37 @@ def test_limits_hold_between_periods_and_in_the_stop(name):
     assert farthest > 0.6, "so is the room"
 
 
-def test_a_limit_is_kept_whatever_the_clearance_margin():
-    """Less than none leaves it to obstacles what is kept to them, and says nothing of limits."""
-    ours = Filter(ready("boxed car").model, clearance_margin=-0.05)
-    rng, plan, kinds = np.random.default_rng(0), np.zeros((ours.robot.horizon, 2)), set()
-    for _ in range(200):
+def decisions_at_the_edge(clearance_margin, count, post=False):
+    """Yield decisions of the boxed car that drives near its limit in x, and optionally beside a post."""
+    filter = Filter(ready("boxed car").model, clearance_margin=clearance_margin)
+    rng, plan, driving = np.random.default_rng(0), np.zeros((filter.robot.horizon, 2)), np.array([0.2, 0.0])
+    for _ in range(count):
         state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])
-        driving = np.array([0.2, 0.0])
-        decision = ours.decide(Request(state, driving, driving, plan, Shapes.of([], 2), known_free=True))
+        posts = [cylinder(state[0] + 0.1, rng.uniform(0.2, 0.4))] if post else []
+        yield filter.decide(Request(state, driving, driving, plan, Shapes.of(posts, 2), known_free=not post))
+
+
+def test_a_limit_is_kept_with_any_clearance_margin():
+    """A negative margin concerns obstacles, not limits."""
+    kinds = set()
+    for decision in decisions_at_the_edge(-0.05, 200):
         kinds.add(decision.kind)
         assert decision.margin >= -1e-9 or decision.kind == FAILSAFE
     assert {ALLOWED, ADJUSTED} <= kinds
 
 
-def test_what_is_replaced_for_clearance_is_not_laid_to_a_limit():
+def test_a_limit_never_blocks_a_proposal_that_is_adjusted_for_clearance():
     """A limit has no clearance margin, so a tube may come nearer to it than to the obstacle that is named."""
-    ours = Filter(ready("boxed car").model, clearance_margin=0.1)
-    limits = {limit.name for limit in ours.robot.limits}
-    rng, plan, near = np.random.default_rng(0), np.zeros((ours.robot.horizon, 2)), 0
-    for _ in range(300):
-        state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])
-        driving = np.array([0.2, 0.0])
-        about = Shapes.of([Obstacle("cylinder", (state[0] + 0.1, rng.uniform(0.2, 0.4)), (0.1,))], 2)
-        decision = ours.decide(Request(state, driving, driving, plan, about))
+    limits, adjusted = {limit.name for limit in ROBOTS["boxed car"].limits}, 0
+    for decision in decisions_at_the_edge(0.1, 300, post=True):
         if decision.for_clearance:
             assert decision.blocked_by.by not in limits
-            near += 1
-    assert near > 5
+            adjusted += 1
+    assert adjusted > 5
 
 
 @pytest.mark.parametrize("margin", [0.2, -0.1])
-def test_a_margin_is_kept_or_spared(margin):
+def test_an_obstacles_margin_is_kept_even_if_negative(margin):
     robot = ROBOTS["feedback"]
     env = Toy(robot, discs(margin), capsule=((0.0, 0.0), (0.0, 0.0), 0.1 + margin))
     drive(filtered(env, ready("feedback")), ready("feedback"), 5)

@@ -44,7 +44,7 @@ def disc(place):
     return Obstacle("cylinder", (float(place[0]), float(place[1])), (SIZE,))
 
 
-# --- persons stay inside the occupied cells -------------------------------------------------------------------------------
+# --- persons stay inside the occupied cells -------------------------------------------------------------------------
 
 
 def starts(rng, sensor, still):

@@ -1,4 +1,4 @@
-"""A statement that is looser than the robot's limit is not used without a question, whoever puts it to use."""
+"""A model set whose stated bound exceeds the robot's limit is refused everywhere, unless the user accepts it."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ LAX = dataclasses.replace(GROUND, accept_bound=0.3)
 
 
 def message():
-    """A question at rest, with nothing near."""
+    """Return a request at rest, with nothing near."""
     sizes = {"state": [0.0] * 5, "action": [0.1, 0.0], "input_in_force": [0.0] * 2, "plan": [0.0] * 6}
     return pb.Request(robot="ground", actor="a", known_free=True, **sizes)
 
@@ -43,7 +43,7 @@ def said(model, about):
     [{}, *({"bound_plan": word} for word in ("nan", "-0.1", "1.5", "inf", "-inf", "many", "", None, [0.001]))],
     ids=str,
 )
-def test_what_is_no_statement_counts_as_one_that_says_nothing(about, model):
+def test_a_malformed_statement_counts_as_no_bound(about, model):
     assert stated_bound(about) == 1.0
     with pytest.raises(TooLoose):
         check_bound(said(model, about), LAX)
@@ -65,7 +65,7 @@ def test_the_limit_is_the_robots_own_unless_more_is_accepted(model):
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.1, math.nan, math.inf])
-def test_what_is_accepted_is_a_share(share):
+def test_an_accepted_bound_must_be_a_share(share):
     with pytest.raises(ValueError, match="above 0"):
         accepted_bound(GROUND, share)
 
@@ -80,7 +80,7 @@ def test_a_refusal_says_the_bound_the_limit_and_what_to_do():
     assert "no statement" in refusal(GROUND, {}) and "certify" in refusal(GROUND, {})
 
 
-def test_what_is_suggested_is_accepted_and_what_is_shown_is_no_less_than_stated():
+def test_a_suggested_bound_is_accepted_and_a_shown_one_is_rounded_up():
     for bound in (*np.random.default_rng(0).random(200), 0.01, 0.07, 0.29, 0.58, 1e-5, 1.0):
         assert bound <= rounded_up(bound) <= min(1.1 * bound, 1.0)
         assert float(f"{rounded_up(bound):g}") >= bound
@@ -88,7 +88,7 @@ def test_what_is_suggested_is_accepted_and_what_is_shown_is_no_less_than_stated(
     assert plans_needed(0.01) == 459
 
 
-def test_whoever_puts_a_model_set_to_use_in_process_refuses_a_loose_one(model, tmp_path):
+def test_every_use_in_process_refuses_a_loose_model_set(model, tmp_path):
     loose = said(model, FLOWN)
     loose.save(tmp_path / "model.safetensors")
     for use in (
@@ -113,7 +113,7 @@ def test_whoever_puts_a_model_set_to_use_in_process_refuses_a_loose_one(model, t
 
 
 class Nothing(gymnasium.Env):
-    """An environment that no filter gets in front of."""
+    """An environment that no filter wraps."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
@@ -128,11 +128,11 @@ def test_a_service_goes_on_with_its_model_set_when_a_loose_one_is_refused(model)
     assert models.filters["ground"] is in_use
 
 
-def test_a_rival_states_nothing_and_is_not_asked_to():
+def test_a_rival_needs_no_stated_bound():
     check_bound(rival(0.3), GROUND)
 
 
-def test_every_decision_carries_the_bound_there_and_back(model):
+def test_every_decision_carries_the_bound(model):
     for about, bound in ((TIGHT, 0.0042), ({}, 1.0), ({"bound_plan": "nan"}, 1.0)):
         decision = Service(said(model, about)).decision(message())
         assert bound_in(decision) == bound
@@ -144,10 +144,10 @@ def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
     old = decision_reply(dataclasses.replace(decision, bound=None), 0.0).decision
     assert not old.HasField("bound") and decision_of(old, GROUND).bound is None
     old.bound = math.nan
-    assert decision_of(old, GROUND).bound == 1.0, "what is no share says nothing"
+    assert decision_of(old, GROUND).bound == 1.0, "NaN counts as no bound"
 
 
-def test_verified_is_said_with_what_it_is_worth(model):
+def test_verified_is_described_with_its_bound(model):
     assert (
         describe_verification(True, 0.0113)
         == "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"

@@ -1,4 +1,4 @@
-"""SAILR alone: the rule against advantages that are known, and what is executed instead."""
+"""SAILR alone: it intervenes at known advantages, and executes the backup policy instead."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def request(action, before=(0.0, 0.0), robot=GROUND, observation=None) -> Reques
 
 
 @pytest.mark.parametrize("threshold", [0.02, 0.1, 0.4, 0.8])
-def test_it_intervenes_exactly_where_the_advantage_is_above_the_threshold(threshold):
+def test_sailr_intervenes_exactly_where_the_advantage_is_above_the_threshold(threshold):
     ready = Sailr(known(threshold))
     for speed in np.linspace(0.0, 0.25, 41):
         cost = 1.0 / (1.0 + np.exp(-STEEP * (speed / 0.125 - 1.0)))
@@ -70,13 +70,13 @@ def test_the_larger_q_and_the_smaller_v_count():
         assert Sailr(known(v=v)).advantage(np.zeros(26), np.array([0.125, 0.0])) == pytest.approx(0.3, abs=1e-5)
 
 
-def test_only_the_advantage_counts_not_the_danger_itself():
-    """Where braking would not help either, an action that makes nothing worse passes."""
+def test_only_the_advantage_counts_not_the_cost_itself():
+    """If braking does not help either, an action that makes nothing worse passes."""
     doomed = Sailr(known(threshold=0.1, q=(logit(0.95),) * 2, v=(logit(0.94),) * 2))
     assert doomed.decide(request((0.125, 0.0))).kind == "allowed"
 
 
-def test_it_looks_at_the_proposal_as_it_would_be_executed():
+def test_sailr_judges_the_proposal_clipped_to_its_bounds():
     decision = Sailr(known(threshold=0.95)).decide(request((99.0, -99.0)))
     assert decision.kind == "allowed" and np.allclose(decision.plan[0], (0.25, -0.5))
 
@@ -106,7 +106,7 @@ def test_a_proposal_that_is_not_finite_brakes():
     assert np.allclose(decision.plan[0], brake(QUADROTOR, before)) and not decision.plan[-1].any()
 
 
-def test_without_the_observation_it_does_not_guess():
+def test_a_request_without_an_observation_is_refused():
     with pytest.raises(BadRequest) as refused:
         Sailr(known()).decide(request((0.1, 0.0), observation=np.zeros(0, np.float32)))
     assert refused.value.field == "observation"

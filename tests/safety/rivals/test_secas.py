@@ -1,4 +1,4 @@
-"""SECAS alone: the closed form against the QP, and what a decision makes of known constraints."""
+"""SECAS alone: the closed form against the QP, and decisions under known constraints."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def test_the_closed_form_is_the_qp_where_one_of_several_is_active(r, seed):
     d = G @ r + rng.uniform(0.5, 1.0, 4)
     d[2] -= 1.2  # the one that is violated
     mine = closed_form(r, G, d)
-    assert G[2] @ mine == pytest.approx(d[2]), "whichever else there are, it is the violated one that is met"
+    assert G[2] @ mine == pytest.approx(d[2]), "the violated constraint is met"
     if (G @ mine <= d).all():
         assert np.allclose(mine, quadratic(r, G, d, -WIDE, WIDE)[0], atol=SAME)
 
@@ -62,7 +62,7 @@ def test_the_qp_is_the_closest_of_all_inputs_that_meet_every_constraint(seed):
     assert np.linalg.norm(a - r) <= best + SAME
 
 
-def test_where_nothing_meets_all_constraints_the_worst_violation_is_the_least():
+def test_the_worst_violation_is_minimal_if_no_input_meets_all_constraints():
     G, d = np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-0.4, -0.2])  # a <= -0.4 and a >= 0.2
     a, _, _ = quadratic(np.array([0.9, 0.3]), G, d, -np.ones(2), np.ones(2))
     assert a == pytest.approx([-0.1, 0.3], abs=1e-3)
@@ -126,15 +126,15 @@ def test_the_speed_is_cut_to_what_the_linear_model_allows():
     assert too_near.plan[0] == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
 
 
-def test_moving_towards_it_counts_as_nearer():
+def test_a_robot_that_approaches_counts_as_nearer():
     constraints = Constraints(GROUND, GROUND.task.rays)
     still, moving = (constraints(seen(0.3), np.array([0, 0, 0, v, 0])) for v in (0.0, 0.25))
     assert still[2] == pytest.approx(-0.3, abs=1e-6)
     assert 0.04 < moving[2] - still[2] <= 0.25 * constraints.stopping
-    assert moving[0] == pytest.approx(still[0], abs=0.05), "nothing is nearer at the side"
+    assert moving[0] == pytest.approx(still[0], abs=0.05), "the side does not come nearer"
 
 
-def test_what_is_far_away_is_all_the_same():
+def test_ranges_beyond_near_count_as_equal():
     constraints, at_rest = Constraints(GROUND, GROUND.task.rays), np.zeros(5)
     assert np.array_equal(constraints(seen(3.5), at_rest), constraints(seen(2.0, beside=1.0), at_rest))
 
