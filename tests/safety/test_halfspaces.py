@@ -1,6 +1,4 @@
-"""Half-spaces: the obstacle, grown by the body and the measurement's error, is on their far side."""
-
-from dataclasses import replace
+"""Half-spaces: the obstacle, grown by the body and the measurement error, is beyond them."""
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ BODY = 0.1
 
 @settings(max_examples=200)
 @given(obstacles(), st.integers(0, 10_000))
-def test_whoever_is_inside_keeps_off_the_obstacle(obstacle, seed):
+def test_a_body_on_the_near_side_keeps_off_the_obstacle(obstacle, seed):
     rng = np.random.default_rng(seed)
     d = len(obstacle.position)
     start, nominal = rng.uniform(-5, 5, d), rng.uniform(-5, 5, (3, d))
@@ -41,7 +39,7 @@ def test_whoever_is_inside_keeps_off_the_obstacle(obstacle, seed):
 
 
 def test_the_start_is_on_the_near_side_wherever_the_plan_leads():
-    """Nominal positions inside the obstacle and behind it: the plane is taken from the start."""
+    """For nominal positions inside the obstacle and behind it, the start determines the plane."""
     near = Shapes.of([Obstacle("cylinder", (1.0, 0.0), (0.3,))], 2)
     nominal = np.array([[0.5, 0.0], [1.0, 0.1], [2.0, 0.0]])
     normals, offsets = half_spaces(near, np.zeros(2), nominal, BODY, np.array([0.01, 0.02]))
@@ -64,7 +62,7 @@ def test_nothing_is_free_for_a_start_that_touches(start):
 
 
 @given(obstacles(), st.integers(0, 10_000))
-def test_what_leads_out_has_all_of_the_obstacle_behind_it_and_is_the_same_outside(obstacle, seed):
+def test_half_spaces_that_lead_out_have_the_obstacle_behind_them_and_are_the_same_outside(obstacle, seed):
     rng = np.random.default_rng(seed)
     d = len(obstacle.position)
     near, measured, drawn = Shapes.of([obstacle], d), rng.uniform(0, 0.05, d), sample(obstacle, rng)
@@ -74,21 +72,14 @@ def test_what_leads_out_has_all_of_the_obstacle_behind_it_and_is_the_same_outsid
         normals, offsets = half_spaces_leading_out(near, start, BODY, measured, planes)
         if near.distance(start)[0] > 0.0:
             assert (normals == planes[0]).all() and (offsets == planes[1]).all()
-        elif np.isfinite(offsets).all():  # but in the middle, where no way is known
+        elif np.isfinite(offsets).all():  # except in the middle, where no way out is known
             assert (offsets < 0.0).all()  # it is not free yet
             kept = BODY + np.abs(normals[0, 0]) @ measured
             assert ((drawn - start) @ normals[0, 0] >= offsets[0, 0] + kept - 1e-7).all()
 
 
-def test_no_number_is_never_free():
-    near = Shapes.of([Obstacle("sphere", (1.0, 0.0), (0.3,))], 2)
-    broken = replace(near, center=near.center * np.nan)
-    _, offsets = half_spaces(broken, np.zeros(2), np.zeros((1, 2)), BODY, np.zeros(2))
-    assert not (offsets > -np.inf).any()
-
-
-def test_who_passes_by_in_a_period_keeps_the_room_beside_the_obstacle():
-    """From one end of the period alone the plane would cut off the other."""
+def test_a_period_that_passes_the_obstacle_keeps_the_room_beside_it():
+    """A plane for one end of the period alone would cut off the other end."""
     near = Shapes.of([Obstacle("cylinder", (1.5, 1.0), (0.5,))], 2)
     nominal = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     normals, offsets = half_spaces(near, np.zeros(2), nominal, 0.0, np.zeros(2))
@@ -99,7 +90,7 @@ def test_who_passes_by_in_a_period_keeps_the_room_beside_the_obstacle():
 
 
 @given(obstacles(), st.integers(0, 10_000))
-def test_a_plan_that_keeps_apart_is_inside_its_half_spaces_and_one_that_does_not_is_not(obstacle, seed):
+def test_no_plan_that_touches_the_obstacle_is_inside_its_half_spaces(obstacle, seed):
     rng = np.random.default_rng(seed)
     d = len(obstacle.position)
     near = Shapes.of([obstacle], d)

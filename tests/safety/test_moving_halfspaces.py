@@ -1,4 +1,4 @@
-"""Half-spaces beside what moves: whatever keeps its bounds is on their far side, for the whole of every period."""
+"""Half-spaces beside movers: a mover that keeps its bounds is beyond them during every period."""
 
 import tracemalloc
 
@@ -38,7 +38,7 @@ def motions(draw, d):
 
 
 def path(motion, rng, times):
-    """Where something that keeps the motion's bounds may be, relative to its measured place: (T, d), by small steps."""
+    """Return a random path (T, d) within the bounds of a motion, relative to the measured position."""
     d = len(motion.velocity)
     at = ball(rng, d, motion.position_error)
     if motion.speed is not None:
@@ -65,7 +65,7 @@ def path(motion, rng, times):
 
 @settings(max_examples=150, deadline=None)
 @given(st.data(), st.integers(0, 10_000))
-def test_what_keeps_its_bounds_stays_on_the_far_side(data, seed):
+def test_a_mover_within_its_bounds_stays_beyond_the_half_spaces(data, seed):
     obstacle = data.draw(obstacles())
     d = len(obstacle.position)
     motion = data.draw(motions(d))
@@ -89,8 +89,7 @@ def test_what_keeps_its_bounds_stays_on_the_far_side(data, seed):
 
 
 @given(obstacles(), st.integers(0, 10_000))
-def test_one_that_has_no_way_to_go_is_one_that_stands(obstacle, seed):
-    """Up to normals that were seen earlier: these may leave more room, never less."""
+def test_a_mover_with_speed_zero_leaves_no_less_room_than_a_standing_obstacle(obstacle, seed):
     rng = np.random.default_rng(seed)
     d = len(obstacle.position)
     ways = np.cumsum(rng.uniform(-0.5, 0.5, (PERIODS + 1, d)), axis=0)
@@ -105,7 +104,7 @@ def test_one_that_has_no_way_to_go_is_one_that_stands(obstacle, seed):
             assert room >= other - 1e-9
 
 
-def test_a_walker_that_comes_is_given_way_to():
+def test_the_half_spaces_recede_from_a_walker_that_comes():
     motion = Motion((-1.0, 0.0), 0.03, 0.05, acceleration=1.0)
     near = MovingObstacles.of([Obstacle("cylinder", (1.0, 0.0), (0.2,), motion=motion)], 2)
     nominal = np.array([[0.05, 0.0], [0.06, 0.0], [0.06, 0.0]])
@@ -115,8 +114,8 @@ def test_a_walker_that_comes_is_given_way_to():
     assert np.allclose(offsets[0], 0.8 - t - (0.03 + 0.05 * t + 0.5 * t * t) - 0.1)
 
 
-def test_many_movers_take_room_for_each_not_for_each_pair():
-    """A thousand in one request kept the service for three seconds: every robot braked."""
+def test_the_memory_for_movers_grows_linearly():
+    """With memory for each pair, a thousand movers in one request would block the service for seconds."""
     rng, count = np.random.default_rng(0), 1000
     near = [
         moving(Obstacle("cylinder", tuple(at), (0.05,)), Motion((0.1, 0.0), 0.01, 0.01, speed=0.5))
@@ -134,7 +133,7 @@ def test_many_movers_take_room_for_each_not_for_each_pair():
         assert np.array_equal(alone[0][0], normals[i]) and np.array_equal(alone[1][0], offsets[i])
 
 
-def test_no_number_is_never_free():
+def test_a_mover_with_nan_leaves_nothing_free():
     near = MovingObstacles.of([Obstacle("sphere", (1.0, 0.0), (0.3,), motion=Motion((0.0, 0.0), 0.0, speed=1.0))], 2)
     near.drift[:] = np.nan
     _, offsets = swept_half_spaces(near, np.zeros(2), np.zeros((2, 2)), BODY, np.zeros(2), PERIOD)
@@ -143,7 +142,7 @@ def test_no_number_is_never_free():
 
 @settings(max_examples=50, deadline=None)
 @given(st.data(), st.integers(0, 10_000))
-def test_who_keeps_the_bounds_is_seen_where_it_may_be(data, seed):
+def test_a_mover_within_its_bounds_is_consistent_with_its_last_sighting(data, seed):
     rng = np.random.default_rng(seed)
     motion = data.draw(motions(2))
     since = 0.2
@@ -165,7 +164,7 @@ def test_who_keeps_the_bounds_is_seen_where_it_may_be(data, seed):
         assert wide.is_consistent(now)
 
 
-def test_who_breaks_the_bound_is_seen_to():
+def test_a_mover_that_breaks_its_bound_is_inconsistent_with_its_last_sighting():
     before = Sighting((0.0, 0.0), (1.0, 0.0), 0.2)
 
     def kept(x, velocity=(1.0, 0.0)):
@@ -187,13 +186,13 @@ def test_who_breaks_the_bound_is_seen_to():
         Motion((0.0, 0.0), 0.0, speed=1.0, before=Sighting((0.0,), (0.0, 0.0), 0.2)),
     ],
 )
-def test_a_motion_that_is_none_is_refused(motion):
+def test_a_malformed_motion_is_refused(motion):
     with pytest.raises(BadShape) as error:
         Obstacle("sphere", (0.0, 0.0), (0.3,), motion=motion)
     assert error.value.field == "motion"
 
 
-def test_what_moves_is_told_from_what_stands():
+def test_movers_are_separated_from_standing_obstacles():
     still = Obstacle("sphere", (1.0, 0.0), (0.3,))
     mover = moving(still, Motion((1.0, 0.0), 0.0, speed=1.0))
     shapes, movers = split_moving([still, mover, still], 2)

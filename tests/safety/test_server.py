@@ -202,6 +202,8 @@ def test_the_client_refuses_a_bad_reply(service):
         (lambda d: d.predicted_half_width.__setitem__(0, NAN), "predicted_center"),
         (lambda d: d.predicted_half_width.__setitem__(0, -0.1), "predicted_center"),
         (lambda d: setattr(d, "margin", NAN), "predicted_center"),
+        (lambda d: d.tube_center.pop(), "tube_center"),
+        (lambda d: d.tube_half_width.__setitem__(0, INF), "tube_center"),
     ):
         damaged = pb.Reply()
         damaged.CopyFrom(reply)
