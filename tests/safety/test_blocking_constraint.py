@@ -1,4 +1,4 @@
-"""What stopped a proposal: the right obstacle, where its edge truly is, and as far as the tube truly comes."""
+"""The blocking constraint names the right obstacle, its true edge and the true violation."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def blocked(ready, requests):
             assert decision.blocked_by is None
 
 
-def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(ready):
+def test_the_edge_touches_the_blocking_obstacle_and_has_all_of_it_behind(ready):
     rng, seen = np.random.default_rng(0), 0
     for question, decision in blocked(ready, (random_request(rng, 6, 0.22) for _ in range(120))):
         stopped, shapes = decision.blocked_by, question.obstacles
@@ -37,7 +37,7 @@ def test_the_edge_touches_the_obstacle_that_is_in_the_way_and_holds_all_of_it(re
     assert seen > 30
 
 
-def test_the_room_is_that_of_the_proposals_tube(ready):
+def test_the_room_is_the_margin_of_the_proposals_tube(ready):
     rng = np.random.default_rng(1)
     for question, decision in blocked(ready, (random_request(rng) for _ in range(60))):
         z_0 = np.concatenate([question.state[ready.regressor], question.input_in_force])

@@ -1,4 +1,4 @@
-"""Recordings: what is refused, and what the windows hold."""
+"""Data sets are saved, checked and cut into windows."""
 
 import json
 from dataclasses import replace
@@ -26,7 +26,7 @@ def small() -> Dataset:
 
 
 def changed(data, **parts):
-    """The data set with parts of its first trajectory replaced."""
+    """Return the data set with parts of its first trajectory replaced."""
     return replace(data, trajectories=(replace(data.trajectories[0], **parts), *data.trajectories[1:]))
 
 
@@ -36,7 +36,7 @@ def with_value(array, value, at=(3, 0)):
     return array
 
 
-def test_what_is_saved_is_what_is_loaded(small, tmp_path):
+def test_a_saved_data_set_is_loaded_unchanged(small, tmp_path):
     moving = changed(small, before=np.array([0.1, -0.2]))
     moving.save(tmp_path / "deep" / "set.safetensors")
     again = Dataset.load(tmp_path / "deep" / "set.safetensors")
@@ -54,7 +54,7 @@ def test_what_is_saved_is_what_is_loaded(small, tmp_path):
 
 @pytest.mark.parametrize("name", ["states", "inputs", "paths", "turned"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_numbers_that_are_none_are_refused(small, name, value):
+def test_nan_and_infinity_are_refused(small, name, value):
     bad = changed(small, **{name: with_value(getattr(small.trajectories[0], name), value)})
     with pytest.raises(BadData, match=f"{name} holds NaN"):
         bad.check()
@@ -96,7 +96,7 @@ def test_two_recordings_glued_into_one_are_refused(small):
         replace(small, trajectories=(glued,)).check()
 
 
-def test_files_that_are_no_data_set_are_refused(small, tmp_path):
+def test_files_that_hold_no_valid_data_set_are_refused(small, tmp_path):
     path = tmp_path / "set.safetensors"
     small.save(path)
     whole = path.read_bytes()
@@ -168,7 +168,7 @@ def test_windows_are_plans_within_one_trajectory(small, k):
         assert np.array_equal(found.y[row, 3:], t.states[start + k, 3:])
 
 
-def test_bulge_and_latch_against_brute_force(small):
+def test_chord_deviation_and_stopping_distance_by_brute_force(small):
     found = windows(small, 3)
     for row in range(0, len(found), 7):
         number, start = found.start[row]
@@ -192,7 +192,7 @@ STATE = arrays(float, 5, elements=st.floats(-3, 3))
 
 @settings(max_examples=100)
 @given(STATE, STATE, st.floats(-10, 10), st.floats(-10, 10), st.floats(-4, 4))
-def test_displacement_does_not_depend_on_where_and_whither(start, end, dx, dy, turn):
+def test_displacement_does_not_depend_on_the_pose_in_the_world(start, end, dx, dy, turn):
     seen = displacement(GROUND, start, end)
 
     def moved(state):

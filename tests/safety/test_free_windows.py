@@ -1,4 +1,4 @@
-"""Model sets from driving that follows no plan: what they say of plans, against windows of these and rollouts."""
+"""Model sets from data without plans: their tubes hold for plans too."""
 
 import itertools
 
@@ -36,7 +36,7 @@ KEEP = np.exp(-0.2 / 0.15)  # of a speed, after a period
 
 
 def moved(x, u):
-    """One period of a linear robot, written out: (state after it, position half-way)."""
+    """Return the state after one period of a linear robot, and the position half-way."""
     half = np.exp(-0.1 / 0.15)
     way = [u * t + 0.15 * (x[2:] - u) * (1.0 - keep) for t, keep in ((0.1, half), (0.2, KEEP))]
     return np.concatenate([x[:2] + way[1], u + KEEP * (x[2:] - u)]), x[:2] + way[0]
@@ -55,7 +55,7 @@ def driven(inputs, rng, noise):
 
 
 def wandering(rng, count):
-    """Inputs that follow no plan, and now and then stop."""
+    """Yield inputs that follow no plan, with some stops."""
     while count > 0:
         for _ in range(rng.integers(4, 12)):
             yield rng.uniform(ROBOT.low(), ROBOT.high())
@@ -71,12 +71,12 @@ def free_data(seed, noise=1.0, count=40):
 
 @pytest.fixture(scope="module")
 def planned():
-    """Of plans, without noise."""
+    """Data from plans, without noise."""
     rngs = [np.random.default_rng((0, i)) for i in range(40)]
     return Dataset(ROBOT, tuple(driven(list(itertools.islice(excitation(ROBOT, r), 80)), r, 0.0) for r in rngs))
 
 
-def test_a_plans_regressors_are_a_free_windows(planned):
+def test_a_plans_regressors_map_to_those_of_a_free_window(planned):
     plans, free = windows(planned, ROBOT.horizon, PLAN), windows(planned, ROBOT.horizon, FREE)
     place = {tuple(start): i for i, start in enumerate(free.start)}
     rows = [place[tuple(start)] for start in plans.start]
@@ -86,7 +86,7 @@ def test_a_plans_regressors_are_a_free_windows(planned):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_of_a_linear_robot_both_are_the_same_predictor(planned, mode):
+def test_both_kinds_of_windows_give_a_linear_robot_the_same_predictor(planned, mode):
     plans = fit_model_set(planned, ModelConfig(mode=mode)).tube()
     free = fit_model_set(free_data(1, noise=0.0), ModelConfig(mode=mode, windows=FREE)).tube()
     z = np.random.default_rng(2).uniform(-1, 1, (50, plans.position.shape[2]))
@@ -116,7 +116,7 @@ def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
     assert outside <= 6, f"{outside} of 1200 positions"
 
 
-def test_the_statement_is_about_windows_like_those_it_was_made_from():
+def test_the_validation_report_is_about_windows_of_the_same_kind():
     fitted, held_out = free_data(5), free_data(6, count=40)
     said = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, held_out)
     assert said.windows > 300 and said.bound_step < 0.05 and said.bound_plan < 0.1
@@ -125,7 +125,7 @@ def test_the_statement_is_about_windows_like_those_it_was_made_from():
     assert worse.step_violations > 0.3 * worse.windows
 
 
-def test_driving_without_stops_says_what_to_drive():
+def test_an_error_about_missing_stops_says_what_to_drive():
     rng = np.random.default_rng(7)
     inputs = [driven(list(rng.uniform(ROBOT.low(), ROBOT.high(), (60, 2))), rng, 1.0) for _ in range(30)]
     with pytest.raises(BadData, match=r"0 stops in the data.*from every speed give zero input and let the robot stand"):

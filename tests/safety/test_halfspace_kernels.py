@@ -1,4 +1,4 @@
-"""Half-spaces held against a tube, compiled: beside what the words say, and beside plans drawn at random."""
+"""Compiled checks of a tube against half-spaces agree with the definitions and with random plans."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def a_tube(rng: np.random.Generator, d: int, own: bool = True) -> Tube:
 
 
 def supports(tube: Tube, normals: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Of the sets at the ends of all periods' half-spaces (n, 2N+1), from the words of `ObstacleRows`."""
+    """Return the supports (n, 2N+1) of the sets at both ends of all periods, by the definition in `ObstacleRows`."""
     N, L, sizes = tube.horizon, tube.generators, tube.magnitudes(z)
     centers = np.vstack([np.zeros(normals.shape[2]), tube.centers(z)])
     spans = np.concatenate([np.zeros((1, *tube.directions.shape[1:])), tube.directions])
@@ -39,7 +39,7 @@ def supports(tube: Tube, normals: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("d", [2, 3])
 @given(seed=SEEDS)
-def test_rows_and_what_they_leave_are_what_the_words_say(d: int, seed: int) -> None:
+def test_rows_and_slack_agree_with_the_definition(d: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tube = a_tube(rng, d, own=bool(seed % 2))
     normals, offsets = rng.normal(size=(4, tube.horizon, d)), rng.normal(size=(4, tube.horizon))
@@ -53,7 +53,7 @@ def test_rows_and_what_they_leave_are_what_the_words_say(d: int, seed: int) -> N
 
 
 @pytest.mark.parametrize("what", ["normals", "offsets", "z"])
-def test_what_is_no_number_leaves_nothing(what: str) -> None:
+def test_nan_in_any_input_leaves_no_slack(what: str) -> None:
     rng = np.random.default_rng(0)
     tube = a_tube(rng, 3)
     told = {
@@ -68,7 +68,7 @@ def test_what_is_no_number_leaves_nothing(what: str) -> None:
 
 
 @given(seed=SEEDS)
-def test_rows_that_are_left_out_do_not_matter(seed: int) -> None:
+def test_the_presolve_drops_only_rows_that_do_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows, known, free, L, q = 12, 3, 3, 5, 3
     gradient, spread = rng.normal(size=(rows, known + free)), np.abs(rng.normal(size=(rows, L)))
@@ -88,7 +88,7 @@ def test_rows_that_are_left_out_do_not_matter(seed: int) -> None:
     count, A, b = presolve_rows(gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6)
     left = bound - 1e-6 - reached
     if count < 0:
-        assert (left.min(axis=1) < 1e-9).all(), "it can't be met, and no plan meets it"
+        assert (left.min(axis=1) < 1e-9).all(), "infeasible: no plan meets all rows"
         return
     of_those = (b[:count] - (np.hstack([f, t]) / scale) @ A[:count].T).min(axis=1, initial=np.inf)
     assert ((left.min(axis=1) >= 0.0) == (of_those >= 0.0))[np.abs(left).min(axis=1) > 1e-9].all()
@@ -96,7 +96,7 @@ def test_rows_that_are_left_out_do_not_matter(seed: int) -> None:
 
 @pytest.mark.parametrize("d", [2, 3])
 @given(seed=SEEDS)
-def test_no_plan_leaves_the_boxes_about_all_of_them(d: int, seed: int) -> None:
+def test_no_plan_leaves_the_boxes_of_all_plans(d: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tube = a_tube(rng, d, own=bool(seed % 2))
     nz, free = tube.W.shape[1], 2

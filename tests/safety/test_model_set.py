@@ -1,4 +1,4 @@
-"""Model sets: what goes in comes out, one version means one content, and what is no model set is refused."""
+"""Model sets: files are read back, a version names one content, and malformed files are refused."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ ALL = [(kind, mode) for kind in KINDS for mode in MODES]
 
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
-def test_what_is_encoded_is_decoded(models, which, tmp_path):
+def test_an_encoded_model_set_is_decoded_unchanged(models, which, tmp_path):
     model = models[which]
     again = ModelSet.decode(model.encode())
     assert again.version == model.version
@@ -35,7 +35,7 @@ def test_what_is_encoded_is_decoded(models, which, tmp_path):
         assert np.array_equal(one.centers(z), other.centers(z))
 
 
-def test_the_version_is_the_content(models, model, data):
+def test_the_version_names_the_content(models, model, data):
     assert len({models[which].version for which in ALL}) == len(ALL)
     assert fit_model_set(data, ModelConfig()).version == model.version
     wider = replace(model, stopping_distance=replace(model.stopping_distance, w=model.stopping_distance.w + 1e-6))
@@ -44,9 +44,8 @@ def test_the_version_is_the_content(models, model, data):
     assert replace(model, model_config=replace(model.model_config, mode="recursion")).version != model.version
 
 
-def test_from_when_on_a_robot_stands_is_what_was_recorded(model, data):
-    """A plan of the toy has one input and then none: it stands after two of three periods, and not where one plan's
-    third period began with more speed than an error of measurement."""
+def test_the_time_until_a_robot_stands_comes_from_the_data(model, data):
+    """The robot stands after two of three periods, unless one recorded plan still moved then."""
     assert model.moving == model.stands == 2
     whole = windows(data, GROUND.horizon)
     number, start = whole.start[len(whole) // 2]
@@ -59,7 +58,7 @@ def test_from_when_on_a_robot_stands_is_what_was_recorded(model, data):
     assert periods_until_standing(whole, data, "plan") == 2 and periods_until_standing(whole, data, "free") == 3
     assert ModelSet.decode(model.encode()).stands == 2
     assert replace(model, stands=3).version != model.version
-    assert replace(model, stands=3).version == replace(model, stands=0).version  # both say: no sooner than at its end
+    assert replace(model, stands=3).version == replace(model, stands=0).version  # both mean: not before the plan ends
     with pytest.raises(BadModel, match="can't have come to a stand after 4"):
         ModelSet.decode(edited(model, {"stands": 4}))
 
@@ -78,7 +77,7 @@ def test_garbage_is_refused(model, tmp_path):
 
 
 def edited(model, metadata=None, **tensors):
-    """The model's bytes with tensors or metadata replaced; its version as it was."""
+    """Return the model's bytes with other tensors or metadata, and the old version."""
     before, about = unpack(model.encode(), ENTRY)
     changed = {name.replace("__", "."): value for name, value in tensors.items()}
     return pack(before | changed, ENTRY, about | (metadata or {}))
@@ -121,7 +120,7 @@ def test_tampered_model_sets_are_refused(model):
             ModelSet.decode(edited(model, metadata))
 
 
-def test_recipes_that_mean_nothing_are_refused():
+def test_invalid_configurations_are_refused():
     for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
         with pytest.raises(ValueError, match=r"certificate|mode|envelope"):
             ModelConfig(**bad)
@@ -138,7 +137,7 @@ def test_data_that_support_no_model_are_refused(data):
 
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
-def test_every_model_bounds_the_data_it_was_bounded_on(models, data, which):
+def test_every_model_set_bounds_its_own_data(models, data, which):
     model = models[which]
     _, bound = data.split((0.5, 0.5))
     w = windows(bound, 1)
@@ -150,8 +149,7 @@ def test_every_model_bounds_the_data_it_was_bounded_on(models, data, which):
     assert (whole.stopping_distance[seen] <= model.stopping_distance.half_widths(whole.z[seen])[:, 0]).all()
 
 
-def test_the_residual_certificate_is_the_narrowest_and_the_envelope_serves_all(models, data):
-    """The noise of all three is the residual of one fit: the matrices of (a) and (b) include it."""
+def test_the_residual_bound_is_the_narrowest_and_the_others_contain_its_fit(models, data):
     w = windows(data, 3)
     widths = {kind: Filter(models[kind, "direct"]).tube.half_widths(w.z[0])[-1].max() for kind in KINDS}
     assert widths["residual"] <= widths["set-membership"] <= widths["matrix-zonotope"]

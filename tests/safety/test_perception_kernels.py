@@ -124,10 +124,8 @@ def test_gaps_reach_and_free_groups_of_a_path(seed, periods, n):
     planes = rng.normal(size=(count, 4, 3)), rng.normal(size=(count, 4))
     planes[0][rng.random((count, 4)) < 0.3] = 0.0
     arguments = planes, first, boxes, growth, (0.2, rng.random(3)), rng.normal(size=3)
-    for compiled, twin in zip(
-        occlusion_kernels.period_planes(*arguments), twins.period_planes(*arguments), strict=True
-    ):
-        assert np.allclose(compiled, twin, atol=1e-12)
+    pairs = zip(occlusion_kernels.period_planes(*arguments), twins.period_planes(*arguments), strict=True)
+    assert all(np.allclose(compiled, twin, atol=1e-12) for compiled, twin in pairs)
 
 
 @settings(max_examples=40)

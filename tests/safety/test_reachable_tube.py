@@ -1,4 +1,4 @@
-"""The stacked tube: closed-loop rollouts stay inside, and it is what the definitions say."""
+"""The stacked tube: rollouts stay inside, and the tube agrees with its definition."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def rotated(vectors, angle):
 
 @pytest.fixture(scope="module")
 def rollouts():
-    """(z, measured displacements (3, 2), off-chord ways (3,), way after the stop) of plans from states in motion."""
+    """Rollouts of plans: (z, displacements (3, 2), chord deviations (3,), stopping distance)."""
     rng = np.random.default_rng(99)
     found = []
     low, high = GROUND.low(), GROUND.high()
@@ -53,7 +53,7 @@ def rollouts():
 
 
 def violations(tube, rollouts):
-    """Of how many rollouts is any part outside? A set is left if a support in one of many directions is exceeded."""
+    """Return the number of rollouts with a part outside, judged by supports in many directions."""
     angles = np.linspace(0, np.pi, 90)
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     bad = 0
@@ -70,14 +70,14 @@ def violations(tube, rollouts):
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
 def test_rollouts_stay_inside(models, rollouts, which):
-    """Bounds of 1.15 times what was seen in 12,000 periods: of 1500 fresh plans at most a few may leave."""
+    """The bounds are 1.15 times the largest errors in 12,000 periods, so few of 1500 fresh plans may leave."""
     tube = models[which].tube()
     outside = violations(tube, rollouts)
     assert outside <= 0.004 * len(rollouts)
     assert violations(models[which].outer_tube(), rollouts) <= outside
 
 
-def test_a_tube_of_half_the_width_is_left(model, rollouts):
+def test_rollouts_leave_a_tube_of_half_the_width(model, rollouts):
     tube = model.tube()
     half = replace(tube, M=0.5 * tube.M, m_0=0.5 * tube.m_0)
     assert violations(half, rollouts) > 0.05 * len(rollouts)

@@ -1,4 +1,4 @@
-"""Arrays and what is said of them: the same content gives the same bytes, and other bytes are refused with a reason."""
+"""Tensor files: equal content gives equal bytes, and malformed bytes are refused with a reason."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.flo
 
 
 @given(ARRAYS, WORDS)
-def test_what_is_packed_is_unpacked_and_the_same_content_gives_the_same_bytes(tensors, about):
+def test_a_packed_file_is_unpacked_unchanged_and_equal_content_gives_equal_bytes(tensors, about):
     payload = pack(tensors, "entry", about)
     found, said = unpack(payload, "entry")
     assert said == about and found.keys() == tensors.keys()

@@ -1,4 +1,4 @@
-"""What held-out data say about a model set."""
+"""Validation of a model set on held-out data."""
 
 from dataclasses import replace
 from math import comb
@@ -37,7 +37,7 @@ def test_a_model_set_holds_on_data_it_has_not_seen(models, data, held_out, which
     assert (
         found.outside_episode == pytest.approx(300 * found.bound_step) and found.outside_episode > found.bound_episode
     )
-    assert found.outside_hour == pytest.approx(18_000 * found.bound_step), "of 0.2 s"
+    assert found.outside_hour == pytest.approx(18_000 * found.bound_step), "a period lasts 0.2 s"
     assert 0 < found.half_width_rest < found.half_width_full
     assert found.samples == len(windows(data, 3))
     assert set(found.figures()) > {"samples", "rank", "condition", "bound_step", "bound_plan"}

@@ -1,4 +1,4 @@
-"""Memory shows only free space to be free: random scenes, with errors in every pose."""
+"""In random scenes with pose errors, memory shows only free space to be free."""
 
 import math
 from dataclasses import replace
@@ -77,20 +77,20 @@ def test_at_the_start_only_a_ring_around_the_body_is_free():
 
 def test_without_a_new_scan_the_last_one_ages():
     memory, rng = FanMemory(0.105), np.random.default_rng(0)
-    assert not len(memory.fill(None, 0.2).ranges), "before the first nothing is known to be free"
+    assert not len(memory.fill(None, 0.2).ranges), "before the first scan, nothing is free"
     seen = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
-    memory.later(0.2)  # a period that nobody saw
+    memory.later(0.2)  # a period without a call of `fill`
     again = memory.fill(None, 0.2)
     assert np.array_equal(again.ranges, seen.ranges) and again.age == pytest.approx(seen.age + 0.4)
     assert memory.fill(None, 0.2).age == pytest.approx(seen.age + 0.6)
     for _ in range(10):
         memory.fill(None, 0.2)
     blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))
-    assert not memory.fill(blind, 0.2).valid_beams.any(), "what may walk took it all back meanwhile"
+    assert not memory.fill(blind, 0.2).valid_beams.any(), "movers may have entered all remembered space"
 
 
 def test_the_ring_at_the_start_ages_before_the_first_scan():
-    """If the first scan comes late, somebody may have walked in."""
+    """If the first scan comes late, a person may have walked in."""
     blind = replace(_open(0.0, np.random.default_rng(0), speed=1.2), ranges=np.zeros(len(FAN)))
     memory = FanMemory(0.105)
     assert memory.fill(blind, 0.2).valid_beams.any(), "at once"
