@@ -29,13 +29,13 @@ def test_a_failsafe_is_the_backup_plans_next_input(ready):
 
 
 @pytest.mark.parametrize(
-    ("model", "prediction"), [("", False), (UNVERIFIED, False), ("0123456789ab", False), ("in use", True)], ids=str
+    ("version", "prediction"), [("", False), (UNVERIFIED, False), ("0123456789ab", False), ("in use", True)], ids=str
 )
-def test_a_plan_counts_as_unverified_without_its_model_or_prediction(ready, model, prediction):
+def test_a_plan_counts_as_unverified_without_its_model_or_prediction(ready, version, prediction):
     """The robot moves without a model's version, with another one, or outside its predicted set."""
     wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0) if prediction else None
     for tail in (((0.2, 0.0), (0, 0), (0, 0)), STILL):
-        decision = ready.decide(moving(tail, model=ready.version if prediction else model, predicted=wrong))
+        decision = ready.decide(moving(tail, model=ready.version if prediction else version, predicted=wrong))
         assert (decision.kind, decision.verified) == (FAILSAFE, False)
         assert not decision.plan.any(), "brake"
         assert decision.contained == (not prediction)
