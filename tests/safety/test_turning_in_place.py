@@ -237,8 +237,8 @@ def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, p
 
 
 @pytest.mark.parametrize("certificate", ["set-membership", "matrix-zonotope"])
-def test_the_other_error_bounds_have_predictors_in_place_too(driving, certificate):
-    model = fit_model_set(driving, ModelConfig(certificate, windows=FREE))
+def test_the_other_error_bounds_have_predictors_in_place_too(certificate):
+    model = fit_model_set(record(0, trajectories=10), ModelConfig(certificate, windows=FREE))
     decisions, angle, _ = turn(Filter(model), pillars(0.05, 4), 0.5, steps=20)
     assert {decision.kind for decision in decisions} == {ALLOWED} and angle > 1.4
 
