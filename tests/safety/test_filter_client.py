@@ -14,6 +14,8 @@ from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import check_for_filter
+from brakeline.safety.model.fitting import fit_model_set
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.in_process import InProcess
@@ -29,11 +31,8 @@ IN_PROCESS_OR_SERVED = pytest.mark.parametrize(
 
 
 @pytest.fixture(scope="module")
-def late(data_folder):
-    from brakeline.deploy.data.model_store import model_for
-    from brakeline.safety.model.model_set import ModelConfig
-
-    return model_for(LATE, ModelConfig())
+def late(data):
+    return fit_model_set(replace(data, robot=LATE), ModelConfig())
 
 
 def test_an_answer_in_process_is_the_answer_of_a_service(model):
