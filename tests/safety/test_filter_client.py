@@ -77,6 +77,13 @@ def test_every_client_implements_the_interface(client, model):
     assert isinstance(client, FilterClient) and not isinstance(Filter(model), FilterClient)
 
 
+def test_without_a_decision_every_client_goes_on_with_its_backup_plan(client):
+    client.backup_plan.accept(np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.0]]), "version", None, True)
+    assert np.array_equal(client.fallback(), [0.1, 0.0])
+    client.reset()
+    assert not client.backup_plan.input_in_force.any()
+
+
 def test_the_clients_have_the_same_parameters():
     wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):

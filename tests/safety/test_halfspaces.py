@@ -1,5 +1,7 @@
 """Half-spaces: the obstacle, grown by the body and the measurement error, is beyond them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -76,6 +78,13 @@ def test_half_spaces_that_lead_out_have_the_obstacle_behind_them_and_are_the_sam
             assert (offsets < 0.0).all()  # it is not free yet
             kept = BODY + np.abs(normals[0, 0]) @ measured
             assert ((drawn - start) @ normals[0, 0] >= offsets[0, 0] + kept - 1e-7).all()
+
+
+def test_an_obstacle_with_nan_leaves_nothing_free():
+    near = Shapes.of([Obstacle("sphere", (1.0, 0.0), (0.3,))], 2)
+    broken = replace(near, center=near.center * np.nan)
+    _, offsets = half_spaces(broken, np.zeros(2), np.zeros((1, 2)), BODY, np.zeros(2))
+    assert not (offsets > -np.inf).any()
 
 
 def test_a_period_that_passes_the_obstacle_keeps_the_room_beside_it():

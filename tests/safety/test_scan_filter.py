@@ -92,6 +92,10 @@ def test_a_scan_crosses_the_wire():
     assert request_of(message, GROUND).scan is not None and message.ByteSize() < 3500
 
 
+def asked(robot, scan):
+    return request_message(BackupPlan(robot), np.zeros(robot.state_dim), np.zeros(robot.action_dim), scan=scan)
+
+
 GROUND_SCAN, SPACE_IMAGE = Scan(np.ones(360), FAN, (0.0,) * 3), RangeImage(np.ones((45, 90)), (0.0,) * 3)
 
 
@@ -101,12 +105,12 @@ GROUND_SCAN, SPACE_IMAGE = Scan(np.ones(360), FAN, (0.0,) * 3), RangeImage(np.on
         (GROUND, GROUND_SCAN, lambda m: m.scan.ranges.__setitem__(5, -1.0), "scan"),
         (QUADROTOR, GROUND_SCAN, lambda m: None, "scan"),
         (GROUND, SPACE_IMAGE, lambda m: None, "image"),
-        (QUADROTOR, SPACE_IMAGE, lambda m: m.scan.CopyFrom(scan_message(GROUND_SCAN)), "scan"),
+        (GROUND, GROUND_SCAN, lambda m: m.image.CopyFrom(asked(QUADROTOR, SPACE_IMAGE).image), "scan"),
     ],
     ids=["negative range", "scan in space", "image in the plane", "both"],
 )
 def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robot, sensed, change, field):
-    message = request_message(BackupPlan(robot), np.zeros(robot.state_dim), np.zeros(robot.action_dim), scan=sensed)
+    message = asked(robot, sensed)
     change(message)
     with pytest.raises(BadRequest) as error:
         check_for_filter(robot, request_of(message, robot))
@@ -114,8 +118,7 @@ def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robo
 
 
 def test_a_robot_in_space_may_send_an_image():
-    message = request_message(BackupPlan(QUADROTOR), np.zeros(9), np.zeros(3), scan=SPACE_IMAGE)
-    check_for_filter(QUADROTOR, request_of(message, QUADROTOR))
+    check_for_filter(QUADROTOR, request_of(asked(QUADROTOR, SPACE_IMAGE), QUADROTOR))
 
 
 def test_a_batch_may_hold_24_images_but_not_48():
