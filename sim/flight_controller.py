@@ -187,11 +187,6 @@ class FlightController:
         self._force_rate = self._force_curve = STILL
         self._count = 0
 
-    @property
-    def holding(self) -> bool:
-        """Whether the controller holds a position."""
-        return self.x.hold is not None
-
     def update(
         self, position: Vector, velocity: Vector, attitude: tuple[float, float, float, float], rates: Vector
     ) -> tuple[float, float, float, float]:

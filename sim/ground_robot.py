@@ -30,6 +30,11 @@ SAMPLE_TIME = GROUND.period / SAMPLES  # s
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of the payload
 
 
+def prefix(number: int) -> str:
+    """Return the prefix of the names of a robot's parts in a model of several robots."""
+    return f"{number} " if number else ""
+
+
 class TurtleBot(SimulatedVehicle):
     """One TurtleBot3 of a world that somebody else advances.
 
@@ -41,12 +46,34 @@ class TurtleBot(SimulatedVehicle):
 
     robot, samples = GROUND, SAMPLES
 
-    def __init__(self, arena: Arena, data: mujoco.MjData, number: int = 0) -> None:
-        """Use robot `number` of a compiled model whose first bodies are TurtleBots."""
+    def __init__(self, arena: Arena, model: mujoco.MjModel, data: mujoco.MjData, number: int = 0) -> None:
+        """Use robot `number` of a compiled model whose first bodies are TurtleBots, named with `prefix`."""
         q, v, u = COORDINATES * number, SPEEDS * number, GROUND.action_dim * number
-        self.arena = arena
+        self.arena, self._model = arena, model
+        self._base = model.body(f"{prefix(number)}base").id
+        self._bare_mass, self._bare_inertia = float(model.body_mass[self._base]), model.body_inertia[self._base].copy()
+        self._wheel_geoms = [model.geom(f"{prefix(number)}{side} wheel").id for side in ("left", "right")]
         self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
         self._ctrl = data.ctrl[u : u + GROUND.action_dim]
+
+    def setters(self) -> dict[str, Callable[[float], None]]:
+        return {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
+
+    def set_payload(self, kg: float) -> None:
+        """Add a payload [kg] to the bare robot, at its centre of mass."""
+        self._model.body_mass[self._base] = self._bare_mass + kg
+        self._model.body_inertia[self._base] = self._bare_inertia + kg * PAYLOAD_GYRATION**2
+        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+
+    def set_friction(self, coefficient: float) -> None:
+        """Set the friction between wheels and floor (1: rubber on a dry floor; 0.1: ice).
+
+        Raises:
+            ValueError: the coefficient is zero.
+        """
+        if coefficient == 0.0:
+            raise ValueError("floor_friction is positive, not 0")
+        self._model.geom_friction[self._wheel_geoms, 0] = coefficient
 
     def start_estimation(self, noise: NoiseLevels | None, rng: np.random.Generator) -> None:
         """Start to measure, once the robot has settled on its wheels."""
@@ -125,35 +152,11 @@ class GroundRobot(TurtleBot):
     ) -> None:
         """Place the robot at the start of an arena and let it settle on its wheels."""
         self._physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
-        self._model = self._physics.model
-        super().__init__(arena, self._physics.data)
-        self._base = self._model.body("base").id
-        self._bare_mass = float(self._model.body_mass[self._base])
-        self._bare_inertia = self._model.body_inertia[self._base].copy()
-        self._wheel_geoms = [self._model.geom(name).id for name in ("left wheel", "right wheel")]
+        super().__init__(arena, self._physics.model, self._physics.data)
         self.alter(payload_kg=payload_kg, floor_friction=floor_friction)
         mujoco.mj_forward(self._model, self._physics.data)
         self._run(np.zeros(GROUND.action_dim))
         self.start_estimation(noise, rng)
-
-    def setters(self) -> dict[str, Callable[[float], None]]:
-        return {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
-
-    def set_payload(self, kg: float) -> None:
-        """Add a payload [kg] to the bare robot, at its centre of mass."""
-        self._model.body_mass[self._base] = self._bare_mass + kg
-        self._model.body_inertia[self._base] = self._bare_inertia + kg * PAYLOAD_GYRATION**2
-        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
-
-    def set_friction(self, coefficient: float) -> None:
-        """Set the friction between wheels and floor (1: rubber on a dry floor; 0.1: ice).
-
-        Raises:
-            ValueError: the coefficient is zero.
-        """
-        if coefficient == 0.0:
-            raise ValueError("floor_friction is positive, not 0")
-        self._model.geom_friction[self._wheel_geoms, 0] = coefficient
 
     def step(self, input: Array) -> Period:
         self.set_input(input)

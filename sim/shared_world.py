@@ -14,7 +14,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, same_room
 from brakeline.sim.arena_generator import arena_kind, draw_fleet
 from brakeline.sim.floor_physics import place_base
-from brakeline.sim.ground_robot import GROUND, MODEL, PAYLOAD_GYRATION, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, TurtleBot
+from brakeline.sim.ground_robot import GROUND, MODEL, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, TurtleBot, prefix
 from brakeline.sim.mujoco_obstacles import add_obstacles
 from brakeline.sim.navigation_env import Info, NavigationEnv, StepResult
 from brakeline.sim.sim_conditions import Conditions
@@ -52,9 +52,11 @@ class GroundWorld:
 
     def __init__(self, arenas: Sequence[Arena], rngs: Sequence[np.random.Generator], conditions: Conditions) -> None:
         """Place a robot at the start of each arena: the same room with different starts and goals."""
-        self._model = _build(arenas, conditions)
+        self._model = _build(arenas)
         self._data = mujoco.MjData(self._model)
-        self.robots = [TurtleBot(arena, self._data, i) for i, arena in enumerate(arenas)]
+        self.robots = [TurtleBot(arena, self._model, self._data, i) for i, arena in enumerate(arenas)]
+        for robot in self.robots:
+            robot.alter(payload_kg=conditions.payload_kg, floor_friction=conditions.floor_friction)
         self._owner = _owners(self._model, len(arenas))
         self._physics_steps = round(SAMPLE_TIME / self._model.opt.timestep)
         self._touching: set[tuple[int, int]] = set()
@@ -162,32 +164,20 @@ class _Member(NavigationEnv):
         return super()._info(period) | {"others": self._fleet.other_states(self._number)}
 
 
-def _base_name(i: int) -> str:
-    return "base" if i == 0 else f"{i} base"
-
-
-def _build(arenas: Sequence[Arena], conditions: Conditions) -> mujoco.MjModel:
+def _build(arenas: Sequence[Arena]) -> mujoco.MjModel:
     """Compile the world, robots first, so that their coordinates follow each other."""
     spec = mujoco.MjSpec.from_string(MODEL)
     for i in range(1, len(arenas)):
         other = mujoco.MjSpec.from_string(MODEL)
         other.delete(other.geom("floor"))
-        spec.attach(other, prefix=f"{i} ", frame=spec.worldbody.add_frame())
+        spec.attach(other, prefix=prefix(i), frame=spec.worldbody.add_frame())
     for i, arena in enumerate(arenas):
-        place_base(spec.body(_base_name(i)), arena, WHEEL_RADIUS)
+        place_base(spec.body(f"{prefix(i)}base"), arena, WHEEL_RADIUS)
     for geom in spec.geoms:
         if geom.name != "floor":
             geom.contype, geom.conaffinity = ROBOT_BIT, geom.conaffinity | ROBOT_BIT
     add_obstacles(spec, arenas[0])
-    model = spec.compile()
-    for i in range(len(arenas)):
-        base = model.body(_base_name(i)).id
-        model.body_mass[base] += conditions.payload_kg
-        model.body_inertia[base] += conditions.payload_kg * PAYLOAD_GYRATION**2
-        wheels = [model.geom(_base_name(i).replace("base", f"{side} wheel")).id for side in ("left", "right")]
-        model.geom_friction[wheels, 0] = conditions.floor_friction
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
+    return spec.compile()
 
 
 def _owners(model: mujoco.MjModel, size: int) -> NDArray[np.int_]:
@@ -195,5 +185,5 @@ def _owners(model: mujoco.MjModel, size: int) -> NDArray[np.int_]:
     owner = np.full(model.ngeom, OBSTACLE)
     owner[model.geom("floor").id] = FLOOR
     for i in range(size):
-        owner[model.body_rootid[model.geom_bodyid] == model.body(_base_name(i)).id] = i
+        owner[model.body_rootid[model.geom_bodyid] == model.body(f"{prefix(i)}base").id] = i
     return owner
