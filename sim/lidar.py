@@ -26,7 +26,6 @@ class Lidar:
         """Build the model of the arena for ray casting.
 
         Args:
-            arena: the arena.
             rays: directions in the frame of the robot's heading, with the arena's dimension.
             noise: standard deviation of a range [m]; independent normal noise, truncated at two standard deviations.
             rng: the source of the noise. Without it, ranges are exact.
@@ -61,19 +60,10 @@ class Lidar:
         else:
             beams = rotate(self._beams, turn) if turn else self._beams
         point = origin if self._height is None else np.array([*origin, self._height])
+        found = (self._hit, self._ranges, None)  # geoms, ranges, no normals
+        # with all groups of geoms, static geoms too, and no body excluded
         mujoco.mj_multiRay(
-            self._model,
-            self._data,
-            point,
-            beams.ravel(),
-            None,  # all groups of geoms
-            True,  # static geoms too
-            -1,  # exclude no body
-            self._hit,
-            self._ranges,
-            None,  # no normals
-            len(beams),
-            self.max_range,
+            self._model, self._data, point, beams.ravel(), None, True, -1, *found, len(beams), self.max_range
         )
         return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
 

@@ -15,7 +15,7 @@ import numpy as np
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
-from brakeline.sim.flight_controller import GRAVITY, FlightController, Vector
+from brakeline.sim.flight_controller import GRAVITY, STILL, FlightController, Vector
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, Quaternion, rotate
 from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
@@ -129,23 +129,17 @@ class Quadrotor(SimulatedVehicle):
 
     def advance(self, steps: int) -> None:
         """Advance by some physics steps, each with the rotors' thrusts from the controller."""
-        model, data, estimator, controller = self._model, self._data, self._estimator, self.controller
-        qpos, qvel, control = data.qpos, data.qvel, data.ctrl
-        position, velocity = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        before = (0.0, 0.0, 0.0)
+        model, data = self._model, self._data
+        estimated, before = (STILL, STILL), STILL
         for _ in range(steps):
-            px, py, pz, qw, qx, qy, qz = qpos.tolist()
-            vx, vy, vz, p, q, r = qvel.tolist()
-            before = (vx, vy, vz)
+            _, before, attitude, rates = self._motion()
             if self._count % OUTER_EVERY == 0:
-                estimator.advance()
-                e = estimator.errors
-                position = (px + e[0], py + e[1], pz + e[2])
-                velocity = (vx + e[3], vy + e[4], vz + e[5])
+                self._estimator.advance()
+                estimated = self.position_and_velocity()
             self._count += 1
             if self.flying:
-                control[:] = controller.update(position, velocity, (qw, qx, qy, qz), (p, q, r))
-            self._apply_drag(vx, vy, vz)
+                data.ctrl[:] = self.controller.update(*estimated, attitude, rates)
+            self._apply_drag(*before)
             if self._movers:
                 self._time += self.timestep
                 self._movers.place(self._time)
@@ -157,9 +151,9 @@ class Quadrotor(SimulatedVehicle):
             else:
                 self.on_floor = False
                 self._movers.note_no_contact()
-        vx, vy, vz = qvel[:3].tolist()
+        vx, vy, vz = data.qvel[:3].tolist()
         dt = self.timestep
-        self._path.append(qpos[:3].tolist())
+        self._path.append(data.qpos[:3].tolist())
         self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
 
     def cut_rotors(self) -> None:
