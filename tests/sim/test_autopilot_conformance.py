@@ -1,17 +1,18 @@
-"""The same questions to every autopilot: an embedded one on the ground answers as its rules say."""
+"""The embedded autopilot answers the requests of the conformance benchmark by its rules."""
 
 from __future__ import annotations
 
 import pytest
 
-from benchmarks import sitl
+from benchmarks import autopilot_conformance, sitl
 from benchmarks.autopilot_conformance import embedded, on_the_ground
 from benchmarks.ground_station import Station
 from brakeline.deploy.run.autopilot_run import AutopilotSettings, open_field, vehicle
 from brakeline.messaging.byte_links import open_link
 
 
-def test_an_embedded_one_answers_on_the_ground() -> None:
+def test_an_embedded_one_answers_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autopilot_conformance, "ASKED", ("LOCAL_POSITION_NED", "ODOMETRY"))  # 1.5 s each
     with embedded("ardupilot") as url:
         link = open_link(url)
         try:
@@ -20,6 +21,7 @@ def test_an_embedded_one_answers_on_the_ground() -> None:
             link.close()
     assert (found["arm, armed already"], found["disarm"]) == ("accepted", "accepted")
     assert found["LOCAL_POSITION_NED at 20 Hz"] == "accepted, comes"
+    assert found["ODOMETRY at 20 Hz"] == "failed, does not come"
     assert found["interval of message 9999"] == "failed" and found["command USER_1"] == "unsupported"
     assert (found["mode 99"], found["mode after mode 99"]) == ("unsupported", 0)
     assert (found["take off, disarmed"], found["mode after that"]) == ("failed", 4)
@@ -27,7 +29,7 @@ def test_an_embedded_one_answers_on_the_ground() -> None:
 
 @pytest.mark.parametrize(("at_once", "acceleration"), [(False, 1.0), (True, 1e4)])
 def test_an_arducopter_of_ours_is_as_delivered_or_as_it_was_recorded(at_once: bool, acceleration: float) -> None:
-    """`fly` flies it behind a model set of one that follows setpoints at once: else states leave their sets."""
+    """`fly` needs the vehicle of the recorded data, which follows setpoints at once."""
     settings = AutopilotSettings("", "ardupilot", airborne=True, at_once=at_once, setpoint_timeout=0.2)
     autopilot = vehicle(settings, open_field(), 1)
     assert autopilot.flight.limits.horizontal_acceleration == acceleration

@@ -39,7 +39,8 @@ def distances(arena: Arena, points: np.ndarray) -> np.ndarray:
 def test_geoms_have_the_distances_of_their_shapes(robot: Robot, name: str, heights: tuple[float, ...]) -> None:
     """In the plane, geoms stand on the floor: the distance is the same at every height."""
     arena = draw_arena(name, np.random.default_rng(4), robot)
-    points = np.random.default_rng(0).uniform(*np.array(arena.bounds).T, (60, arena.dim))
+    low, high = np.array(arena.bounds).T
+    points = np.random.default_rng(0).uniform(low, high, (60, arena.dim))
     exact = arena.shapes.distance(points)
     points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
     for at in [np.column_stack((points, np.full(len(points), height))) for height in heights] or [points]:
