@@ -60,10 +60,10 @@ class Lidar:
         else:
             beams = rotate(self._beams, turn) if turn else self._beams
         point = origin if self._height is None else np.array([*origin, self._height])
-        found = (self._hit, self._ranges, None)  # geoms, ranges, no normals
+        results = (self._hit, self._ranges, None)  # geoms, ranges, no normals
         # with all groups of geoms, static geoms too, and no body excluded
         mujoco.mj_multiRay(
-            self._model, self._data, point, beams.ravel(), None, True, -1, *found, len(beams), self.max_range
+            self._model, self._data, point, beams.ravel(), None, True, -1, *results, len(beams), self.max_range
         )
         return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
 

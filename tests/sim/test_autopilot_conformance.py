@@ -16,15 +16,15 @@ def test_an_embedded_one_answers_on_the_ground(monkeypatch: pytest.MonkeyPatch) 
     with embedded("ardupilot") as url:
         link = open_link(url)
         try:
-            found = on_the_ground(Station(link, 1), "ardupilot")
+            answers = on_the_ground(Station(link, 1), "ardupilot")
         finally:
             link.close()
-    assert (found["arm, armed already"], found["disarm"]) == ("accepted", "accepted")
-    assert found["LOCAL_POSITION_NED at 20 Hz"] == "accepted, comes"
-    assert found["ODOMETRY at 20 Hz"] == "failed, does not come"
-    assert found["interval of message 9999"] == "failed" and found["command USER_1"] == "unsupported"
-    assert (found["mode 99"], found["mode after mode 99"]) == ("unsupported", 0)
-    assert (found["take off, disarmed"], found["mode after that"]) == ("failed", 4)
+    assert (answers["arm, armed already"], answers["disarm"]) == ("accepted", "accepted")
+    assert answers["LOCAL_POSITION_NED at 20 Hz"] == "accepted, comes"
+    assert answers["ODOMETRY at 20 Hz"] == "failed, does not come"
+    assert answers["interval of message 9999"] == "failed" and answers["command USER_1"] == "unsupported"
+    assert (answers["mode 99"], answers["mode after mode 99"]) == ("unsupported", 0)
+    assert (answers["take off, disarmed"], answers["mode after that"]) == ("failed", 4)
 
 
 @pytest.mark.parametrize(("at_once", "acceleration"), [(False, 1.0), (True, 1e4)])

@@ -76,14 +76,14 @@ def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf)
     ours, theirs = socket.socketpair()
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
     hil = HilLink(ours, vehicle, HilSensors(SensorNoise(), np.random.default_rng(0), vehicle.timestep))
-    heard: list[int] = []
+    times: list[int] = []
 
     def answer() -> None:
         parser, packer = mavlink.MAVLink(None), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         while data := theirs.recv(65536):
             for message in parser.parse_buffer(data) or ():
-                if message.get_type() == "HIL_SENSOR" and len(heard) < answers:
-                    heard.append(message.time_usec)
+                if message.get_type() == "HIL_SENSOR" and len(times) < answers:
+                    times.append(message.time_usec)
                     controls = [share] * 4 + [0.0] * 12
                     reply = mavlink.MAVLink_hil_actuator_controls_message(message.time_usec, controls, 129, lockstep)
                     theirs.sendall(reply.pack(packer))
@@ -91,7 +91,7 @@ def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf)
     thread = threading.Thread(target=answer)
     thread.start()
     try:
-        yield hil, heard
+        yield hil, times
     finally:
         ours.shutdown(socket.SHUT_RDWR)
         thread.join(10.0)
@@ -100,10 +100,10 @@ def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf)
 
 
 def test_the_simulator_waits_for_every_command_and_applies_it() -> None:
-    with stand_in() as (hil, heard):
+    with stand_in() as (hil, times):
         for _ in range(200):
             hil.tick()
-        assert heard == [5000 * (i + 1) for i in range(200)] and hil.unanswered == 0 and hil.armed
+        assert times == [5000 * (i + 1) for i in range(200)] and hil.unanswered == 0 and hil.armed
         assert hil.time == pytest.approx(1.0)
         assert np.abs(hil.vehicle.state()[:6] - [0, 0, 10, 0, 0, 0]).max() < 1e-6  # it hovers
     with stand_in(share=2.0 * HOVER) as (hil, _):

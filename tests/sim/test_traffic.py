@@ -59,10 +59,10 @@ def test_positions_depend_on_the_time_alone():
 
 def test_the_measured_motion_bounds_the_true_motion():
     crowd = Crowd(KIND, PLACES, Shapes.of(ROOM, 2), seed=9)
-    watch = CrowdSensor(crowd, np.random.default_rng(0))
+    sensor = CrowdSensor(crowd, np.random.default_rng(0))
     for k in range(200):
         time = 0.2 * k
-        seen = watch.measure(time)
+        seen = sensor.measure(time)
         truth = crowd.at(time)
         for obstacle, place, pace in zip(seen, *truth, strict=True):
             motion = obstacle.motion
@@ -133,8 +133,8 @@ def test_a_lidar_sees_moving_obstacles_at_their_positions():
 def test_info_has_the_moving_obstacles_and_a_contact_ends_the_episode():
     env = NavigationEnv(GROUND, draw=lambda *_: replace(staged_arena(), crowd=Straight(1.0, -0.5)))
     _, info = env.reset(seed=0)
-    told = [o for o in info["obstacles"] if o.motion is not None]
-    assert len(told) == 1 and told[0].motion.acceleration == KIND.acceleration
+    moving = [o for o in info["obstacles"] if o.motion is not None]
+    assert len(moving) == 1 and moving[0].motion.acceleration == KIND.acceleration
     ended = False
     while not ended:
         _, reward, ended, _, info = env.step(np.zeros(2, np.float32))
