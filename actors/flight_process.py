@@ -38,7 +38,7 @@ from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
 from brakeline.actors.policies import PolicyFactory, Stop
-from brakeline.errors import BusError, FilterRequired, TakeoffNotVerified
+from brakeline.errors import BusError, Mismatch, TakeoffNotVerified
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -301,12 +301,12 @@ def run(
         conditions: of these only perception counts.
 
     Raises:
-        FilterRequired, TakeoffNotVerified, RefusedByLearner, Unreachable, BadLink: with what to do.
+        Mismatch, TakeoffNotVerified, RefusedByLearner, Unreachable, BadLink: with what to do.
         MavlinkError: there is no autopilot, it refuses something, or nobody flies the vehicle any more.
     """
     robot = robot_with_task(settings.robot)
     if settings.method == "none" or not robot.late:
-        raise FilterRequired("a real-time flight needs the filter, and a robot whose plans allow for the delay")
+        raise Mismatch("a real-time flight needs the filter, and a robot whose plans allow for the delay")
     stages = goal_sequence(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
         policy = prepared(propose, stages, settings.seed)

@@ -38,7 +38,7 @@ class Insecure(BusError):
 
 
 class BadKeys(BusError):
-    """A folder of keys lacks a file that is needed; the message names it."""
+    """A key or certificate is missing or too short; the message names it."""
 
 
 class NoReply(BusError):
@@ -75,28 +75,28 @@ class Refused(BusError):
         self.type, self.field, self.text = error.type, error.field, error.message
 
 
-class BadLink(BrakelineError, ValueError):
-    """A link's URL has a form that `brakeline.messaging.byte_links` does not support."""
-
-
-class Implausible(BrakelineError, ValueError):
-    """A message has a time, a name or a size that no correct sender uses."""
-
-
-class BadShape(BrakelineError, ValueError):
-    """An obstacle is invalid. `field` names the invalid field."""
+class InvalidField(BrakelineError, ValueError):
+    """A value is invalid. `field` names it."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(message)
         self.field = field
 
 
-class BadPerceptrons(BrakelineError, ValueError):
-    """The layers of a network do not fit each other, or hold NaN or infinity; the message names the layer."""
+class BadLink(BrakelineError, ValueError):
+    """A link's URL has a form that `brakeline.messaging.byte_links` does not support."""
+
+
+class Implausible(BrakelineError, ValueError):
+    """A message has a time, a name or a size that no correct sender uses, or there are too many senders."""
+
+
+class BadShape(InvalidField):
+    """An obstacle is invalid."""
 
 
 class BadWeights(BrakelineError, ValueError):
-    """The file holds no policy, or a policy of another robot; the message says which part is wrong."""
+    """The layers of a network are invalid, or the policy is of another robot; the message names the part."""
 
 
 class UnknownRobot(BrakelineError, ValueError):
@@ -136,15 +136,11 @@ class UnknownTask(BrakelineError, ValueError):
 
 
 class Mismatch(BrakelineError, ValueError):
-    """The environment does not fit the robot. The message says which argument to give."""
+    """The robot does not fit its environment or the program. The message says what to give."""
 
 
-class BadRequest(BrakelineError, ValueError):
-    """The filter cannot decide on the request. `field` names the wrong field."""
-
-    def __init__(self, field: str, message: str) -> None:
-        super().__init__(message)
-        self.field = field
+class BadRequest(InvalidField):
+    """The filter cannot decide on the request."""
 
 
 class StaleModel(BadRequest):
@@ -186,10 +182,6 @@ class AskedApart(BadRequest):
         super().__init__("fleet", message)
 
 
-class BadKey(BrakelineError, ValueError):
-    """The key of the plan tokens is too short."""
-
-
 class NoModel(BadRequest):
     """The service has no model of the robot."""
 
@@ -201,16 +193,12 @@ class Untrusted(BadModel):
 # --- Simulation ---
 
 
-class UnknownArena(BrakelineError, ValueError):
-    """The robot has no arena of this name; the message lists the names."""
+class UnknownName(BrakelineError, ValueError):
+    """The robot has no arena, policy or rule set of this name; the message lists the names."""
 
 
 class NoArena(BrakelineError, RuntimeError):
     """No drawn arena has a path from start to goal: the settings of the arena leave too little room."""
-
-
-class UnknownRules(BrakelineError, ValueError):
-    """No rule set has this name."""
 
 
 class RequestRefused(BrakelineError):
@@ -229,14 +217,6 @@ class BadParameter(BrakelineError, ValueError):
     """The parameter does not exist, or cannot have this value."""
 
 
-class Px4Error(BrakelineError, RuntimeError):
-    """The folder holds no PX4, or PX4 did not start."""
-
-
-class UnknownPolicy(BrakelineError, ValueError):
-    """The robot has no scripted policy of this name; the message lists the names."""
-
-
 class NoFleet(BrakelineError, ValueError):
     """Several robots cannot share a world: their kind, the arena or the conditions do not allow it."""
 
@@ -246,10 +226,6 @@ class BadInput(BrakelineError, ValueError):
 
 
 # --- Actors and their vehicles ---
-
-
-class FilterRequired(BrakelineError, ValueError):
-    """A real-time flight needs the filter: without an answer the vehicle flies the filter's plan."""
 
 
 class TakeoffNotVerified(BrakelineError, ValueError):
@@ -284,14 +260,6 @@ class BadMessage(BrakelineError, ValueError):
     """A message is not valid: its receiver drops it, and goes on."""
 
 
-class BadLaserScan(BrakelineError, ValueError):
-    """A ROS laser scan is not valid."""
-
-
-class UnsupportedRobot(BrakelineError, ValueError):
-    """A robot cannot be driven by Twist messages."""
-
-
 class InputMissing(BrakelineError):
     """An input of a decision is missing or stale; the message says which."""
 
@@ -300,82 +268,37 @@ class InputMissing(BrakelineError):
 
 
 class CheckpointError(BrakelineError, RuntimeError):
-    """A checkpoint could not be written or read."""
-
-
-class NoCheckpoint(CheckpointError):
-    """The folder holds no checkpoint."""
-
-
-class MissingPart(CheckpointError):
-    """A part of the checkpoint, or one of its files, is missing; `part` names it."""
-
-    def __init__(self, part: str, where: Path) -> None:
-        super().__init__(f"{where}: the part {part!r} is missing")
-        self.part = part
+    """There is no checkpoint, it is of another run, or it could not be written; the message says which."""
 
 
 class DamagedPart(CheckpointError):
-    """A part of the checkpoint is damaged, or does not fit; `part` names it."""
+    """A part of the checkpoint is missing, damaged, or does not fit; `part` names it."""
 
     def __init__(self, part: str, where: Path, why: str) -> None:
-        super().__init__(f"{where}: the part {part!r} is damaged: {why}")
+        super().__init__(f"{where}: the part {part!r} is {why}")
         self.part = part
 
 
-class OtherRun(CheckpointError):
-    """The checkpoint belongs to another robot or configuration; `field` names the difference."""
-
-    def __init__(self, field: str, where: Path) -> None:
-        super().__init__(f"{where}: the checkpoint differs from this run in {field}")
-        self.field = field
-
-
-class BadState(BrakelineError, ValueError):
-    """An entry of a checkpoint is missing, or has another shape or type; the message names it."""
-
-
-class TooFew(BrakelineError, ValueError):
-    """The data hold fewer samples than one batch."""
-
-
-class BadStep(BrakelineError, ValueError):
-    """The learner cannot learn from the step; `field` names the wrong field."""
+class BadStep(InvalidField):
+    """The learner cannot learn from the step."""
 
     def __init__(self, field: str, why: str) -> None:
-        super().__init__(f"{field}: {why}")
-        self.field = field
+        super().__init__(field, f"{field}: {why}")
 
 
 # --- Logs ---
 
 
 class LogError(BrakelineError):
-    """The log cannot be read."""
-
-
-class BeingRecorded(LogError):
-    """A recorder is writing to the file."""
+    """The log is missing, damaged, being recorded, or lacks what is needed; the message says which."""
 
 
 class NotMcap(BrakelineError):
     """The file does not start with the MCAP magic bytes."""
 
 
-class Crowded(BrakelineError, ValueError):
-    """The run has too many publishers, actors or processes."""
-
-
 class ExportError(BrakelineError, ValueError):
     """The log cannot be exported."""
-
-
-class NoLog(LogError):
-    """There is no log at the path."""
-
-
-class NotALog(LogError):
-    """The file is not an MCAP file."""
 
 
 # --- Commands and runs ---
@@ -397,17 +320,9 @@ class NoSource(BadData):
     """A source cannot be read as data of a robot; the message gives the reason and the remedy."""
 
 
-class FigureMismatch(BrakelineError, RuntimeError):
-    """The log of a run does not agree with the figures that the run counted."""
-
-
-class StaleResultError(BrakelineError, ValueError):
-    """An existing result was made with other settings."""
-
-
-class ReplayError(BrakelineError, ValueError):
-    """The log cannot be replayed; the message says what is missing."""
+class ResultError(BrakelineError, ValueError):
+    """An existing result was made with other settings, or the log of a run disagrees with the run's figures."""
 
 
 class LaunchError(BrakelineError, RuntimeError):
-    """A run can't start or go on. The message says what to do."""
+    """A run, or its PX4, can't start or go on. The message says what to do."""

@@ -39,7 +39,7 @@ def environment(
 
     Raises:
         UnknownTask: the robot has no simulator.
-        UnknownArena: the robot has no such arena.
+        UnknownName: the robot has no such arena.
     """
     conditions = conditions or Conditions()
     make = simulated_vehicle(robot, conditions, tap)

@@ -1,1 +1,1 @@
-"""The process that learns from all robots' steps and publishes weights."""
+"""The learner: the process that learns from the steps of all actors and publishes weights."""

@@ -13,9 +13,9 @@ EPSILON = 1e-8
 
 
 class Adam:
-    """p ← p − lr · m̂ / (√v̂ + ε), m and v the running means of the gradient and its square, corrected for their start.
+    """p ← p − lr · m̂ / (√v̂ + ε), with m and v the running means of the gradient and of its square.
 
-    Its whole state is `mean`, `square` and `count`, there from the start: a checkpoint has nothing to create.
+    The constructor creates the whole state (`mean`, `square`, `count`), so that a checkpoint can be copied into it.
     """
 
     def __init__(self, parameters: Tensor, rate: float) -> None:
@@ -26,10 +26,11 @@ class Adam:
         self._root = torch.zeros_like(parameters)
 
     def step(self, gradients: Tensor) -> None:
+        """Update the parameters in place."""
         self.count += 1
         self.mean.lerp_(gradients, 1.0 - BETA_MEAN)
         self.square.mul_(BETA_SQUARE).addcmul_(gradients, gradients, value=1.0 - BETA_SQUARE)
-        # √v̂ + ε = (√v + ε √c) / √c with c = 1 − β^count, so that the corrections cost no pass over the vector
+        # √v̂ + ε = (√v + ε √c) / √c with c = 1 − β^count: the bias corrections need no pass over the vector.
         mean_correction = 1.0 - BETA_MEAN**self.count
         root_correction = math.sqrt(1.0 - BETA_SQUARE**self.count)
         torch.sqrt(self.square, out=self._root).add_(EPSILON * root_correction)

@@ -1,9 +1,9 @@
-"""Checkpoints: everything the learner is, or nothing.
+"""Checkpoints: the whole state of a learner on disk.
 
-A checkpoint is a folder, `<root>/000042/`, of one safetensors file per part and a `manifest.json` with each file's
-hash and the parts' plain values. It is written as `.partial`, renamed, and only then does the one-line file `latest`
-point to it, by an atomic replacement; older ones are deleted last. So whatever happens in between (a kill, a full
-disk), `latest` names a whole checkpoint. Reading one checks every hash: a damaged one is an error, never a fresh start.
+A checkpoint is a folder, `<root>/000042/`. It holds one safetensors file for each part, and `manifest.json` with the
+hash of each file and the plain values of the parts. The function `save` writes a folder `.partial`, renames it, and
+replaces the one-line file `latest` atomically. It deletes older checkpoints last. A kill or a full disk at any moment
+therefore leaves `latest` at a whole checkpoint. The function `load` verifies every hash.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from brakeline.errors import CheckpointError, DamagedPart, MissingPart, NoCheckpoint
+from brakeline.errors import CheckpointError, DamagedPart
 from brakeline.learner.checkpoint_state import PartState
 
 FORMAT = 1
@@ -30,18 +30,22 @@ PARTIAL = ".partial"
 
 
 def exists(root: Path) -> bool:
+    """Return whether there is a checkpoint."""
     return (root / LATEST).exists()
 
 
 def save(root: Path, parts: dict[str, PartState], about: dict[str, Any]) -> Path:
-    """Write `parts` as the latest checkpoint; `about` is what identifies the run (robot, configuration, …).
+    """Write the latest checkpoint, and return its folder.
+
+    Args:
+        about: identifies the run (robot, configuration, …).
 
     Raises:
-        CheckpointError: it could not be written; the one before is untouched.
+        CheckpointError: the checkpoint could not be written; the previous one is unchanged.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
-        place = root / f"{_serial(root) + 1:06d}"
+        place = root / f"{int(latest(root).name) + 1 if exists(root) else 1:06d}"
         partial = root / PARTIAL
         for leftover in (partial, place):  # of a save that was killed
             shutil.rmtree(leftover, ignore_errors=True)
@@ -62,41 +66,30 @@ def save(root: Path, parts: dict[str, PartState], about: dict[str, Any]) -> Path
 
 
 def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, PartState], dict[str, Any]]:
-    """The latest checkpoint's parts, each of `names` among them, and what was said about it.
+    """Return the named parts of the latest checkpoint, and what `save` got as `about`.
 
     Raises:
-        NoCheckpoint, MissingPart, DamagedPart: as they say.
+        CheckpointError: there is no checkpoint.
+        DamagedPart: a part is missing or damaged.
     """
     place = latest(root)
     manifest = _manifest(place)
-    parts = {}
-    for name in names:
-        if name not in manifest["parts"]:
-            raise MissingPart(name, place)
-        parts[name] = _read(place, name, manifest["parts"][name])
-    return parts, manifest["about"]
-
-
-def _serial(root: Path) -> int:
-    try:
-        return int(latest(root).name)
-    except NoCheckpoint:
-        return 0
+    return {name: _read(place, name, manifest["parts"].get(name)) for name in names}, manifest["about"]
 
 
 def latest(root: Path) -> Path:
-    """The folder of the latest checkpoint.
+    """Return the folder of the latest checkpoint.
 
     Raises:
-        NoCheckpoint: there is none.
-        MissingPart: what the pointer names is not there.
+        CheckpointError: there is no checkpoint.
+        DamagedPart: `latest` names a folder that does not exist.
     """
     try:
         name = (root / LATEST).read_text().strip()
     except FileNotFoundError:
-        raise NoCheckpoint(f"{root}: there is no checkpoint") from None
+        raise CheckpointError(f"{root}: there is no checkpoint") from None
     if not name.isdecimal() or not (root / name).is_dir():
-        raise MissingPart(LATEST, root)
+        raise DamagedPart(LATEST, root, "missing")
     return root / name
 
 
@@ -117,20 +110,20 @@ def _manifest(place: Path) -> dict[str, Any]:
     try:
         manifest = json.loads((place / MANIFEST).read_text())
     except FileNotFoundError:
-        raise MissingPart(MANIFEST, place) from None
+        raise DamagedPart(MANIFEST, place, "missing") from None
     except ValueError as error:
-        raise DamagedPart(MANIFEST, place, str(error)) from error
+        raise DamagedPart(MANIFEST, place, f"damaged: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not {"about", "parts"} <= manifest.keys():
         raise DamagedPart(MANIFEST, place, f"not of format {FORMAT}")
     return manifest
 
 
-def _read(place: Path, name: str, entry: dict[str, Any]) -> PartState:
+def _read(place: Path, name: str, entry: dict[str, Any] | None) -> PartState:
     path = place / f"{name}.safetensors"
-    if not path.exists():
-        raise MissingPart(name, place)
+    if entry is None or not path.exists():
+        raise DamagedPart(name, place, "missing")
     if _hash(path) != entry["sha256"]:
-        raise DamagedPart(name, place, "its hash is not the manifest's")
+        raise DamagedPart(name, place, "damaged: its hash is not the one in the manifest")
     return PartState(safetensors.numpy.load_file(path), entry["values"])
 
 
@@ -140,7 +133,7 @@ def _hash(path: Path) -> str:
 
 
 def _sync(path: Path) -> None:
-    """On the disk, not only in its cache."""
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,10 +1,10 @@
-"""The learner without a bus: steps go in; weights, permissions and figures come out.
+"""The learner without a bus: it takes steps and gives weights, permissions to publish, and figures.
 
     insert ── ledger (duplicates, gaps) ── windows (n-step) ── replay ── TD3 ── weights
-                                             limiter: who waits for whom ── flow
+                                                         rate limiter ── flow
 
-Everything that decides about the weights is in here and in its checkpoint, so a run can be replayed bit for bit: in
-lockstep an actor may publish step i only once everything due after step i − 1 is done.
+The learner and its checkpoint contain everything that determines the weights, so that a run in lockstep is repeatable
+bit for bit. In lockstep, an actor may publish step i after all updates that step i − 1 made due.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from brakeline.errors import BadStep, CheckpointError, DamagedPart, OtherRun
+from brakeline.errors import BadStep, CheckpointError, DamagedPart
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import LearnerConfig
@@ -32,16 +32,18 @@ from brakeline.messaging import policy_weights as policy
 from brakeline.messaging.task import RobotWithTask
 
 MOST_ACTORS = 2048
-AHEAD = 1000  # steps beyond its permission that an actor may be: it had it from the learner before
+AHEAD = 1000  # steps that an actor may be ahead of its permission, which it may have from an earlier learner
 
 
 class Part(Protocol):
+    """A part of the learner that is in the checkpoint."""
+
     def state(self) -> PartState: ...
     def restore(self, state: PartState) -> None: ...
 
 
 class Learner:
-    """Not for several threads at once."""
+    """The learner of one kind of robot. Not thread-safe."""
 
     def __init__(
         self,
@@ -50,7 +52,12 @@ class Learner:
         incarnation: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`incarnation` tells actors of a restart: they join again when it changes."""
+        """Start without steps.
+
+        Args:
+            incarnation: is in every flow; actors join again when it changes, after a restart.
+            clock: [s], for the rates in the metrics.
+        """
         self._intake = StepReader(robot)
         td3, dims = config.td3, (robot.task.observation_dim, robot.action_dim)
         self.robot, self.config, self.incarnation = robot, config, incarnation
@@ -63,28 +70,29 @@ class Learner:
         ahead = 0.0 if config.lockstep else config.ahead
         self._limiter = RateLimiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
         self._limits: dict[str, int] = {}
-        self._episode_ended = True  # by the last step taken in
-        self._saved_at = 0  # steps
-        self.surplus = 0  # steps that came after the run's last one
+        self._episode_ended = True  # whether the last step ended its episode
+        self._saved_at = 0  # number of steps at the last checkpoint
+        self.surplus = 0  # steps after the last one of the run
         self.rejected = 0
         self._version, self._published_updates = 0, 0
         self._clock = clock
-        self._mark = (clock(), 0, 0)  # time, steps and updates at the last figures
-        self._ages: list[int] = []  # versions that steps were behind, since the last figures
+        self._mark = (clock(), 0, 0)  # time, steps and updates at the last metrics
+        self._ages: list[int] = []  # versions that each step was behind, since the last metrics
         self.publish()
 
-    # --- in ---
-
     def insert(self, step: pb.Step) -> bool:
-        """Take in one step; False: a duplicate, or one after the end.
+        """Insert a step. Return False if it is a duplicate, or comes after the end of the run.
 
         Raises:
-            BadStep: sizes or values are wrong, or its actor was never taken in, or not so far; it is counted and
-                nothing else is changed.
+            BadStep: a size or value is wrong, or the actor may not publish this step. The step is only counted.
         """
         try:
             move = self._intake.move(step)
-            self._check_place(step)
+            place = self._ledger.places.get(step.actor)
+            if place is None:
+                raise BadStep("actor", f"{step.actor} never joined")
+            if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
+                raise BadStep("index", f"{step.index}, but {step.actor} is at {place.last_index}")
         except BadStep:
             self.rejected += 1
             raise
@@ -100,44 +108,28 @@ class Learner:
         self._ages.append(self._version - step.weights_version)
         return True
 
-    def _check_place(self, step: pb.Step) -> None:
-        """Raises BadStep for a step of nobody, or one that nobody allowed."""
-        place = self._ledger.places.get(step.actor)
-        if place is None:
-            raise BadStep("actor", f"{step.actor} never joined")
-        if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
-            raise BadStep("index", f"{step.index}, where {step.actor} is at {place.last_index}")
-
     def join(self, join: pb.Join) -> pb.JoinReply:
-        """Take an actor in, or say in `error` why not."""
-        refusal = self._refusal(join)
-        if refusal is not None:
-            return pb.JoinReply(error=refusal)
+        """Accept an actor, or give the reason for the refusal in `error`."""
+        layout, known = self.robot.learning_layout(), join.actor in self._limits
+        refusals = {
+            ("robot", f"{join.robot!r}, not {self.robot.name!r}"): join.robot != self.robot.name,
+            ("layout", f"{join.layout!r}, but {self.robot.name} has {layout!r} here"): join.layout != layout,
+            ("actor", "empty"): not join.actor,
+            ("index", f"{join.index} steps, episode {join.episode}"): max(join.index, join.episode) >= LATEST,
+            ("actor", f"{join.actor!r} is one more than {MOST_ACTORS}"): not known and len(self._limits) == MOST_ACTORS,
+            ("actor", f"{join.actor!r}, but lockstep allows one actor, {next(iter(self._limits), '')!r}"): (
+                self.config.lockstep and bool(self._limits.keys() - {join.actor})
+            ),
+        }
+        for (field, why), refused in refusals.items():
+            if refused:
+                return pb.JoinReply(error=pb.Error(type="Refused", field=field, message=why))
         episode = self._ledger.join(join.actor, join.index, join.episode)
         self._limits[join.actor] = join.index
         return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode)
 
-    def _refusal(self, join: pb.Join) -> pb.Error | None:
-        if join.robot != self.robot.name:
-            field, why = "robot", f"{join.robot!r} where {self.robot.name!r} is learned"
-        elif join.layout != self.robot.learning_layout():
-            field, why = "layout", f"{join.layout!r} where {self.robot.name} has {self.robot.learning_layout()!r} here"
-        elif not join.actor:
-            field, why = "actor", "empty"
-        elif join.index >= LATEST or join.episode >= LATEST:
-            field, why = "index", f"{join.index} steps, episode {join.episode}"
-        elif join.actor not in self._limits and len(self._limits) == MOST_ACTORS:
-            field, why = "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"
-        elif self.config.lockstep and self._limits.keys() - {join.actor}:
-            field, why = "actor", f"{join.actor!r}, but lockstep has one, {next(iter(self._limits))!r}"
-        else:
-            return None
-        return pb.Error(type="Refused", field=field, message=why)
-
-    # --- work ---
-
     def work(self, most: int) -> int:
-        """Make the updates that are due, `most` at the most; returns how many it made."""
+        """Make at most `most` of the updates that are due. Return how many it made."""
         made = 0
         while made < most and self._limiter.may_sample() and len(self._replay) > 0:
             self._replay.sample(self._draws, self._batch)
@@ -149,36 +141,38 @@ class Learner:
         return made
 
     def _enough(self) -> bool:
-        """All steps of the run are there."""
+        """Return whether all steps of the run have arrived."""
         return self._limiter.inserts >= self.config.steps and (self._episode_ended or not self.config.lockstep)
 
     @property
     def done(self) -> bool:
+        """Whether all steps have arrived and all updates are made."""
         return self._enough() and not self._limiter.may_sample()
 
     @property
     def steps(self) -> int:
+        """Number of steps."""
         return self._limiter.inserts
 
     @property
     def updates(self) -> int:
+        """Number of updates."""
         return self._td3.updates
 
     @property
     def warming_up(self) -> bool:
-        """Are there too few steps yet to learn from? Until then actors act at random."""
+        """Whether there are too few steps for updates; until then the actors act at random."""
         return self._limiter.warming_up
 
-    # --- out ---
-
     def weights_due(self) -> bool:
+        """Return whether it is time for `publish`."""
         new = self._td3.updates - self._published_updates
         if self.config.lockstep or self.done:
             return new > 0 and not self._limiter.may_sample()
         return new >= self.config.publish_every
 
     def publish(self) -> pb.Weights:
-        """The actor as it is, as a new version; from now on `weights` and `flow` speak of it."""
+        """Return the present weights as a new version, which `weights` and `flow` give from now on."""
         self._version += 1
         self._published_updates = self._td3.updates
         self._encode()
@@ -192,11 +186,11 @@ class Learner:
         )
 
     def weights(self) -> pb.Weights:
-        """The version published last."""
+        """Return the latest version of the weights."""
         return self._weights
 
     def flow(self) -> pb.Flow:
-        """Who may publish how far. A limit never falls."""
+        """Return up to which index each actor may publish. A limit never falls."""
         if not (self.config.lockstep and (self._limiter.may_sample() or self.weights_due())):
             self._grant()
         return pb.Flow(
@@ -214,13 +208,13 @@ class Learner:
             room = min(room, self.config.steps - self._limiter.inserts)
         if room < 1 or not self._limits:
             return
-        # Nothing is reserved, so a dead actor holds up nobody; the band is exceeded by an actor's share at the most.
+        # No room is reserved, so a dead actor delays nobody; the band is exceeded by at most one actor's share.
         share = 1 if self.config.lockstep else max(1, min(self.config.window, room // len(self._limits)))
         for actor, limit in self._limits.items():
             self._limits[actor] = max(limit, self._ledger.places[actor].last_index + share)
 
     def metrics(self) -> pb.LearnerMetrics:
-        """Rates and staleness are of the time since the last call."""
+        """Return the metrics, with rates and staleness since the last call."""
         now, steps, updates = self._clock(), self._limiter.inserts, self._td3.updates
         then, steps_then, updates_then = self._mark
         elapsed = max(now - then, 1e-9)
@@ -244,19 +238,20 @@ class Learner:
             done=self.done,
         )
 
-    # --- checkpoints ---
-
     def may_save(self) -> bool:
-        """In lockstep only between episodes, everything due done: an actor goes on with a new episode."""
+        """Return whether a checkpoint is possible: in lockstep only between episodes, with no update due."""
         settled = self._episode_ended and not self._limiter.may_sample() and not self.weights_due()
         return settled or not self.config.lockstep
 
     def checkpoint_due(self) -> bool:
+        """Return whether it is time for `save`."""
         return self.steps - self._saved_at >= self.config.checkpoint_every and self.may_save()
 
     def save(self, root: Path) -> Path:
-        """Raises:
-        CheckpointError: it could not be written; the one before is untouched.
+        """Write a checkpoint, and return its folder.
+
+        Raises:
+            CheckpointError: the checkpoint could not be written; the previous one is unchanged.
         """
         saved_before, self._saved_at = self._saved_at, self.steps
         parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}
@@ -267,10 +262,10 @@ class Learner:
             raise
 
     def restore(self, root: Path) -> None:
-        """Become what the latest checkpoint under `root` holds. After an error this learner is of no use.
+        """Take over the state of the latest checkpoint. After an error, the learner is not usable.
 
         Raises:
-            CheckpointError: there is none, it is damaged or incomplete, or it is of another run.
+            CheckpointError: there is no checkpoint, it is damaged, or it is of another run.
         """
         states, about = checkpoint.load(root, (*self._parts(), "run"))
         self._compare(root, about)
@@ -279,7 +274,7 @@ class Learner:
             try:
                 restore(states[name])
             except (ValueError, TypeError, KeyError, IndexError) as error:
-                raise DamagedPart(name, root, str(error)) from error
+                raise DamagedPart(name, root, f"damaged: {error}") from error
         self._encode()
         if self._published_updates != self._td3.updates:
             self.publish()
@@ -306,7 +301,7 @@ class Learner:
             else:
                 names = [name] if theirs != ours[name] else []
             if names:
-                raise OtherRun(", ".join(names), root)
+                raise CheckpointError(f"{root}: the checkpoint differs from this run in {', '.join(names)}")
 
     def _run_state(self) -> PartState:
         values = {

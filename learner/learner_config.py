@@ -1,4 +1,4 @@
-"""What a learner can be told. No torch here: whoever starts a run reads it."""
+"""The settings of a learner. This module does not import torch, because the launcher reads it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 Precision = Literal["float32", "bfloat16"]
-Stored = Literal["executed", "both"]  # of a corrected step, see `learner/n_step.py`
+Stored = Literal["executed", "both"]  # actions of a corrected step to learn from (`learner/n_step.py`)
 
 
 @dataclass(frozen=True)
 class TD3Config:
+    """Settings of TD3."""
+
     hidden: tuple[int, ...] = (256, 256)
     actor_rate: float = 3e-4
     critic_rate: float = 3e-4
@@ -22,13 +24,13 @@ class TD3Config:
     policy_delay: int = 2
     target_noise: float = 0.2  # σ, of the half range of an action
     target_noise_clip: float = 0.5  # η
-    exploration_noise: float = 0.1  # of the half range; travels to the actors with the weights
-    reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100, where Adam at 3e-4 is quick
+    exploration_noise: float = 0.1  # of the half range; the actors get it with the weights
+    reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100
     updates_per_step: float = 1.0
     stored: Stored = "both"
-    symmetric: bool = True  # learn from a step's mirror images too, where the robot has any (`learner/symmetry.py`)
-    warmup: int = 2000  # steps at random before the first update
-    precision: Precision = "float32"  # of the wide products
+    symmetric: bool = True  # learn from the images of a step too, if the task is symmetric (`learner/symmetry.py`)
+    warmup: int = 2000  # random steps before the first update
+    precision: Precision = "float32"  # of the products of wide layers
 
     def __post_init__(self) -> None:
         widths = min(self.hidden, default=0)
@@ -42,22 +44,24 @@ class TD3Config:
 
 @dataclass(frozen=True)
 class LearnerConfig:
+    """Settings of a learner."""
+
     td3: TD3Config = field(default_factory=TD3Config)
     seed: int = 0
-    steps: int = 100_000  # the run's length; in lockstep the episode in which they end is finished
+    steps: int = 100_000  # length of the run; in lockstep the last episode is completed
     capacity: int = 200_000  # transitions
-    window: int = 16  # steps that an actor may have on their way
-    ahead: int = 64  # steps that the actors together may be ahead of the updates
-    publish_every: int = 50  # updates from one version of the weights to the next
+    window: int = 16  # steps that an actor may publish ahead of the learner
+    ahead: int = 64  # steps that all actors together may be ahead of the updates
+    publish_every: int = 50  # updates between two versions of the weights
     checkpoint_every: int = 10_000  # steps
-    lockstep: bool = False  # one actor; `window`, `ahead` and `publish_every` are 1, 0 and 1
+    lockstep: bool = False  # one actor, with `window` 1, `ahead` 0 and `publish_every` 1
 
     def __post_init__(self) -> None:
         if min(self.steps, self.capacity, self.window, self.publish_every, self.checkpoint_every) < 1 or self.ahead < 0:
             raise ValueError(f"steps, capacity, window, publish_every, checkpoint_every must be positive: {self}")
 
     def lasting(self) -> dict[str, Any]:
-        """What a resumed run must share with the interrupted one, as JSON gives it back."""
+        """Return the settings that a resumed run must share with the interrupted one, as JSON values."""
         values = asdict(self)
         for name in ("steps", "checkpoint_every"):
             del values[name]

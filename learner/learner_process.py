@@ -1,7 +1,7 @@
-"""PROCESS: one robot kind's learner on the bus; a thin loop around `Learner`.
+"""PROCESS: the learner of one kind of robot on the bus, a loop around `Learner`.
 
-The bus's threads only put things into queues; the loop alone touches the learner, so what happens depends on the order
-of the messages and on nothing else.
+The threads of the bus only fill queues. Only the loop uses the learner, so that the result depends on nothing but the
+order of the messages.
 """
 
 from __future__ import annotations
@@ -29,31 +29,37 @@ from brakeline.messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHT
 log = logging.getLogger("brakeline.learner")
 
 POLICY = "policy.safetensors"
-UPDATES_A_TURN = 4  # about 20 ms: how long a joining actor or a lockstep step may wait
-FLOW_SPACING = 0.02  # s between two flows, except in lockstep, where every change goes out
-FLOW_PERIOD = 0.5  # s, the longest without one
-METRICS_PERIOD = 1.0  # s
-JOIN_PATIENCE = 10.0  # s, a checkpoint included
-RETRY = 30.0  # s to the next attempt after a checkpoint could not be written
-LINGER = 1.0  # s that the end of a run is announced before the process goes
+UPDATES_A_TURN = 4  # take about 20 ms, the longest that a joining actor or a step in lockstep waits
+FLOW_SPACING = 0.02  # least time between two flows [s]; in lockstep every change is published
+FLOW_PERIOD = 0.5  # longest time between two flows [s]
+METRICS_PERIOD = 1.0  # [s]
+JOIN_PATIENCE = 10.0  # longest time to answer a join, with the time of a checkpoint [s]
+RETRY = 30.0  # time to the next attempt after a failed checkpoint [s]
+LINGER = 1.0  # time for which the process announces the end of the run [s]
 
 
 @dataclass(frozen=True)
 class LearnerSettings:
+    """Settings of the process."""
+
     bus: BusSettings
     robot: str = "ground"
     out: Path = Path("runs/learner")
-    resume: bool = False  # from the checkpoint in `out`; that there is one is demanded then
+    resume: bool = False  # True: continue from the checkpoint in `out`, which must exist
     source: str = "learner"
     learner: LearnerConfig = field(default_factory=LearnerConfig)
 
 
 def main(settings: LearnerSettings) -> bool:
-    """Learn until the run's last step (True), SIGINT or SIGTERM; end with a checkpoint and a policy file.
+    """Learn until the last step of the run, SIGINT or SIGTERM. Write a checkpoint and a policy file at the end.
+
+    Returns:
+        Whether the run is complete.
 
     Raises:
-        CheckpointError: `resume` was asked for and is impossible, or was not and there is a checkpoint in the folder.
-        UnknownRobot, Unreachable: as they say.
+        CheckpointError: the run cannot be resumed, or `out` holds a checkpoint and `resume` is False.
+        UnknownRobot: there is no such robot.
+        Unreachable: no router answers.
     """
     robot = robot_with_task(settings.robot)
     with Process(settings.bus, settings.source) as process:
@@ -71,7 +77,7 @@ def main(settings: LearnerSettings) -> bool:
 
 
 class LearnerLoop:
-    """Takes steps and joins from the queues, lets the learner work, and publishes what it has to say."""
+    """Take steps and joins from the queues, let the learner work, and publish its weights, flow and metrics."""
 
     def __init__(
         self,
@@ -84,7 +90,7 @@ class LearnerLoop:
         self._steps: deque[Sample] = deque()
         self._joins: deque[tuple[bytes, Future[bytes]]] = deque()
         self._wake = Event()
-        self._said: object = None  # the content of the last flow
+        self._last_flow: object = None
         self._flow_at = self._metrics_at = self._retry_at = -1e9
         bus, robot = process.bus, learner.robot.name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
@@ -94,7 +100,7 @@ class LearnerLoop:
             bus.subscribe(topic, self._receive, robot=robot)
         bus.serve(JOIN, self._answer, robot=robot)
 
-    # --- in the bus's threads ---
+    # In the threads of the bus:
 
     def _receive(self, sample: Sample) -> None:
         self._steps.append(sample)
@@ -106,10 +112,10 @@ class LearnerLoop:
         self._wake.set()
         return answer.result(JOIN_PATIENCE)
 
-    # --- in the loop's ---
+    # In the thread of the loop:
 
     def run(self) -> None:
-        """Until told to stop, or a moment after the run's end."""
+        """Run until the process stops, or for `LINGER` seconds after the end of the run."""
         end: float | None = None
         while not self._process.stop.is_set():
             if not self.turn():
@@ -122,15 +128,15 @@ class LearnerLoop:
         self._finish()
 
     def turn(self) -> bool:
-        """One pass; False: there was nothing to do."""
+        """Make one pass. Return whether there was anything to do."""
         busy = self._take_joins() + self._take_steps() + self._learner.work(UPDATES_A_TURN) > 0
         if self._learner.weights_due():
             self._weights.put(self._learner.publish())
         if self._learner.checkpoint_due() and self._clock() > self._retry_at:
             self._save()
-        self._say_flow()
+        self._publish_flow()
         if self._clock() - self._metrics_at > METRICS_PERIOD:
-            self._say_metrics()
+            self._publish_metrics()
         return busy
 
     def _take_joins(self) -> int:
@@ -141,10 +147,10 @@ class LearnerLoop:
             try:
                 join = pb.Join.FromString(payload)
                 reply = self._learner.join(join)
-                outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "taken in"
+                outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "accepted"
                 log.info("actor %s: %s", join.actor, outcome)
                 answer.set_result(reply.SerializeToString())
-            except Exception as error:  # it goes back to who asked
+            except Exception as error:  # the bus sends it to the actor
                 answer.set_exception(error)
         return taken
 
@@ -160,16 +166,16 @@ class LearnerLoop:
                 self._learner.insert(step)
         return taken
 
-    def _say_flow(self) -> None:
+    def _publish_flow(self) -> None:
         flow = self._learner.flow()
         content = (dict(flow.limit), flow.weights_version, flow.warmup, flow.done)
         age = self._clock() - self._flow_at
         spacing = 0.0 if self._settings.learner.lockstep else FLOW_SPACING
-        if age > FLOW_PERIOD or (content != self._said and age >= spacing):
-            self._said, self._flow_at = content, self._clock()
+        if age > FLOW_PERIOD or (content != self._last_flow and age >= spacing):
+            self._last_flow, self._flow_at = content, self._clock()
             self._flow.put(flow)
 
-    def _say_metrics(self) -> None:
+    def _publish_metrics(self) -> None:
         self._metrics_at = self._clock()
         metrics = self._learner.metrics()
         self._process.figures = {
@@ -184,7 +190,7 @@ class LearnerLoop:
         self._metrics.put(metrics)
 
     def _save(self) -> None:
-        """A checkpoint and the policy, or a note why there are none; learning goes on."""
+        """Write a checkpoint and the policy; if that fails, log the reason and continue."""
         try:
             place = self._learner.save(self._settings.out / CHECKPOINT)
             self._process.notes["checkpoint"] = f"step {self._learner.steps}"
@@ -203,7 +209,7 @@ class LearnerLoop:
             log.error("the policy was not written: %s", error)
 
     def _finish(self) -> None:
-        """What arrived is learned from as far as it is due, and kept."""
+        """Learn from the steps that arrived, as far as updates are due, and save the result."""
         self._take_joins()
         self._take_steps()
         if self._settings.learner.lockstep:
@@ -214,6 +220,6 @@ class LearnerLoop:
         if self._learner.may_save():
             self._save()
         else:
-            log.warning("stopped within an episode: in lockstep the checkpoint of an earlier one stays the latest")
+            log.warning("stopped within an episode: in lockstep, the latest checkpoint is from before the episode")
             self._write_policy()
-        self._say_metrics()
+        self._publish_metrics()

@@ -1,17 +1,15 @@
-"""From single steps to n-step transitions, per actor.
+"""Turn the steps of each actor into n-step transitions.
 
-A window opens at every step and closes after n steps or, shorter, where the episode ends or a step is missing. Only a
-*terminated* episode has no value beyond its end; truncation and gaps leave one, γ^k Q(s'), with s' as last seen. So
-nothing spans a gap and nothing that arrived is lost.
+A window opens at every step. It closes after n steps, at the end of the episode, or before a missing step. Only a
+*terminated* episode has no value after its end. After truncation or a gap, the value is γ^k Q(s') of the last state.
 
-A step that the safety filter corrected is two lessons in one: proposing what was executed would have had the same
-outcome without a penalty, and proposing what was proposed had it with one. With `Stored` "both" each becomes a
-transition. "executed" alone teaches nothing about actions that the filter never lets pass, and the critic's guesses
-about them draw the policy to the obstacles; there the penalty stands with the executed action.
+A step that the safety filter corrected gives two transitions with `Stored` "both": the executed action without the
+penalty, and the proposed action with it. With "executed", the executed action has the penalty. The learner then learns
+nothing about actions that the filter never allows, and the critic's guesses draw the policy to the obstacles.
 
-A step that is *cut* (SAILR's intervention) ends the episode for the learner alone: proposing what was proposed leads to
-nothing, with the lowest reward (Wagener et al. 2021, section 4: the absorbing MDP). With "both" what the backup policy
-did instead is a transition of its own, of one step, with a value beyond it.
+A *cut* step (an intervention of SAILR) ends the episode for the learner only. The proposed action gets the lowest
+reward and no value after it (the absorbing MDP of Wagener et al. 2021, section 4). With "both", the action of the
+backup policy is a one-step transition with a value after it.
 """
 
 from __future__ import annotations
@@ -41,11 +39,11 @@ class ActorStep(NamedTuple):
     next_observation: Vector
     terminated: bool
     truncated: bool
-    cut: bool = False  # for the learner the episode ends here; the reward less the penalty is the lowest there is
+    cut: bool = False  # the episode ends for the learner; reward − penalty is the lowest possible
 
 
 class NStepWindows:
-    """Open windows of every actor: at most n − 1 consecutive moves each."""
+    """The open windows of each actor: at most n − 1 consecutive steps."""
 
     def __init__(self, n: int, gamma: float, stored: Stored = "executed") -> None:
         self.n, self.gamma, self.stored = n, gamma, stored
@@ -53,9 +51,9 @@ class NStepWindows:
         self._last: dict[str, tuple[int, int]] = {}  # newest (episode, step) of an actor
 
     def push(self, actor: str, move: ActorStep) -> list[Transition]:
-        """The transitions that this move completes, oldest first. Moves are not repeated (`learner/step_ledger.py`)."""
+        """Return the transitions that a step completes, oldest first. The step is no duplicate (`StepLedger`)."""
         here, last = (move.episode, move.step), self._last.get(actor, (-1, -1))
-        if here < last:  # a straggler: its neighbours are closed, it stands for itself
+        if here < last:  # it comes late: the windows of its neighbours are closed
             return self._close([move])
         self._last[actor] = here
         moves = self._open.setdefault(actor, deque())
@@ -101,7 +99,7 @@ class NStepWindows:
         return done
 
     def state(self) -> PartState:
-        """The open windows too: with several actors a checkpoint cuts through the episodes of all but one."""
+        """Return the state for a checkpoint, with the open windows: other actors may be within an episode."""
         actors = sorted(self._last)
         moves = [(number, move) for number, actor in enumerate(actors) for move in self._open[actor]]
         tensors = {
@@ -114,6 +112,7 @@ class NStepWindows:
         return PartState(tensors, {"actors": actors, "last": [list(self._last[actor]) for actor in actors]})
 
     def restore(self, state: PartState) -> None:
+        """Take over the state of a checkpoint."""
         actors: list[str] = state.value("actors")
         self._last = {actor: (last[0], last[1]) for actor, last in zip(actors, state.value("last"), strict=True)}
         self._open = {actor: deque() for actor in actors}

@@ -1,8 +1,8 @@
-"""Multilayer perceptrons side by side, with the gradients written out.
+"""Several multilayer perceptrons of one shape, with explicit gradients.
 
-Training is bound by matrix products, so everything else is kept out of the way: the parameters of a network are one
-flat vector (one Adam step, one Polyak step), twins are one batched product, and every array is allocated once.
-Autograd would be shorter, and slower at these sizes; `tests/learner/test_networks.py` holds it against these gradients.
+Matrix products should take most of the time of a training step. Therefore the parameters of a network are one flat
+vector (one Adam step, one Polyak step), twin critics are one batched product, and all arrays are allocated once.
+Autograd is slower at these sizes; `tests/learner/test_networks.py` compares the gradients with autograd.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from torch import Tensor
 
 from brakeline.learner.learner_config import Precision
 
-WIDE = 64  # a product is worth rounding to bfloat16 from this width on
+WIDE = 64  # width from which bfloat16 makes a product faster
 
 
 class Dense:
-    """`count` affine maps side by side, z_i = x_i W_iᵀ + b_i.
+    """A layer of `count` affine maps, z_i = x_i W_iᵀ + b_i.
 
     Shapes: x (count, batch, in), W (count, out, in), b (count, 1, out), z (count, batch, out).
     """
@@ -32,24 +32,26 @@ class Dense:
         self.dx = torch.zeros(count, batch, inputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Z for x (count or 1, batch, in); x is kept by reference until the backward pass."""
+        """Return z for x (count or 1, batch, in). The layer refers to x until the backward pass."""
         self.x = x.expand(self.weight.shape[0], -1, -1)
         return torch.baddbmm(self.bias, self.x, self.weight.mT, out=self.z)
 
     def parameter_gradient(self, dz: Tensor, weight_gradient: Tensor, bias_gradient: Tensor) -> None:
+        """Write the gradients of the weight and the bias for a gradient dz of z."""
         torch.bmm(dz.mT, self.x, out=weight_gradient)
         torch.sum(dz, dim=1, keepdim=True, out=bias_gradient)
 
     def input_gradient(self, dz: Tensor) -> Tensor:
-        if self.weight.shape[1] == 1:  # an outer product: the batched one takes fifteen times as long
+        """Return the gradient of x for a gradient dz of z."""
+        if self.weight.shape[1] == 1:  # an outer product, for which `bmm` takes fifteen times as long
             return torch.mul(dz, self.weight, out=self.dx)
         return torch.bmm(dz, self.weight, out=self.dx)
 
 
 class HalfDense(Dense):
-    """A `Dense` whose three products round their factors and results to bfloat16; parameters stay in float32.
+    """A `Dense` that rounds the factors and results of its products to bfloat16. Parameters stay in float32.
 
-    Twice as fast where the processor multiplies bfloat16 (AVX512-BF16, AMX), slower where it does not.
+    It is twice as fast on a processor that multiplies bfloat16 (AVX512-BF16, AMX), and slower on others.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, batch: int) -> None:
@@ -81,8 +83,9 @@ class HalfDense(Dense):
 class Network:
     """`count` perceptrons of one shape: affine, ReLU, affine, …, affine.
 
-    `sizes` is (inputs, hidden…, outputs). A `Network` made by `first()` shares the parameters of its parent's
-    first perceptron and has its own working memory.
+    Attributes:
+        sizes: (inputs, hidden…, outputs).
+        parameters: all weights and biases as one vector.
     """
 
     def __init__(
@@ -108,7 +111,7 @@ class Network:
             self.layers.append(kind(weight, bias, self.batch))
 
     def _views(self, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Weight (count, out, in) and bias (count, 1, out) of every layer, as windows on a flat vector."""
+        """Return weight (count, out, in) and bias (count, 1, out) of every layer, as views of a flat vector."""
         views, start = [], 0
         for inputs, outputs in pairwise(self.sizes):
             weight = flat[start : start + self.count * outputs * inputs].view(self.count, outputs, inputs)
@@ -119,25 +122,26 @@ class Network:
         return views
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Uniform in ±1/√(inputs of the layer), as torch's linear layers start."""
+        """Draw the parameters uniformly in ±1/√(inputs of the layer), like torch's linear layers."""
         for layer in self.layers:
             bound = 1.0 / math.sqrt(layer.weight.shape[2])
             layer.weight.uniform_(-bound, bound, generator=generator)
             layer.bias.uniform_(-bound, bound, generator=generator)
 
     def first(self) -> Network:
+        """Return a network that shares the parameters of the first perceptron, with its own working memory."""
         other = Network(self.sizes, 1, self.batch, self.precision)
         other._stack([(layer.weight[:1], layer.bias[:1]) for layer in self.layers])
         return other
 
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs (count, batch, out) for x (1 or count, batch, in); valid until the next call."""
+        """Return the outputs (count, batch, out) for x (1 or count, batch, in), valid until the next call."""
         for layer in self.layers[:-1]:
             x = layer.forward(x).relu_()
         return self.layers[-1].forward(x)
 
     def parameter_gradient(self, dz: Tensor) -> Tensor:
-        """Backward from the outputs' gradient; fills and returns `gradients`."""
+        """Fill and return `gradients` for a gradient of the outputs."""
         for depth in range(len(self.layers) - 1, -1, -1):
             self.layers[depth].parameter_gradient(dz, *self._gradient_views[depth])
             if depth > 0:
@@ -145,13 +149,13 @@ class Network:
         return self.gradients
 
     def input_gradient(self, dz: Tensor, columns: slice) -> Tensor:
-        """Gradient (count, batch, columns) by some inputs, past the parameters."""
+        """Return the gradient (count, batch, columns) of some inputs for a gradient of the outputs."""
         for depth in range(len(self.layers) - 1, 0, -1):
             dz = self._through_relu(depth, dz)
         return torch.bmm(dz, self.layers[0].weight[:, :, columns])
 
     def _through_relu(self, depth: int, dz: Tensor) -> Tensor:
-        """The gradient before the ReLU that feeds layer `depth`."""
+        """Return the gradient before the ReLU whose output is the input of layer `depth`."""
         dx = self.layers[depth].input_gradient(dz)
         active = self.layers[depth - 1].z  # after the ReLU, which worked in place
         torch.ops.aten.threshold_backward.grad_input(dx, active, 0, grad_input=dx)

@@ -1,4 +1,4 @@
-"""How many samples an insert is worth: the rate limiter of Reverb (Cassirer et al. 2021)."""
+"""Hold the ratio of samples to inserts: the rate limiter of Reverb (Cassirer et al. 2021)."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from brakeline.learner.checkpoint_state import PartState
 
 
 class RateLimiter:
-    """Keeps learning and acting in step:
+    """Keep the error between inserts and samples in a band.
 
         error = (inserts − warmup) · samples_per_insert − samples,    0 ≤ error < ceiling  (below 0 in the warm-up)
 
-    Sampling would lower the error, inserting would raise it; each is allowed while the band holds. The ceiling is at
-    least a batch and an insert, or neither could move. The first `warmup` inserts are owed no samples, and there is no
-    sampling before them.
+    Sampling lowers the error, inserting raises it; each is allowed while the error stays in the band. The ceiling is at
+    least a batch and an insert, so that one of them is always allowed. Sampling starts after `warmup` inserts.
     """
 
     def __init__(self, samples_per_insert: float, batch: int, warmup: int, ahead: float = 0.0) -> None:
-        """`ahead`: inserts that actors may be ahead of the learner; 0 is lockstep."""
+        """Start at zero.
+
+        Args:
+            ahead: number of inserts that the actors may be ahead of the learner; 0: lockstep.
+        """
         self.samples_per_insert, self.batch, self.warmup = samples_per_insert, batch, warmup
         self.ceiling = batch + samples_per_insert * (1.0 + ahead)
         self.inserts = 0
@@ -26,31 +29,34 @@ class RateLimiter:
 
     @property
     def error(self) -> float:
+        """The error in samples."""
         return (self.inserts - self.warmup) * self.samples_per_insert - self.samples
 
     @property
     def warming_up(self) -> bool:
+        """Whether sampling has not started."""
         return self.inserts < self.warmup
 
     def may_sample(self) -> bool:
-        """Is a whole batch due?"""
+        """Return whether a whole batch is due."""
         return not self.warming_up and self.error >= self.batch
 
-    def may_insert(self) -> bool:
-        return self.error + self.samples_per_insert < self.ceiling
-
     def room(self) -> int:
-        """How many inserts in a row are allowed now."""
+        """Return how many inserts in a row are allowed now."""
         return max(0, math.ceil((self.ceiling - self.error) / self.samples_per_insert) - 1)
 
     def insert(self) -> None:
+        """Count an insert."""
         self.inserts += 1
 
     def sample(self) -> None:
+        """Count a batch."""
         self.samples += self.batch
 
     def state(self) -> PartState:
+        """Return the state for a checkpoint."""
         return PartState({}, {"inserts": self.inserts, "samples": self.samples})
 
     def restore(self, state: PartState) -> None:
+        """Take over the state of a checkpoint."""
         self.inserts, self.samples = state.integer("inserts"), state.integer("samples")

@@ -8,32 +8,37 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from brakeline.errors import BadState
 from brakeline.learner.checkpoint_state import PartState
 
 Vector = NDArray[np.float32]
+NAMES = ("observation", "action", "reward", "discount", "next_observation")
 
 
 class Transition(NamedTuple):
-    """k ≥ 1 steps of one episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), s' after the k-th."""
+    """k ≥ 1 steps of one episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), s' after the k-th step."""
 
     observation: Vector
-    action: Vector  # the first of the k, normalised to [−1, 1]
+    action: Vector  # of the first step, normalised to [−1, 1]
     reward: float
     discount: float
     next_observation: Vector
 
 
-class Batch:
-    """Transitions drawn together, as torch and NumPy see the same memory; refilled by every `ReplayBuffer.sample`.
+def _widths(observation_dim: int, action_dim: int) -> tuple[int, ...]:
+    return (observation_dim, action_dim, 1, 1, observation_dim)
 
-    Shapes: observation, next_observation (1, batch, obs), action (1, batch, act), reward, discount (1, batch, 1).
+
+class Batch:
+    """A batch of transitions that `ReplayBuffer.sample` fills. Torch and NumPy share its memory.
+
+    Attributes:
+        observation, action, reward, discount, next_observation: tensors (1, batch, width).
+        arrays: the same as arrays (batch, width), in the order of `NAMES`.
     """
 
     def __init__(self, size: int, observation_dim: int, action_dim: int) -> None:
-        widths = (observation_dim, action_dim, 1, 1, observation_dim)
-        # Torch aligns what it allocates; by NumPy's alignment the last bits of a product could differ from run to run.
-        tensors = [torch.zeros(1, size, width) for width in widths]
+        # Torch aligns its memory; with NumPy's alignment, the last bits of a product could differ from run to run.
+        tensors = [torch.zeros(1, size, width) for width in _widths(observation_dim, action_dim)]
         self.arrays = tuple(tensor[0].numpy() for tensor in tensors)
         self.observation, self.action, self.reward, self.discount, self.next_observation = tensors
 
@@ -44,43 +49,46 @@ class Batch:
 class ReplayBuffer:
     """The last `capacity` transitions, drawn uniformly with replacement."""
 
-    NAMES = ("observation", "action", "reward", "discount", "next_observation")
-
     def __init__(self, capacity: int, observation_dim: int, action_dim: int) -> None:
         self.capacity, self.size, self._next = capacity, 0, 0
-        widths = (observation_dim, action_dim, 1, 1, observation_dim)
-        self._arrays = tuple(np.zeros((capacity, width), np.float32) for width in widths)
+        self._arrays = tuple(np.zeros((capacity, width), np.float32) for width in _widths(observation_dim, action_dim))
 
     def __len__(self) -> int:
         return self.size
 
     def insert(self, transition: Transition) -> None:
-        """Writes over the oldest one when full."""
+        """Add a transition; a full buffer overwrites its oldest one."""
         for array, value in zip(self._arrays, transition, strict=True):
             array[self._next] = np.asarray(value)
         self._next = (self._next + 1) % self.capacity
         self.size = min(self.size + 1, self.capacity)
 
     def sample(self, generator: np.random.Generator, batch: Batch) -> None:
+        """Fill a batch.
+
+        Raises:
+            ValueError: the buffer is empty.
+        """
         if self.size == 0:
-            raise ValueError("nothing to sample from")
+            raise ValueError("the replay buffer has nothing to sample from")
         rows = generator.integers(self.size, size=len(batch))
         for array, out in zip(self._arrays, batch.arrays, strict=True):
-            np.take(array, rows, axis=0, out=out, mode="clip")  # "raise", the default, would copy the whole of `out`
+            np.take(array, rows, axis=0, out=out, mode="clip")  # the default mode "raise" copies the whole of `out`
 
     def state(self) -> PartState:
-        """The filled rows as they lie, so that the same draw finds the same rows again."""
-        tensors = {name: array[: self.size] for name, array in zip(self.NAMES, self._arrays, strict=True)}
+        """Return the state for a checkpoint, with the rows in their places: the same draw finds the same rows."""
+        tensors = {name: array[: self.size] for name, array in zip(NAMES, self._arrays, strict=True)}
         return PartState(tensors, {"capacity": self.capacity, "next": self._next})
 
     def restore(self, state: PartState) -> None:
+        """Take over the state of a checkpoint."""
         if state.integer("capacity") != self.capacity:
-            raise BadState(f"capacity: {state.integer('capacity')} where {self.capacity} belongs")
+            raise ValueError(f"capacity: {state.integer('capacity')}, not {self.capacity}")
         size = len(state.tensor("reward", (None, 1), "float32"))
         at = state.integer("next")
         full = size == self.capacity
         if size > self.capacity or not (0 <= at < size if full else at == size):
-            raise BadState(f"next: {at} with {size} rows")
-        for name, array in zip(self.NAMES, self._arrays, strict=True):
+            raise ValueError(f"next: {at} with {size} rows")
+        for name, array in zip(NAMES, self._arrays, strict=True):
             array[:size] = state.tensor(name, (size, array.shape[1]), "float32")
         self.size, self._next = size, at

@@ -1,4 +1,4 @@
-"""Fits the networks that the rivals rest on, from data that were driven beforehand (`deploy/data/rival_rollouts.py`).
+"""Fit the networks of the rivals to recorded rollouts (`deploy/data/rival_rollouts.py`).
 
 SECAS   min Σ_t (c_i(s'_t) − c_i(s_t) − g_i(s_t)ᵀ a_t)²            per constraint i (Dalal et al. 2018, eq. 3)
 SAILR   min Σ_t BCE(σ(f(x_t)), y_t)                                 per critic, y the cost-to-go in [0, 1]
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brakeline.errors import TooFew
+from brakeline.errors import BadData
 from brakeline.learner.adam import Adam
 from brakeline.learner.networks import Network
 from brakeline.learner.symmetry import SymmetryAugmentation
@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How networks are fitted."""
+    """Settings of a fit."""
 
     hidden: tuple[int, ...]
     rate: float = 1e-3
     batch: int = 256
     epochs: int = 20
-    held_out: float = 0.1  # share of the samples that only the stated errors see
+    held_out: float = 0.1  # share of the samples for the stated errors
 
     def __post_init__(self) -> None:
         if min(self.batch, self.epochs) < 1 or not self.hidden or not 0.0 < self.held_out < 1.0:
@@ -45,12 +45,13 @@ Gradient = Callable[[Tensor, NDArray[np.intp]], Tensor]  # outputs (count, batch
 def fit_linear(
     observation: Array, action: Array, change: Array, how: FitConfig, seed: int
 ) -> tuple[Perceptrons, Array]:
-    """Networks g_i with change_i ≈ g_i(observation)ᵀ action, one for each column of `change` (N, K).
+    """Fit networks g_i with change_i ≈ g_i(observation)ᵀ action, one for each column of `change` (N, K).
 
-    Returns them and, on held-out samples, each one's root mean squared error and that of predicting no change, (2, K).
+    Returns:
+        The networks; and (2, K) on held-out samples, their root mean squared errors and those of predicting no change.
 
     Raises:
-        TooFew: samples.
+        BadData: there are fewer samples than a batch.
     """
     seen, actions, changes = (torch.from_numpy(np.asarray(a, np.float32)) for a in (observation, action, change))
 
@@ -67,13 +68,19 @@ def fit_linear(
 def fit_cost(
     robot: RobotWithTask, x: Array, cost: Array, count: int, how: FitConfig, seed: int
 ) -> tuple[Perceptrons, float]:
-    """`count` networks whose sigmoid is the cost (N,) in [0, 1] of inputs x (N, i), observations or pairs of
-    observation and action; they differ by their start. They learn from images too (`learner/symmetry.py`).
+    """Fit `count` networks, with different initial parameters, whose sigmoid is a cost.
 
-    Returns them and the mean absolute error of their mean on held-out samples.
+    The networks learn from images too (`learner/symmetry.py`).
+
+    Args:
+        x: inputs (N, i), observations or pairs of observation and action.
+        cost: (N,) in [0, 1].
+
+    Returns:
+        The networks; and the mean absolute error of their mean on held-out samples.
 
     Raises:
-        TooFew: samples.
+        BadData: there are fewer samples than a batch.
     """
     inputs, costs = (torch.from_numpy(np.asarray(a, np.float32)) for a in (x, cost))
 
@@ -93,14 +100,14 @@ def _fit(
     seed: int,
     images: SymmetryAugmentation | None = None,
 ) -> tuple[Perceptrons, NDArray[np.intp]]:
-    """`shape[0]` networks with `shape[1]` outputs, and the rows that were held out."""
+    """Return `shape[0]` networks with `shape[1]` outputs, and the held-out rows."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(inputs))
     aside = max(1, int(how.held_out * len(inputs)))
     apart, kept = order[:aside], order[aside:]
     if len(kept) < how.batch:
-        raise TooFew(f"{len(inputs)} samples; a batch alone has {how.batch}")
+        raise BadData(f"{len(inputs)} samples are fewer than one batch ({how.batch})")
     count, outputs = shape
     network = Network((inputs.shape[1], *how.hidden, outputs), count, how.batch)
     network.initialise(torch.Generator().manual_seed(int(rng.integers(2**31))))
@@ -116,7 +123,7 @@ def _fit(
 
 
 def _batches(rows: NDArray[np.intp], how: FitConfig, rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
-    """Whole batches of every epoch, each in an order of its own."""
+    """Yield the whole batches of every epoch, each epoch in a random order."""
     for _ in range(how.epochs):
         order = rng.permutation(rows)
         for start in range(0, len(order) - how.batch + 1, how.batch):

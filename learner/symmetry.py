@@ -1,12 +1,11 @@
-"""What a robot would have seen and done in a world that is turned or mirrored: as true as what was recorded.
+"""Augment transitions by their images in a turned or mirrored world.
 
-The quadrotor's body, bounds, arenas and rays are the same after a quarter turn about the vertical, and in a mirror.
-With a signed permutation R of the world's axes, a transition of it has the image
+The quadrotor's body, bounds, arenas and rays are invariant to a quarter turn about the vertical and to mirroring. With
+a signed permutation R of the world's axes, a transition has the image
 
     ray j of s ↦ the ray i with e_i = Rᵀ e_j,      every vector v in s, and a,  ↦  R v
 
-with the same reward and discount. A batch holds all eight images in equal shares: a policy need not learn the same
-eight times.
+with the same reward and discount. A batch contains all eight images in equal shares.
 """
 
 from __future__ import annotations
@@ -16,19 +15,17 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.learner.replay import Batch, ReplayBuffer
+from brakeline.learner.replay import NAMES, Batch
 from brakeline.messaging.task import RobotWithTask
 
 Indices = NDArray[np.intp]
 Matrix = NDArray[np.float64]
 
-OBSERVATION, ACTION, NEXT_OBSERVATION = (
-    ReplayBuffer.NAMES.index(n) for n in ("observation", "action", "next_observation")
-)
+TURNED = [NAMES.index(name) for name in ("observation", "action", "next_observation")]
 
 
 def symmetry_matrices(robot: RobotWithTask) -> list[Matrix]:
-    """The R (d, d) under which a robot and its world stay the same, the identity first."""
+    """Return the matrices R (d, d) to which a robot and its world are invariant, the identity first."""
     d = robot.position_dim
     if robot.task.symmetry == "none":
         return [np.eye(d)]
@@ -38,10 +35,10 @@ def symmetry_matrices(robot: RobotWithTask) -> list[Matrix]:
 
 
 def symmetry_maps(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, Indices, Matrix]:
-    """Where each coordinate of an observation's image comes from, with which sign; the same of an action's.
+    """Return the source and the sign of each coordinate of an observation's image, then those of an action's image.
 
     Raises:
-        ValueError: the rays do not come upon each other.
+        ValueError: the rays, or the other coordinates, are not invariant to the turn.
     """
     directions, d = robot.task.rays.directions, len(turn)
     alike = directions @ turn @ directions.T  # [j, i]: e_j · R e_i
@@ -52,16 +49,16 @@ def symmetry_maps(robot: RobotWithTask, turn: Matrix) -> tuple[Indices, Matrix, 
     signs = turn[np.arange(d), axes]
     vectors, left = divmod(robot.task.observation_dim - len(rays), d)
     if left or robot.action_dim != d:
-        raise ValueError(f"{robot.name} observes and does more than vectors of {d} coordinates")
+        raise ValueError(f"{robot.name} has coordinates besides vectors with {d} coordinates")
     after = len(rays) + (np.arange(vectors)[:, None] * d + axes).ravel()
     observed = np.concatenate([np.ones(len(rays)), np.tile(signs, vectors)])
     return np.concatenate([rays, after]), observed, axes, signs
 
 
 class SymmetryAugmentation:
-    """Replaces rows by their images: row k by that under number k of `symmetry_matrices`, modulo their count.
+    """Replace row k of a batch by its image under matrix k of `symmetry_matrices`, modulo their number.
 
-    Rows are drawn at random, so which image of a transition is seen is as random.
+    The rows of a batch are drawn at random, so the image of a transition is random too.
     """
 
     def __init__(self, robot: RobotWithTask, batch: int) -> None:
@@ -79,13 +76,13 @@ class SymmetryAugmentation:
         }
 
     def apply(self, batch: Batch) -> None:
-        """In place."""
+        """Replace a batch in place."""
         if self._sources:
-            for number in (OBSERVATION, ACTION, NEXT_OBSERVATION):
+            for number in TURNED:
                 batch.arrays[number][:] = self.rows(batch.arrays[number])
 
     def rows(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Of observations (batch, o), actions (batch, m), or pairs of them (batch, o + m)."""
+        """Return the images of observations (batch, o), actions (batch, m), or pairs of both (batch, o + m)."""
         if not self._sources:
             return array
         source, sign = self._sources[array.shape[1]]
@@ -93,6 +90,6 @@ class SymmetryAugmentation:
 
 
 def _flat(columns: Indices) -> Indices:
-    """Columns (rows, width) as indices into the array of that shape, laid out flat."""
+    """Return columns (rows, width) as indices into the flat array of that shape."""
     rows, width = columns.shape
     return np.asarray(np.arange(rows)[:, None] * width + columns)

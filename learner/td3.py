@@ -1,13 +1,13 @@
-"""TD3 (Fujimoto et al. 2018): twin critics, a smoothed target, a delayed actor.
+"""TD3 (Fujimoto et al. 2018): twin critics, target smoothing and delayed updates of the actor.
 
-Actions are normalised to [−1, 1] per coordinate. A transition spans k ≤ n steps (`learner/n_step.py`):
+Each coordinate of an action is normalised to [−1, 1]. A transition spans k ≤ n steps (`learner/n_step.py`):
 
     y     = c·R + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
     L_Q   = Σ_i mean (Q_i(s, a) − y)²
     L_π   = −mean Q_1(s, π(s))                                     every `policy_delay`-th update, then
     θ̄     ← θ̄ + τ (θ − θ̄)
 
-with R = Σ_j γ^j r_j over the k steps, d = γ^k or 0 at a true end, c the reward scale.
+with R = Σ_j γ^j r_j over the k steps, d = γ^k (0 at a true end), and c the reward scale.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from brakeline.learner.replay import Batch
 
 @dataclass
 class Losses:
-    """Of the last updates of each kind."""
+    """The losses of the last updates."""
 
     critic: float = 0.0
     actor: float = 0.0
@@ -36,10 +36,10 @@ class Losses:
 
 
 class TD3:
-    """Networks, their targets and optimisers; one `update` per batch."""
+    """The networks, their targets and their optimisers."""
 
     def __init__(self, observation_dim: int, action_dim: int, config: TD3Config, seed: int) -> None:
-        torch.set_num_threads(1)  # several processes with two threads each on two cores are ten times slower
+        torch.set_num_threads(1)  # more threads than cores make all processes ten times slower
         self.config, self.updates, self.losses = config, 0, Losses()
         self._generator = torch.Generator().manual_seed(seed)
         batch, joint = config.batch, observation_dim + action_dim
@@ -61,19 +61,18 @@ class TD3:
         self._target = torch.zeros(1, batch, 1)
 
     def update(self, batch: Batch) -> None:
-        torch.set_flush_denormal(
-            True
-        )  # the moments of silent units decay into denormals: up to half the time, for nothing
+        """Learn from a batch."""
+        torch.set_flush_denormal(True)  # the moments of inactive units decay to denormals, which double the time
         self._update_critics(batch)
         self.updates += 1
         if self.updates % self.config.policy_delay == 0:
             self._update_actor(batch)
             self.target_actor.parameters.lerp_(self.actor.parameters, self.config.tau)
             self.target_critics.parameters.lerp_(self.critics.parameters, self.config.tau)
-        torch.set_flush_denormal(False)  # it holds for the whole thread, which is not ours alone
+        torch.set_flush_denormal(False)  # the setting is the whole thread's
 
     def target(self, batch: Batch) -> Tensor:
-        """Y (1, batch, 1)."""
+        """Return y (1, batch, 1)."""
         config = self.config
         noise = self._noise.normal_(0.0, 1.0, generator=self._generator).mul_(config.target_noise)
         noise.clamp_(-config.target_noise_clip, config.target_noise_clip)
@@ -104,7 +103,7 @@ class TD3:
         self.actor_adam.step(self.actor.parameter_gradient(daction * (1.0 - action * action)))
 
     def policy_layers(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Weight (out, in) and bias (out,) of the actor's layers, copied."""
+        """Return copies of the weight (out, in) and bias (out,) of the actor's layers."""
         return [(layer.weight[0].numpy().copy(), layer.bias[0, 0].numpy().copy()) for layer in self.actor.layers]
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -120,12 +119,14 @@ class TD3:
         }
 
     def state(self) -> PartState:
+        """Return the state for a checkpoint."""
         tensors = {name: tensor.numpy() for name, tensor in self._tensors().items()}
         tensors["generator"] = self._generator.get_state().numpy()
         counts = {"updates": self.updates, "actor_adam": self.actor_adam.count, "critic_adam": self.critic_adam.count}
         return PartState(tensors, counts)
 
     def restore(self, state: PartState) -> None:
+        """Take over the state of a checkpoint."""
         for name, tensor in self._tensors().items():
             tensor.copy_(torch.from_numpy(state.tensor(name, tuple(tensor.shape), "float32").copy()))
         generator = state.tensor("generator", tuple(self._generator.get_state().shape), "uint8")

@@ -1,4 +1,4 @@
-"""From a step on the wire to a move to learn from: sizes and values are checked, the action is normalised."""
+"""Check the sizes and values of a step from the bus, and normalise its actions."""
 
 from __future__ import annotations
 
@@ -13,28 +13,30 @@ from brakeline.learner.replay import Vector
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
-# What no task pays and no sensor says: far beyond any, and far below what would drown the networks.
-AT_ONCE = 10.0  # times all that a task pays, a metre's progress included: no step is paid as much
+# Bounds of plausible steps: beyond what tasks and sensors give, and below what would ruin the networks.
+MAX_REWARD_FACTOR = 10.0  # of the sum of all rewards of a task, with the progress of one metre
 MOST_OBSERVED = 10.0  # observations are clipped at 1.5
-MOST_PROPOSED = 1e2  # half ranges from the middle: policies may propose what is out of bounds, and are clipped
-ROUNDING = 1e-3  # of half a range, of an executed action at its bounds
+MOST_PROPOSED = 1e2  # distance from the center of the bounds, in half ranges; proposals are clipped
+ROUNDING = 1e-3  # rounding of an executed action at its bounds, in half ranges
 LATEST = 2**31  # number of an episode or a step
 
 
 class StepReader:
-    """Reads the steps of one kind of robot. The reward learned is `reward − penalty`."""
+    """Reads the steps of one kind of robot."""
 
     def __init__(self, robot: RobotWithTask) -> None:
         self.robot = robot
-        self.most_reward = AT_ONCE * sum(map(abs, astuple(robot.task.reward)))
+        self.most_reward = MAX_REWARD_FACTOR * sum(map(abs, astuple(robot.task.reward)))
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     def move(self, step: pb.Step) -> ActorStep:
-        """Raises:
-        BadStep: it cannot be learned from.
+        """Return the step in a message.
+
+        Raises:
+            BadStep: the learner cannot learn from the step.
         """
         if step.robot != self.robot.name:
-            raise BadStep("robot", f"{step.robot!r} where {self.robot.name!r} is learned")
+            raise BadStep("robot", f"{step.robot!r}, not {self.robot.name!r}")
         if not step.actor:
             raise BadStep("actor", "empty")
         if step.index == 0:
@@ -53,7 +55,7 @@ class StepReader:
         )
 
     def _normalised(self, name: str, values: Any, most: float) -> Vector:
-        """An action in [-1, 1]: what is out of bounds, by not too much, would have been clipped."""
+        """Return an action in [−1, 1], clipped if it is out of bounds by at most `most`."""
         normalised = (_vector(name, values, self.robot.action_dim) - self._centre) / self._half
         if np.abs(normalised).max() > most:
             raise BadStep(name, f"{list(values)}, out of the robot's bounds")
@@ -70,7 +72,7 @@ class StepReader:
 def _vector(name: str, values: Any, size: int) -> Vector:
     vector = np.array(values, np.float32)
     if vector.shape != (size,):
-        raise BadStep(name, f"{len(values)} values where {size} belong")
+        raise BadStep(name, f"{len(values)} values, not {size}")
     if not np.isfinite(vector).all():
         raise BadStep(name, "not finite")
     return vector

@@ -231,8 +231,7 @@ def analyse_runs(paths: Paths, options: AnalysisOptions | None = None) -> LogAna
     """Analyse the logs at `paths`, run by run.
 
     Raises:
-        NoLog: a path has no log.
-        NotALog: a file is not an MCAP file.
+        LogError: a path has no log, or a file is not an MCAP file.
     """
     runs = by_run(find(paths))
     several = len(runs) > 1

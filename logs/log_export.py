@@ -41,7 +41,7 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
 
     Raises:
         ExportError: the log has no step of this robot; the message lists the robots that it has.
-        NoLog, NotALog: as `open_log`.
+        LogError: as `open_log`.
     """
     vectors = columns(robot)
     plain = [f.name for f in pb.Step.DESCRIPTOR.fields if not f.is_repeated and f.message_type is None]
@@ -82,7 +82,7 @@ def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
 
     Raises:
         ExportError: `out` exists, or the log has no message.
-        NoLog, NotALog: as `open_log`.
+        LogError: as `open_log`.
         OSError: the disk is full or broken.
     """
     if out.exists():

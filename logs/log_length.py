@@ -14,7 +14,7 @@ def count(paths: Paths, topic: Topic) -> int | None:
     """Return the number of messages of a topic; None if a file has no summary because its recorder was killed.
 
     Raises:
-        NoLog: a path has no log.
+        LogError: a path has no log.
     """
     root, total = topic.key.split("/", 1)[0], 0
     for path in find(paths):

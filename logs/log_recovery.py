@@ -15,7 +15,7 @@ from typing import IO, Any
 import mcap.writer
 from mcap.records import Attachment, Metadata
 
-from brakeline.errors import BeingRecorded, NotALog, NotMcap
+from brakeline.errors import LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, records
 from brakeline.logs.segment import CHUNK, being_written
 
@@ -56,13 +56,12 @@ def recover(path: Path, out: Path | None = None) -> Recovery:
     The repaired file gets its name only when it is complete, so that an interruption loses nothing.
 
     Raises:
-        BeingRecorded: a recorder is writing to the file.
-        NotALog: the file is not an MCAP file.
+        LogError: a recorder is writing to the file, or it is not an MCAP file.
         FileExistsError: `out` or an earlier damaged file would be overwritten.
         OSError: the disk is full or broken.
     """
     if being_written(path):
-        raise BeingRecorded(f"{path} is being recorded: stop its recorder first")
+        raise LogError(f"{path} is being recorded: stop its recorder first")
     target, damaged = out or path, path if out is not None else path.with_name(path.name + DAMAGED)
     if out is not None and out.exists():
         raise FileExistsError(f"{out} exists already")
@@ -84,7 +83,7 @@ def recover(path: Path, out: Path | None = None) -> Recovery:
                 path.rename(damaged)
         beside.replace(target)
     except NotMcap as error:
-        raise NotALog(f"{path} is not an MCAP file: {error}") from error
+        raise LogError(f"{path} is not an MCAP file: {error}") from error
     finally:
         beside.unlink(missing_ok=True)
     result.kept = damaged

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from google.protobuf.message import Message
 
-from brakeline.errors import Crowded
+from brakeline.errors import Implausible
 from brakeline.logs import tube_stats
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
@@ -115,7 +115,7 @@ class Metrics:
         """Add a message that was published at `key`; return False for a duplicate, which is only counted.
 
         Raises:
-            Crowded: the message is from a new publisher, actor or process, and there are too many.
+            Implausible: the message is from a new publisher, actor or process, and there are too many.
         """
         header: pb.Header = message.header
         sequence, place = header.sequence, (key, header.run)
@@ -245,11 +245,11 @@ class Metrics:
 
 
 def _get_or_create(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
-    """Return the entry of a name; create it for a new name. Raises Crowded."""
+    """Return the entry of a name; create it for a new name. Raises Implausible."""
     if name not in table:
         most = MOST_STREAMS if make is PublisherStream else MOST_NAMES
         if len(table) >= most:
-            raise Crowded(f"{name} is rejected: there are already {most}")
+            raise Implausible(f"{name} is rejected: there are already {most}")
         table[name] = make()
     return table[name]
 

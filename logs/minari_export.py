@@ -76,7 +76,7 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
 
     Raises:
         ExportError: the data set exists, or the log has no step of this robot.
-        NoLog, NotALog: as `open_log`.
+        LogError: as `open_log`.
     """
     import gymnasium
     import minari

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Metadata
 
-from brakeline.errors import Implausible, NoLog, NotALog, NotMcap
+from brakeline.errors import Implausible, LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, Row, records
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import being_written, name_of, number_of
@@ -152,7 +152,7 @@ class Log:
                     elif isinstance(item, Attachment):
                         self.attachments[item.name] = item.data
         except NotMcap as error:
-            raise NotALog(f"{path} is not an MCAP file: {error}") from error
+            raise LogError(f"{path} is not an MCAP file: {error}") from error
 
     def _add_damage(self, segment: LogSegment, damage: DamagedBytes) -> None:
         reason = "the file is being recorded" if segment.recording and damage.at_end else damage.reason
@@ -168,7 +168,7 @@ def find(paths: Paths) -> tuple[Path, ...]:
     """Return the files at `paths`: for a folder all its logs, for run.mcap also its segments run_0001.mcap ….
 
     Raises:
-        NoLog: a path has no log.
+        LogError: a path has no log.
     """
     given = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     logs: dict[Path, None] = {}
@@ -182,7 +182,7 @@ def find(paths: Paths) -> tuple[Path, ...]:
         else:
             files = []
         if not files:
-            raise NoLog(f"no log at {path}: give an .mcap file or the folder of a run")
+            raise LogError(f"no log at {path}: give an .mcap file or the folder of a run")
         logs.update(dict.fromkeys(sorted(files, key=number_of)))
     return tuple(logs)
 
@@ -216,8 +216,7 @@ def open_log(paths: Paths) -> Log:
     """Open the logs at `paths`, one or more files or folders.
 
     Raises:
-        NoLog: a path has no log.
-        NotALog: while iterating, if a file is not an MCAP file.
+        LogError: a path has no log; or, while iterating, a file is not an MCAP file.
     """
     return Log(find(paths))
 

@@ -24,8 +24,7 @@ def analyse(paths: Paths) -> Figures:
     A value of the configuration is None if the log does not have it or if the runs differ.
 
     Raises:
-        NoLog: a path has no log.
-        NotALog: a file is not an MCAP file.
+        LogError: a path has no log, or a file is not an MCAP file.
     """
     return analyse_runs(paths).figures()
 

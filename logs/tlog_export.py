@@ -19,7 +19,7 @@ def to_tlog(paths: Paths, file: BinaryIO) -> int:
 
     Raises:
         ExportError: the log has no frame.
-        NoLog, NotALog: as `open_log`.
+        LogError: as `open_log`.
     """
     count = 0
     for record in open_log(paths):

@@ -1,7 +1,7 @@
-"""Links that carry bytes, by URL: what MAVLink runs over. Nothing here knows what the bytes mean.
+"""Links that carry the bytes of MAVLink, by URL.
 
-udpin:HOST:PORT    listen; answer whoever sent something lately
-udpout:HOST:PORT   send there first
+udpin:HOST:PORT    listen; send to all peers that sent something in the last `FORGET` seconds
+udpout:HOST:PORT   send to this address
 tcp:HOST:PORT      connect
 tcpin:HOST:PORT    listen; any number of connections
 """
@@ -15,24 +15,24 @@ from typing import Protocol
 
 from brakeline.errors import BadLink
 
-FORGET = 10.0  # s of silence after which a UDP peer is no longer answered
-LARGEST = 65536  # bytes read at once
+FORGET = 10.0  # time after which a silent UDP peer gets nothing more [s]
+LARGEST = 65536  # largest number of bytes in one read
 
 
 class Link(Protocol):
-    """Bytes there and back; what is lost on the way is lost."""
+    """A link that may lose bytes."""
 
     def send(self, data: bytes) -> None:
-        """Never waits; never raises for a peer that is gone."""
+        """Send bytes without waiting. A peer that is gone is no error."""
 
     def receive(self) -> bytes:
-        """What has arrived since the last call; empty when nothing has."""
+        """Return the bytes that arrived since the last call."""
 
     def close(self) -> None: ...
 
 
 class Udp:
-    """A UDP socket that answers its peers: a fixed one, or all that were heard in the last `FORGET` seconds."""
+    """A UDP socket that sends to a fixed peer, or to all that sent something in the last `FORGET` seconds."""
 
     def __init__(self, host: str, port: int, listen: bool) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -43,7 +43,7 @@ class Udp:
 
     @property
     def port(self) -> int:
-        """Its own."""
+        """The link's own port."""
         return int(self._socket.getsockname()[1])
 
     def send(self, data: bytes) -> None:
@@ -60,7 +60,7 @@ class Udp:
                 data, peer = self._socket.recvfrom(LARGEST)
             except BlockingIOError:
                 return b"".join(parts)
-            except OSError:  # the peer's port is closed: the answer to something sent earlier
+            except OSError:  # the peer's port was closed at an earlier send
                 continue
             self._peers[peer] = time.monotonic()
             parts.append(data)
@@ -70,7 +70,7 @@ class Udp:
 
 
 class Tcp:
-    """One TCP connection; after its end it carries nothing."""
+    """A TCP connection; after its end, `send` does nothing."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
@@ -81,7 +81,7 @@ class Tcp:
     def send(self, data: bytes) -> None:
         try:
             if self.open and self._socket.send(data) < len(data):
-                self.open = False  # a peer that does not read: half a frame is worse than none
+                self.open = False  # the peer does not read; a part of a frame would be useless
         except OSError:
             self.open = False
 
@@ -104,7 +104,7 @@ class Tcp:
 
 
 class TcpServer:
-    """Accepts connections; all get what is sent."""
+    """A TCP server that sends to all its connections."""
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = socket.create_server((host, port))
@@ -113,7 +113,7 @@ class TcpServer:
 
     @property
     def port(self) -> int:
-        """Its own."""
+        """The link's own port."""
         return int(self._socket.getsockname()[1])
 
     def send(self, data: bytes) -> None:
@@ -136,10 +136,10 @@ class TcpServer:
 
 
 def open_link(url: str) -> Udp | Tcp | TcpServer:
-    """The link of a URL.
+    """Open the link at a URL.
 
     Raises:
-        BadLink: not one of the four kinds.
+        BadLink: the URL is not one of the four kinds.
         OSError: the port is taken, or nobody listens.
     """
     parts = url.replace("//", "").split(":")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.errors import BadPerceptrons
+from brakeline.errors import BadWeights
 
 Tensor = NDArray[np.float32]
 Layer = tuple[Tensor, Tensor]  # weight (count, out, in), bias (count, out)
@@ -24,18 +24,18 @@ class Perceptrons:
         """Copy the layers.
 
         Raises:
-            BadPerceptrons: layers do not fit each other, or are not finite.
+            BadWeights: layers do not fit each other, or are not finite.
         """
         self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
         if not self.layers:
-            raise BadPerceptrons("layers: there are none")
+            raise BadWeights("layers: there are none")
         self.count, _, self.inputs = self.layers[0][0].shape if self.layers[0][0].ndim == 3 else (0, 0, 0)
         width = self.inputs
         for number, (weight, bias) in enumerate(self.layers):
             if weight.ndim != 3 or weight.shape[::2] != (self.count, width) or bias.shape != weight.shape[:2]:
-                raise BadPerceptrons(f"layers.{number}: {weight.shape} and {bias.shape} behind {width} inputs")
+                raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {width} inputs")
             if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-                raise BadPerceptrons(f"layers.{number}: not finite")
+                raise BadWeights(f"layers.{number}: not finite")
             width = weight.shape[1]
         self.outputs = width
 
@@ -61,15 +61,15 @@ class Perceptrons:
         """Return the perceptrons with a name from the tensors of a file.
 
         Raises:
-            BadPerceptrons: a layer is missing, has another type, or does not fit.
+            BadWeights: a layer is missing, has another type, or does not fit.
         """
         layers: list[Layer] = []
         while f"{name}.{len(layers)}.weight" in tensors:
             parts = [tensors.get(f"{name}.{len(layers)}.{kind}") for kind in ("weight", "bias")]
             if any(part is None or part.dtype != np.float32 for part in parts):
-                raise BadPerceptrons(f"{name}.{len(layers)}: a part is missing or not float32")
+                raise BadWeights(f"{name}.{len(layers)}: a part is missing or not float32")
             layers.append((np.asarray(parts[0]), np.asarray(parts[1])))
         try:
             return cls(layers)
-        except BadPerceptrons as error:
-            raise BadPerceptrons(f"{name}: {error}") from error
+        except BadWeights as error:
+            raise BadWeights(f"{name}: {error}") from error

@@ -1,8 +1,7 @@
-"""Policies as bytes, on the wire and on disk alike, and their forward pass without torch.
+"""Policies as bytes on the bus and in files, and their forward pass without torch.
 
-A file is safetensors: `layers.K.weight` (out, in) and `layers.K.bias` (out,), float32, K from 0; one metadata entry
-`policy` holds, as JSON, the robot's name, the hash of its layout, the version and the exploration noise. Nothing in it
-is executable, and nothing of it is believed before it was checked.
+The format is safetensors: `layers.K.weight` (out, in) and `layers.K.bias` (out,), float32, with K from 0. The metadata
+entry `policy` is JSON with the robot's name, the hash of its layout, the version and the exploration noise.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
 
 
 class MLP:
-    """A policy: observation → ReLU layers → tanh, scaled to the robot's [low, high].
-
-    Working memory is allocated once, so one `MLP` belongs to one thread.
-    """
+    """A policy: observation → ReLU layers → tanh, scaled to the robot's bounds. Not thread-safe."""
 
     def __init__(self, robot: RobotWithTask, layers: Layers, version: int = 0, noise: float = 0.0) -> None:
-        """`noise`: standard deviation of the exploration, as a fraction of half an action's range.
+        """Copy the layers.
+
+        Args:
+            noise: standard deviation of the exploration, as a fraction of half an action's range.
 
         Raises:
             BadWeights: the layers do not fit each other or the robot, or are not finite.
@@ -48,7 +47,7 @@ class MLP:
 
     @classmethod
     def untrained(cls, robot: RobotWithTask, seed: int, hidden: tuple[int, ...] = (256, 256)) -> MLP:
-        """Uniform in ±1/√(inputs of the layer), as the learner starts."""
+        """Return a policy with parameters drawn uniformly in ±1/√(inputs of the layer), like a new learner's."""
         generator = np.random.default_rng(seed)
         layers = []
         for inputs, outputs in pairwise((robot.task.observation_dim, *hidden, robot.action_dim)):
@@ -59,20 +58,21 @@ class MLP:
 
     @property
     def sizes(self) -> tuple[int, ...]:
+        """Number of inputs, and of outputs of each layer."""
         return (self.robot.task.observation_dim, *(len(bias) for _, bias in self.layers))
 
     def __call__(self, observation: NDArray[Any]) -> Array:
-        """The action (action_dim,), in the robot's units."""
+        """Return the action (m,) in the robot's units."""
         return self._centre + self._half * self.normalised(observation)
 
     def explore(self, observation: NDArray[Any], generator: np.random.Generator) -> Array:
-        """The action with Gaussian noise, clipped to the bounds."""
+        """Return the action with Gaussian noise, clipped to the bounds."""
         draw = generator.standard_normal(self.robot.action_dim)
         action = self._centre + self._half * (self.normalised(observation) + self.noise * draw)
         return np.clip(action, self._low, self._high)
 
     def normalised(self, observation: NDArray[Any]) -> Matrix:
-        """The action in [−1, 1]; valid until the next call."""
+        """Return the action in [−1, 1], valid until the next call."""
         value = self._input
         value[:] = observation
         for (weight, bias), outputs in zip(self.layers, self._outputs, strict=True):
@@ -83,36 +83,38 @@ class MLP:
         return np.tanh(value, out=value)
 
     def encode(self) -> bytes:
+        """Return the bytes of the policy's file."""
         return encode(self.robot, self.layers, self.version, self.noise)
 
     def save(self, path: Path) -> None:
+        """Write the policy to a file."""
         path.write_bytes(self.encode())
 
     @classmethod
     def load(cls, path: Path, robot: RobotWithTask | None = None) -> MLP:
-        """Raises:
-        BadWeights: the file is not a policy (of that robot, if one is given).
-        OSError: it cannot be read.
-        """
+        """Read a policy from a file. Raises OSError, or BadWeights as `decode`."""
         return decode(path.read_bytes(), robot)
 
 
 def encode(robot: RobotWithTask, layers: Layers, version: int, noise: float = 0.0) -> bytes:
-    """The same arguments give the same bytes."""
+    """Return the bytes of a policy's file, which depend on nothing but the arguments."""
     tensors = {}
     for number, (weight, bias) in enumerate(layers):
         tensors[f"layers.{number}.weight"] = np.ascontiguousarray(weight, np.float32)
         tensors[f"layers.{number}.bias"] = np.ascontiguousarray(bias, np.float32)
     about = {"robot": robot.name, "layout": robot.learning_layout(), "version": version, "noise": noise}
-    # One entry: the order of several would change from call to call.
+    # One entry: safetensors does not keep the order of several.
     return safetensors.numpy.save(tensors, {"policy": json.dumps(about, sort_keys=True)})
 
 
 def decode(data: bytes, robot: RobotWithTask | None = None) -> MLP:
-    """The policy in `data`; `robot` is the one it must be for, else the one that it names.
+    """Return the policy in the bytes of a file.
+
+    Args:
+        robot: the robot of the policy. None: the shipped robot that the file names.
 
     Raises:
-        BadWeights: it is not one.
+        BadWeights: the bytes are not a policy, or a policy of another robot.
     """
     try:
         read: Any = safetensors.deserialize  # Any: it comes without types
@@ -144,22 +146,20 @@ def _robot(about: Any, robot: RobotWithTask | None) -> RobotWithTask:
     if not isinstance(about, dict) or not isinstance(about.get("robot"), str):
         raise BadWeights("robot: missing")
     if robot is None:
-        if (
-            about["robot"].removesuffix(REAL_TIME_SUFFIX) not in shipped_robots()
-        ):  # the name is from outside: no path is read
+        if about["robot"].removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():  # an untrusted name is never a path
             raise BadWeights(f"robot: unknown, {about['robot']!r}")
         robot = robot_with_task(about["robot"])
     if about["robot"] != robot.name:
-        raise BadWeights(f"robot: of {about['robot']!r} where {robot.name!r} is meant")
+        raise BadWeights(f"robot: {about['robot']!r}, not {robot.name!r}")
     if not robot.accepts_learning_layout(about.get("layout")):
-        raise BadWeights(f"layout: {about.get('layout')!r} where {robot.name} has {robot.learning_layout()!r}")
+        raise BadWeights(f"layout: {about.get('layout')!r}, but {robot.name} has {robot.learning_layout()!r}")
     return robot
 
 
 def _array(entries: dict[str, Any], name: str) -> Matrix:
     entry = entries[name]
     if entry["dtype"] != "F32":
-        raise BadWeights(f"{name}: {entry['dtype']} where F32 belongs")
+        raise BadWeights(f"{name}: {entry['dtype']}, not F32")
     array: Matrix = np.frombuffer(entry["data"], np.float32).reshape(entry["shape"])
     return array
 

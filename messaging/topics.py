@@ -1,9 +1,8 @@
-"""THE table of what crosses the bus: key, message, delivery, rate, who may publish, who may listen, is it recorded?
+"""THE table of topics: key, message, delivery, rate, roles that publish and subscribe, and whether it is recorded.
 
-`{robot}` and `{source}` in a key are filled in by the publisher and are wildcards for a subscriber. Who asks a query
-publishes it, and who listens answers; the answer is a message too. Liveness follows from `rate`: three periods without
-a message is stale. Where processes have keys, their routers let nothing pass that is not in this table
-(messaging/bus/access_control.py).
+A publisher fills in `{robot}` and `{source}` in a key; for a subscriber they are wildcards. The publisher of a query
+asks it, and a subscriber answers it with another message. With keys, the routers of a bus let nothing pass that is not
+in this table (messaging/bus/access_control.py).
 """
 
 from __future__ import annotations
@@ -15,54 +14,56 @@ from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
 
-# What a process is to the others. A name begins with its role: "actor-7", "learner-ground", "safety".
+# The name of a process begins with its role: "actor-7", "learner-ground", "safety".
 ROLES = (
     *("safety", "learner", "actor", "recorder", "certify", "feeder", "launcher", "router"),
-    "viewer",  # looks on: watch, status
-    "client",  # a program that asks the safety service, and does nothing else
+    "viewer",  # shows a run: watch, status
+    "client",  # a program that only asks the safety service
 )
-RECORDERS = ("recorder", "launcher", "viewer")  # they may hear all that is recorded
+RECORDERS = ("recorder", "launcher", "viewer")  # may subscribe to all recorded topics
 
 
 class Delivery(Enum):
-    """What happens when a receiver does not keep up."""
+    """What happens if a receiver is too slow."""
 
-    DROP = "drop"  # the newest wins: telemetry
-    BLOCK = "block"  # nothing is lost while both ends live: steps, under explicit flow control
-    QUERY = "query"  # a question with a deadline
+    DROP = "drop"  # it misses the oldest messages: telemetry
+    BLOCK = "block"  # the publisher waits, and no message is lost: steps, under explicit flow control
+    QUERY = "query"  # a query with a deadline
 
 
 @dataclass(frozen=True)
 class Topic:
+    """A row of the table."""
+
     name: str
-    key: str  # under the run's prefix
+    key: str  # without the prefix of the bus
     message: type[Message]
     delivery: Delivery
-    rate: float | None  # Hz, the least to be expected while the publisher lives; None: on occasion
+    rate: float | None  # least rate while the publisher lives [Hz]; None: irregular
     publishers: tuple[str, ...]  # roles
-    subscribers: tuple[str, ...]  # roles, besides `RECORDERS` if it is recorded
+    subscribers: tuple[str, ...]  # roles, in addition to `RECORDERS` for a recorded topic
     recorded: bool
-    answer: type[Message] | None = None  # of a query
-    largest: int = 2**20  # bytes of a message: what is larger is passed over
-    own: bool = True  # `{source}` is the publisher's own name, or begins with it and a dot; else it may be any
+    answer: type[Message] | None = None  # to a query
+    largest: int = 2**20  # bytes; larger messages are rejected
+    own: bool = True  # `{source}` must be the publisher's name, or begin with the name and a dot
 
     @property
     def stale_after(self) -> float | None:
-        """Seconds without a message after which the publisher counts as gone."""
+        """Time without a message after which the publisher counts as gone: three periods [s]."""
         return None if self.rate is None else 3.0 / self.rate
 
     @property
     def listeners(self) -> tuple[str, ...]:
-        """Roles that may hear it."""
+        """Roles that may subscribe."""
         return tuple(dict.fromkeys((*self.subscribers, *(RECORDERS if self.recorded else ()))))
 
     def at(self, **names: str) -> str:
-        """The key with its names filled in; a wildcard where none is given."""
+        """Return the key with its names filled in; a missing name becomes a wildcard."""
         fields = {"robot": "*", "source": "*"} | names
         return self.key.format(**fields)
 
 
-FILE = 2**26  # bytes: a message that carries one
+FILE = 2**26  # largest message with a file [bytes]
 BLOCK, DROP, QUERY = Delivery.BLOCK, Delivery.DROP, Delivery.QUERY
 # fmt: off
 DECIDE = Topic("decide", "safety/{robot}/decide", pb.RequestBatch, QUERY, None, ("actor", "client"), ("safety",), False,

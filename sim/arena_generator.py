@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from brakeline.errors import NoArena, UnknownArena
+from brakeline.errors import NoArena, UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
@@ -27,11 +27,11 @@ MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the 
 
 
 def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
-    """Return the kind of a robot's arena. Raises UnknownArena: the robot has no arena of this name."""
+    """Return the kind of a robot's arena. Raises UnknownName: the robot has no arena of this name."""
     kinds = robot.task.arenas
     if name not in kinds:
         names = ", ".join(sorted(kinds)) or "none"
-        raise UnknownArena(f"no arena is called {name!r}; there are: {names} ({robot.kind})")
+        raise UnknownName(f"no arena is called {name!r}; there are: {names} ({robot.kind})")
     return kinds[name]
 
 
@@ -39,7 +39,7 @@ def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Are
     """Draw an arena in which a robot can get from start to goal.
 
     Raises:
-        UnknownArena: the robot has no arena of this name.
+        UnknownName: the robot has no arena of this name.
         NoArena: no draw has a path from start to goal.
     """
     kind = arena_kind(robot, name)
@@ -62,7 +62,7 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
     """Draw one arena for several robots, each with its own start and goal.
 
     Raises:
-        UnknownArena: the robot has no arena of this name.
+        UnknownName: the robot has no arena of this name.
         NoArena: no draw has room for so many robots.
     """
     kind = arena_kind(robot, name)
@@ -130,7 +130,7 @@ def goal_sequence(arena: Arena, goals: int, rng: np.random.Generator, robot: Rob
     """Return the same arena with one goal after another: each start is the goal before.
 
     Raises:
-        UnknownArena: the robot has no arena of this name.
+        UnknownName: the robot has no arena of this name.
         NoArena: no path leads to further goals.
     """
     kind, stages, start = arena_kind(robot, arena.name), list[Arena](), arena.start[: arena.dim]

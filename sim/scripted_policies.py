@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.errors import UnknownPolicy
+from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import Array, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
@@ -29,12 +29,12 @@ def scripted(name: str, robot: RobotWithTask, rng: np.random.Generator) -> Polic
     """Return the scripted policy of a name in `task.policies`. It notices by itself that a new episode starts.
 
     Raises:
-        UnknownPolicy: the robot has no policy of this name.
+        UnknownName: the robot has no policy of this name.
     """
     task = robot.task
     if name not in task.policies:
         names = ", ".join(task.policies) or "none"
-        raise UnknownPolicy(f"no policy of the {robot.kind} is called {name!r}; there are: {names}")
+        raise UnknownName(f"no policy of the {robot.kind} is called {name!r}; there are: {names}")
     policy: Policy = task.code(task.policies[name])(robot, rng)
     return policy
 

@@ -30,7 +30,7 @@ def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditi
 
     Raises:
         NoFleet: the robot's kind, the arena, the size or the conditions do not allow it.
-        UnknownArena: the robot has no arena of that name.
+        UnknownName: the robot has no arena of that name.
     """
     if robot.layout() != GROUND.layout():
         raise NoFleet(f"only ground robots can share a world, not {robot.name}")

@@ -85,7 +85,7 @@ class Px4Flight:
         """Take this vehicle's place, hovering at the start of its arena.
 
         Raises:
-            Px4Error, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: PX4 does not answer.
+            LaunchError, MavlinkError: PX4 does not start, or does not take off; AutopilotGone: PX4 does not answer.
         """
         try:
             hovers = self.flies and self._stop()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.ros2.sensor_frames import PlanarPose
-from brakeline.errors import BadLaserScan
+from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
@@ -80,9 +80,9 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     n, gap = len(ranges), float(scan.angle_increment)
     limits = (scan.range_min, scan.range_max, scan.angle_min, gap, scan.time_increment)
     if not (2 <= n <= MOST_BEAMS and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST_BEAMS):
-        raise BadLaserScan(f"{n} beams, {gap:g} rad apart")
+        raise BadScan(f"{n} beams, {gap:g} rad apart")
     if not 0.0 <= scan.range_min < scan.range_max:
-        raise BadLaserScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")
+        raise BadScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")
     times = seconds(scan.header.stamp) + float(scan.time_increment) * np.arange(n)
     angles = scan.angle_min + gap * np.arange(n)
     hit = (ranges >= scan.range_min) & (ranges <= scan.range_max)  # NaN is neither

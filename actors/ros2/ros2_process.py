@@ -21,7 +21,7 @@ from brakeline.actors.ros2.command_gate import CommandGate
 from brakeline.actors.ros2.ros_clock import RosClock, RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
-from brakeline.errors import InputMissing, UnsupportedRobot
+from brakeline.errors import InputMissing, Mismatch
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
@@ -85,12 +85,12 @@ def driven(name: str) -> Robot:
 
     Raises:
         UnknownRobot: there is none.
-        UnsupportedRobot: a Twist cannot drive it, or odometry does not contain its state.
+        Mismatch: a Twist cannot drive it, or odometry does not contain its state.
     """
     robot = robot_maybe_with_task(name)
     robot = robot if robot.late else robot.in_real_time()
     if (robot.position_dim, robot.heading, robot.state_dim, robot.action_dim) != (2, 2, 5, 2):
-        raise UnsupportedRobot(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")
+        raise Mismatch(f"{robot.kind}: over ROS 2 a robot drives in the plane by speed and turn rate")
     return robot
 
 
@@ -105,7 +105,7 @@ class FilterNode:
             tap: called with every message.
 
         Raises:
-            Unreachable, BadRosName, UnknownRobot, UnsupportedRobot
+            Unreachable, BadRosName, UnknownRobot, Mismatch
         """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)

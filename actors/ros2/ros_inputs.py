@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
 from brakeline.actors.ros2.odometry import OdometryHistory
 from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, frame_name, pose_of
-from brakeline.errors import BadLaserScan, InputMissing
+from brakeline.errors import BadScan, InputMissing
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
@@ -113,7 +113,7 @@ class RosInputs:
         try:
             frame = headline(message.header.frame_id, LONGEST_FRAME)
             scan, bad = (read(message, self.settings.zero_is_free), frame), ""
-        except BadLaserScan as error:
+        except BadScan as error:
             scan, bad = None, str(error)
         with self._lock:
             self._scan, self._bad_scan = scan or self._scan, bad

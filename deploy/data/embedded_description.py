@@ -21,7 +21,7 @@ def read_embedded_description(path: Path, name: str) -> str:
 
     Raises:
         NoSource: the log contains no description, or several and none with this name.
-        NoLog, NotALog: the file does not exist, or is not a log.
+        LogError: the file does not exist, or is not a log.
     """
     log = open_log(path)
     for _ in log:

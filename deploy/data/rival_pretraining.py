@@ -64,7 +64,7 @@ def pretrain(robot: RobotWithTask, recipe: ModelConfig, each: Each = lambda: Non
     """Record rollouts, fit the networks, and store the cost in `about`. Call `each` after every step.
 
     Raises:
-        TooFew: there are too few samples.
+        BadData: there are too few samples.
         ValueError: the robot has no simulator.
     """
     started = time.perf_counter()

@@ -32,7 +32,7 @@ def from_log(path: Path, robot: Robot, last: int) -> Recorded:
 
     Raises:
         BadData: the log holds too few steps of the robot.
-        NoLog, NotALog: the file does not exist, or is not a log.
+        LogError: the file does not exist, or is not a log.
     """
     steps: deque[pb.Step] = deque(maxlen=last)
     for record in read(path):

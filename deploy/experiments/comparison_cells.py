@@ -27,7 +27,7 @@ from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, run_trial
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, policy_named
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.errors import FigureMismatch
+from brakeline.errors import ResultError
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.report import analyse
@@ -102,7 +102,7 @@ class CellConfig:
         """Train, evaluate, and check the figures against the logs. Logs and policy stay in `folder`.
 
         Raises:
-            FigureMismatch: a log does not agree with the figures.
+            ResultError: a log does not agree with the figures.
         """
         return _CellRun(self, folder, say).result()
 
@@ -198,15 +198,15 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
 
 
 def _checked(table: EpisodeTable, log_file: Path) -> dict[str, Any]:
-    """Return the counted figures and those of the log. Raises FigureMismatch if they disagree."""
+    """Return the counted figures and those of the log. Raises ResultError if they disagree."""
     columns, logged = table.columns(), analyse(log_file)
     counted = {"steps": table.decisions, "episodes": len(table.rows)}
     counted |= {name: int(sum(columns[column])) for name, column in COUNTED.items()}
     for name, count in counted.items():
         if logged[name] != count:
-            raise FigureMismatch(f"{log_file} has {logged[name]} {name}, but the run counted {count}")
+            raise ResultError(f"{log_file} has {logged[name]} {name}, but the run counted {count}")
     if logged["collisions"] < sum(columns["collision"]):
-        raise FigureMismatch(f"{log_file} has {logged['collisions']} collisions, but the run counted more")
+        raise ResultError(f"{log_file} has {logged['collisions']} collisions, but the run counted more")
     return {
         "episodes": columns,
         "decision_ms": table.decision_ms(),

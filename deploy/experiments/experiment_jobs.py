@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from brakeline.deploy.interpreter import end_with_parent, spawning
-from brakeline.errors import StaleResultError
+from brakeline.errors import ResultError
 from brakeline.messaging.atomic_files import write_atomically
 
 LONGEST_LINE = 500  # characters per progress message
@@ -55,7 +55,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     """Return the stored result of a job, or None if there is none.
 
     Raises:
-        StaleResultError: the result was made with other settings; the message names them.
+        ResultError: the result was made with other settings; the message names them.
     """
     path = result_path(results, job)
     if not path.exists():
@@ -64,7 +64,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     stored, current = result.get("study", {}), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
-        raise StaleResultError(
+        raise ResultError(
             f"{path} was made with another {', '.join(differing)}: move it away, or run again with --again"
         )
     return result
@@ -93,7 +93,7 @@ def complete(
         say: called with a job's name and its progress.
 
     Raises:
-        StaleResultError: a result was made with other settings; raised before any job runs.
+        ResultError: a result was made with other settings; raised before any job runs.
         Any exception of a job, after the jobs that already run have ended.
     """
     if again:

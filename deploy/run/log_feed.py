@@ -77,7 +77,7 @@ def count(logs: Sequence[str], robot: RobotWithTask) -> int:
     """Count the steps of a robot kind that a learner can use from these logs.
 
     Raises:
-        NoLog, NotALog: a path is no log.
+        LogError: a path is no log.
         ValueError: the logs have no steps of this robot.
     """
     total = sum(1 for _ in LoggedSteps(logs, robot))
@@ -106,7 +106,7 @@ def main(settings: FeederSettings) -> bool:
 
     Raises:
         RefusedByLearner: the learner does not accept the actors of the log.
-        NoLog, NotALog: a path is no log.
+        LogError: a path is no log.
     """
     with Process(settings.bus, settings.name) as process:
         return _feed(process, settings)

@@ -68,7 +68,7 @@ def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda veh
         on_start: is called when PX4 has answered for the first time.
 
     Raises:
-        Px4Error: PX4 is not in the folder or does not start.
+        LaunchError: PX4 is not in the folder or does not start.
         AutopilotGone: PX4 fell silent.
         ValueError: the URL is not on this machine.
     """

@@ -21,7 +21,7 @@ from google.protobuf.message import Message
 
 from brakeline.deploy.data.data_paths import data_root
 from brakeline.deploy.experiments.evaluate import asking
-from brakeline.errors import ReplayError
+from brakeline.errors import LogError
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.reader import Log, Paths, open_log
@@ -60,7 +60,7 @@ class Archive:
         """Return the method that was in use.
 
         Raises:
-            ReplayError: its model is nowhere.
+            LogError: its model is nowhere.
             BadModel: its file is damaged or has another layout.
         """
         if version not in self.methods:
@@ -75,7 +75,7 @@ class Archive:
             path = root / robot / "models" / f"{version}.safetensors"
             if version.isalnum() and path.exists():
                 return load(path)
-        raise ReplayError(f"model {version} of {robot} is not in the log: copy its file to ROBOT/models/ beside it")
+        raise LogError(f"model {version} of {robot} is not in the log: copy its file to ROBOT/models/ beside it")
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
 
     Raises:
         NoLog, NotALog: the paths are no log.
-        ReplayError, BadModel: a model that was in use is missing or damaged.
+        LogError, BadModel: a model that was in use is missing or damaged.
     """
     log = open_log(paths)
     archive, models, result = Archive(log), ModelRegistry(), Comparison()
@@ -232,7 +232,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
             if instead is not None:
                 robot = log.robots.named(request.robot)
                 if robot is None:
-                    raise ReplayError(f"{request.robot!r} is neither in the log nor a robot of the program")
+                    raise LogError(f"{request.robot!r} is neither in the log nor a robot of the program")
                 _put_to_use(models, request, instead(robot))
                 if request.model not in ("", UNVERIFIED):
                     request.model = models.filters[request.robot].version

@@ -85,7 +85,7 @@ class Bridge:
     """One robot in one arena, as a ROS node."""
 
     def __init__(self, settings: BridgeSettings, tap: MessageTap | None = None) -> None:
-        """Raises Unreachable, UnknownArena.
+        """Raises Unreachable, UnknownName.
 
         tap: records each received and sent message.
         """

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from brakeline.errors import Crowded
+from brakeline.errors import Implausible
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.foxglove_scene import half_width
@@ -157,7 +157,7 @@ class Dashboard:
         """Add one message. A message of an unknown robot is ignored.
 
         Raises:
-            Malformed, Crowded, ValueError: the page cannot show the message.
+            Malformed, Implausible, ValueError: the page cannot show the message.
         """
         message = sample.message()
         with self._lock:
@@ -181,7 +181,7 @@ class Dashboard:
                 return
             panel = RobotPanel(robot, message.actor)
             if len(self._panels) == MOST_PANELS:
-                raise Crowded(f"{message.actor} cannot be shown: the page shows at most {MOST_PANELS} robots")
+                raise Implausible(f"{message.actor} cannot be shown: the page shows at most {MOST_PANELS} robots")
             self._panels[message.actor] = panel
         if isinstance(message, pb.Episode):
             panel.begin(message)

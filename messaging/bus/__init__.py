@@ -1,7 +1,7 @@
-"""The bus: publishers, subscribers, questions and answers, and who is alive, over Zenoh.
+"""The bus: publishers, subscribers, queries and liveliness, over Zenoh.
 
-A process that is given `listen` is a router; the others are clients of one of the `connect` endpoints. With keys all
-show who they are, and the router lets each say and hear what the table of topics grants it.
+A process with `listen` endpoints is a router; other processes are clients of one of the `connect` endpoints. With keys,
+all processes authenticate themselves, and the router lets each one publish and receive what the table of topics grants.
 """
 
 from brakeline.errors import BadKeys, BusError, Busy, Expired, Insecure, Late, Malformed, NoReply, Refused, Unreachable

@@ -1,7 +1,7 @@
-"""Who may say and hear what, as a router's access-control list: the table of topics, and nothing else, is let through.
+"""A router's access-control list, made from the table of topics.
 
-Zenoh looks at each message that comes from a link (ingress) or is about to leave on one (egress), and tells by the
-certificate at the other end whose link it is. What a router's own process says does not cross a link and is not judged.
+Zenoh checks each message that arrives on a link (ingress) or leaves on one (egress). The certificate at the other end
+identifies the process. Messages of the router's own process cross no link, and are not checked.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 
 from brakeline.messaging.bus.identity import role_of
 from brakeline.messaging.bus.topic_keys import own_key
-from brakeline.messaging.topics import HEALTH, TOPICS, Delivery, Topic
+from brakeline.messaging.topics import HEALTH, TOPICS, Delivery
 
-ALIVE = "alive/{source}"  # key of the token of each process that lives
+ALIVE = "alive/{source}"  # key of the liveliness token of a process
 EVERYTHING = (
     *("put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"),
     *("liveliness_token", "declare_liveliness_subscriber", "liveliness_query"),
@@ -24,7 +24,7 @@ Grant = tuple[str, tuple[str, ...], str]  # flow, messages, key expression
 
 
 def access(names: Iterable[str], prefix: str) -> dict[str, Any]:
-    """Zenoh's `access_control` for certificates of these names: default deny, one policy a name.
+    """Return Zenoh's setting `access_control` for certificates with these names. It denies what it does not grant.
 
     Raises:
         ValueError: a name has no role.
@@ -48,39 +48,35 @@ def access(names: Iterable[str], prefix: str) -> dict[str, Any]:
 
 
 def grants(name: str, prefix: str) -> list[Grant]:
-    """What a process of that name may say and hear."""
+    """Return the messages that a process of this name may send and receive."""
     role = role_of(name)
-    if role == "router":  # it judges by a list of its own, and what it passes on is others'
+    if role == "router":  # it has an access-control list of its own, and forwards messages of others
         return [(flow, EVERYTHING, f"{prefix}/**") for flow in (INGRESS, EGRESS)]
-    found: list[Grant] = []
+    granted: list[Grant] = []
     for topic in TOPICS:
         everywhere = f"{prefix}/{topic.at()}"
-        question = topic.delivery is Delivery.QUERY
-        if role in topic.publishers and question:
+        query = topic.delivery is Delivery.QUERY
+        if role in topic.publishers and query:
             for key in (everywhere, own_key(everywhere, "*")):
-                found += [(INGRESS, ("query",), key), (EGRESS, ("reply", "declare_queryable"), key)]
+                granted += [(INGRESS, ("query",), key), (EGRESS, ("reply", "declare_queryable"), key)]
         elif role in topic.publishers:
-            found += [(INGRESS, ("put",), key) for key in _published(topic, name, prefix)]
-            found.append((EGRESS, ("declare_subscriber",), everywhere))
-        if role in topic.listeners and question:
+            keys = _own(topic.key, name) if topic.own else [topic.key.format(robot="*", source="*")]
+            granted += [(INGRESS, ("put",), f"{prefix}/{key}") for key in keys]
+            granted.append((EGRESS, ("declare_subscriber",), everywhere))
+        if role in topic.listeners and query:
             for key in (everywhere, own_key(everywhere, "*")):
-                found += [(INGRESS, ("declare_queryable", "reply"), key), (EGRESS, ("query",), key)]
+                granted += [(INGRESS, ("declare_queryable", "reply"), key), (EGRESS, ("query",), key)]
         elif role in topic.listeners:
-            found += [(INGRESS, ("declare_subscriber",), everywhere), (EGRESS, ("put",), everywhere)]
-    found += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name)]
-    if role in HEALTH.listeners:  # who may hear how the others fare may know that they live
+            granted += [(INGRESS, ("declare_subscriber",), everywhere), (EGRESS, ("put",), everywhere)]
+    granted += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name)]
+    if role in HEALTH.listeners:  # they may watch which processes are alive, too
         everyone = f"{prefix}/{ALIVE.format(source='*')}"
-        found.append((INGRESS, ("declare_liveliness_subscriber", "liveliness_query"), everyone))
-        found.append((EGRESS, ("liveliness_token", "reply"), everyone))
-    return found
-
-
-def _published(topic: Topic, name: str, prefix: str) -> list[str]:
-    keys = _own(topic.key, name) if topic.own else [topic.key.format(robot="*", source="*")]
-    return [f"{prefix}/{key}" for key in keys]
+        granted.append((INGRESS, ("declare_liveliness_subscriber", "liveliness_query"), everyone))
+        granted.append((EGRESS, ("liveliness_token", "reply"), everyone))
+    return granted
 
 
 def _own(key: str, name: str) -> list[str]:
-    """A key where `{source}` is `name`, or begins with it and a dot."""
+    """Return the keys in which `{source}` is a name, or begins with the name and a dot."""
     sources = (name, f"{name}.$*") if "{source}" in key else ("",)
     return [key.format(robot="*", source=source) for source in sources]

@@ -1,4 +1,4 @@
-"""Where the bus is, and how a session of it is set up."""
+"""The settings of a bus, and how a process opens a Zenoh session with them."""
 
 from __future__ import annotations
 
@@ -15,45 +15,51 @@ from brakeline.errors import Insecure, Unreachable
 from brakeline.messaging.bus.access_control import access
 from brakeline.messaging.bus.identity import names_in, tls
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # s between two attempts to find a router
-SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # where in Zenoh's source an error arose
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # between two attempts to connect to a router [s]
+SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # the place in Zenoh's source in an error message
 
 
 @dataclass(frozen=True)
 class BusSettings:
-    """Where the bus is. Endpoints are written as Zenoh writes them: `tcp/127.0.0.1:7447`, `unixsock-stream//tmp/bus`.
+    """The endpoints of a bus in Zenoh's form, such as `tcp/127.0.0.1:7447` or `unixsock-stream//tmp/bus`.
 
-    A client takes the first of `connect` that answers. `patience` is how long it waits for one at the start;
-    once connected it reconnects by itself for ever. A peer that is silent for `lease` counts as gone.
+    With `keys`, all endpoints are `tls/HOST:PORT`, both ends of a link authenticate themselves, and a router enforces
+    the table of topics. Without keys, a bus that other machines can reach does not start, unless it is `insecure`.
 
-    With `keys`, a folder (messaging/bus/certificate_authority.py), all endpoints are `tls/HOST:PORT`, both ends show
-    who they are,
-    and a router lets through what the table of topics says. Without, a bus that others than this machine reach does
-    not start, unless it is `insecure` on purpose.
+    Attributes:
+        connect: endpoints of routers. A client uses the first one that answers, and reconnects by itself later.
+        listen: endpoints at which the process is a router.
+        patience: time to wait for a router at the start [s].
+        lease: time after which a silent peer counts as gone [s].
+        stall: time for which a publisher waits for a receiver that reads nothing, before it closes the link [s].
+        keys: folder with the keys (messaging/bus/certificate_authority.py).
+        metrics: PORT or HOST:PORT at which the process serves its metrics; empty: it serves none.
     """
 
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     prefix: str = "brakeline"
-    patience: float = 10.0  # s
-    lease: float = 1.5  # s
-    stall: float = 1.0  # s, the longest a publisher waits for a receiver that does not drain, before the link is closed
+    patience: float = 10.0
+    lease: float = 1.5
+    stall: float = 1.0
     keys: Path | None = None
     insecure: bool = False
-    metrics: str = ""  # PORT or HOST:PORT at which a process serves its metrics; empty: nowhere
+    metrics: str = ""
 
     @property
     def warning(self) -> str:
-        """What is to be said aloud: nobody on these endpoints shows who it is, and others reach them; else empty."""
+        """A warning if other machines can reach the endpoints without authentication; otherwise empty."""
         open_to_others = [endpoint for endpoint in (*self.listen, *self.connect) if not local(endpoint)]
         if self.keys is not None or not open_to_others:
             return ""
         return f"INSECURE: no keys at {', '.join(open_to_others)}; whoever reaches it can command the robots"
 
     def check(self) -> None:
-        """Raises:
-        ValueError: neither `connect` nor `listen` is given, or the endpoints do not go with the keys.
-        Insecure: others than this machine could connect, and there are no keys.
+        """Check the settings.
+
+        Raises:
+            ValueError: there is no endpoint, or an endpoint needs keys and there are none, or the reverse.
+            Insecure: other machines could connect, and there are no keys.
         """
         endpoints = (*self.connect, *self.listen)
         if not endpoints:
@@ -70,9 +76,9 @@ class BusSettings:
 
 
 def local(endpoint: str) -> bool:
-    """Is it within this machine?"""
+    """Return whether an endpoint is within this machine."""
     protocol, _, address = endpoint.partition("/")
-    if protocol.startswith("unix") or not address:  # a file's name, or no endpoint at all
+    if protocol.startswith("unix") or not address:  # the name of a file, or no endpoint
         return True
     host = address.split("#")[0].rpartition(":")[0].strip("[]")
     try:
@@ -82,11 +88,11 @@ def local(endpoint: str) -> bool:
 
 
 def configuration(settings: BusSettings, source: str) -> zenoh.Config:
-    """The Zenoh configuration of one session of the process `source`.
+    """Return the Zenoh configuration of a session of the process `source`.
 
     Raises:
-        ValueError, Insecure: as `BusSettings.check` says.
-        BadKeys: there are no keys of this process, or none that it can listen with.
+        ValueError, Insecure: see `BusSettings.check`.
+        BadKeys: the process has no keys, or none to listen with.
     """
     settings.check()
     client = not settings.listen
@@ -94,13 +100,13 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         "mode": "client" if client else "router",
         "connect/endpoints": settings.connect,
         "connect/exit_on_failure": client,
-        # Of a client 0: each endpoint once, and `open_session` does it again; else it goes on with the first alone.
+        # With 0 a client tries each endpoint once, and `open_session` repeats; otherwise Zenoh retries only the first.
         "connect/timeout_ms": 0 if client else -1,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
         "listen/endpoints": settings.listen,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # With it, queries were lost silently when a receiver stalled.
+        # With shared memory, queries were lost silently when a receiver stalled.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": int(settings.lease * 1e3),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": int(settings.stall * 1e6),
@@ -118,9 +124,11 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
 
 
 def open_session(settings: BusSettings, source: str) -> zenoh.Session:
-    """Raises:
-    Unreachable: no router answered, or an endpoint cannot be listened on.
-    ValueError, Insecure, BadKeys: as `configuration` says.
+    """Open a session of the process `source`.
+
+    Raises:
+        Unreachable: no router answered, or the process cannot listen on an endpoint.
+        ValueError, Insecure, BadKeys: see `configuration`.
     """
     until = time.monotonic() + (0.0 if settings.listen else settings.patience)
     pause = FIRST_PAUSE
@@ -136,7 +144,6 @@ def open_session(settings: BusSettings, source: str) -> zenoh.Session:
 
 
 def _unreachable(settings: BusSettings, error: zenoh.ZError) -> Unreachable:
-    """With what to do."""
     why = SOURCE.sub("", str(error))
     if settings.listen:
         return Unreachable(f"cannot listen on {', '.join(settings.listen)}: {why}")

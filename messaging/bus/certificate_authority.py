@@ -1,11 +1,11 @@
-"""A certificate authority of one's own, in a folder: it says who is who on the bus.
+"""A certificate authority in a folder, which certifies the processes of a bus.
 
-ca.pem            its certificate: every process has it
-ca.key            its key: with it anybody can be made anybody, so it stays away from the processes' machines
-names             whom routers let in, one a line; a name that is struck out is revoked (and is not to be used again)
-NAME.pem, .key    a process's certificate (its name is the common name) and key
+ca.pem            the certificate of the authority; every process needs it
+ca.key            the key of the authority; whoever has it can certify any name, so keep it off the processes' machines
+names             the names that routers accept, one on each line; delete a name to revoke it, and never use it again
+NAME.pem, .key    the certificate of a process (its common name is NAME) and its key
 
-Keys are on the curve P-256, in PKCS #8 without a password, readable by their owner alone.
+Keys are on the curve P-256, in PKCS #8 without a password. Only their owner can read them.
 """
 
 from __future__ import annotations
@@ -26,19 +26,22 @@ from brakeline.errors import BadKeys
 from brakeline.messaging.atomic_files import write_atomically, write_secret
 from brakeline.messaging.bus.identity import SERVERS, certificate_file, key_file, role_of
 
-DAYS = 365  # that a certificate is valid; the authority's ten times as long
-EARLIER = datetime.timedelta(days=1)  # certificates are valid from then on: clocks differ, by hours at times
+DAYS = 365  # validity of a certificate; the authority's own certificate is valid ten times as long
+EARLIER = datetime.timedelta(days=1)  # certificates are valid from that time before now, since clocks differ
 HERE = ("localhost", "127.0.0.1", "::1")
 
 
 class Authority:
-    """The authority in `folder`, which is made if there is none yet."""
+    """The authority in a folder."""
 
     def __init__(self, folder: Path, days: int = DAYS) -> None:
-        """days: that the certificates are valid which it is going to issue.
+        """Read the authority, or create it if the folder has none.
+
+        Args:
+            days: validity of the certificates that it issues.
 
         Raises:
-            BadKeys: there is a certificate of one in the folder, but not its key.
+            BadKeys: the folder has the certificate of an authority, but not its key.
         """
         self.folder, self.days = folder, days
         if (folder / "ca.pem").exists():
@@ -51,15 +54,16 @@ class Authority:
                 raise BadKeys(f"{folder}/ca.key is no key on an elliptic curve")
             self._key = key
         else:
-            self._key, self._certificate = self._founded()
+            self._key, self._certificate = self._create()
 
     def issue(self, name: str, hosts: Iterable[str] = ()) -> None:
-        """A certificate and a key for a process, in place of those it may have had; its name goes on the list.
+        """Write a new certificate and key for a process, and add its name to the list.
 
-        hosts: names and addresses at which others reach it, besides this machine's, if it may be a router.
+        Args:
+            hosts: names and addresses of a router besides those of this machine.
 
         Raises:
-            ValueError: the name begins with no role.
+            ValueError: the name does not begin with a role.
         """
         role = role_of(name)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -67,7 +71,7 @@ class Authority:
             uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         key = ec.generate_private_key(ec.SECP256R1())
         builder = (
-            self._begun(name, key, self.days)
+            self._builder(name, key, self.days)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
         )
@@ -81,15 +85,15 @@ class Authority:
         names = listed.read_text().split() if listed.exists() else []
         write_atomically(listed, "".join(f"{n}\n" for n in dict.fromkeys((*names, name))).encode())
 
-    def _founded(self) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-        """A new authority, written down."""
+    def _create(self) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+        """Create an authority, and write its files."""
         self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         signs = dict.fromkeys(
             ("digital_signature", "content_commitment", "key_encipherment", "data_encipherment"), False
         ) | dict.fromkeys(("key_agreement", "encipher_only", "decipher_only"), False)
         certificate = (
-            self._begun("brakeline", key, 10 * self.days, key)
+            self._builder("brakeline", key, 10 * self.days, key)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **signs), critical=True)
             .sign(key, hashes.SHA256())
@@ -98,10 +102,10 @@ class Authority:
         write_atomically(self.folder / "ca.pem", certificate.public_bytes(Encoding.PEM))
         return key, certificate
 
-    def _begun(
+    def _builder(
         self, name: str, key: ec.EllipticCurvePrivateKey, days: int, issuer: ec.EllipticCurvePrivateKey | None = None
     ) -> x509.CertificateBuilder:
-        """A certificate of a name and a key; issuer: itself, where given."""
+        """Return a builder of a certificate; with `issuer`, the certificate is signed by its own key."""
         now = datetime.datetime.now(datetime.UTC)
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         return (

@@ -1,6 +1,4 @@
-"""Who a process is to the others: its certificate, from a folder of keys (messaging/bus/certificate_authority.py
-makes one).
-"""
+"""The identity of a process: its name, role and certificate in a folder of keys (`certificate_authority`)."""
 
 from __future__ import annotations
 
@@ -9,14 +7,14 @@ from pathlib import Path
 from brakeline.errors import BadKeys
 from brakeline.messaging.topics import ROLES
 
-SERVERS = ("safety", "launcher", "router")  # roles that may be a router; others' certificates are a client's only
+SERVERS = ("safety", "launcher", "router")  # roles that may be routers; other certificates are for clients only
 
 
 def role_of(name: str) -> str:
-    """What a process of that name is: the name up to its first hyphen or dot.
+    """Return the role of a process: its name up to the first hyphen or dot.
 
     Raises:
-        ValueError: no such role.
+        ValueError: there is no such role.
     """
     role = name.split(".", 1)[0].split("-", 1)[0]
     if role not in ROLES:
@@ -25,20 +23,22 @@ def role_of(name: str) -> str:
 
 
 def certified_name(source: str) -> str:
-    """The name on the certificate of a process called `source`: one certificate serves NAME and all of NAME.MORE."""
+    """Return the name on the certificate of a process: one certificate serves NAME and all NAME.MORE."""
     return source.split(".", 1)[0]
 
 
 def certificate_file(folder: Path, name: str) -> Path:
+    """Return the path of a certificate."""
     return folder / f"{name}.pem"
 
 
 def key_file(folder: Path, name: str) -> Path:
+    """Return the path of a key."""
     return folder / f"{name}.key"
 
 
 def names_in(folder: Path) -> tuple[str, ...]:
-    """Whom a router with these keys lets in.
+    """Return the names that a router with these keys accepts.
 
     Raises:
         BadKeys: there is no list, or a name on it has no role.
@@ -48,16 +48,20 @@ def names_in(folder: Path) -> tuple[str, ...]:
         for name in names:
             role_of(name)
     except (OSError, ValueError) as error:
-        raise BadKeys(f"{folder / 'names'} is no list of whom to let in: {error}") from error
+        raise BadKeys(f"{folder / 'names'} is no list of the names to accept: {error}") from error
     return names
 
 
 def tls(folder: Path, source: str, listens: bool) -> dict[str, object]:
-    """Zenoh's settings for mutual TLS under the certificate of `source`: nobody without one of our authority's gets in,
-    and nobody else is believed to be a router.
+    """Return Zenoh's settings for mutual TLS: both ends of a link need a certificate of the authority.
+
+    Args:
+        folder: the keys.
+        source: name of the process.
+        listens: whether the process is a router.
 
     Raises:
-        BadKeys: a file is missing, or it listens with a certificate that is a client's only.
+        BadKeys: a file is missing, or a router has a certificate for clients only.
     """
     name = certified_name(source)
     try:

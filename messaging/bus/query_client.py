@@ -1,4 +1,4 @@
-"""Who asks: all that serve at first, and then whoever answered first, by itself, for as long as it does."""
+"""Ask queries: the first one goes to all services, and the next ones to the service that answered first."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.topic_keys import own_key
 
-RENEWED = 30.0  # s after which all are asked again: there may be more of them by now, or one that is less busy
-HELD = 1.0  # s for which who was late is asked again: if all are late, to ask all each time makes them later
-AGAIN = 0.1  # of the deadline: all are asked when one is known to be gone before that
-PATIENT = 1.0  # s of a deadline from which on a busy link is waited for: before that, question or answer is dropped
+RENEWED = 30.0  # time after which all services are asked again, as there may be a new or a less busy one [s]
+HELD = 1.0  # time for which a late service keeps its place [s]: asking all makes all of them later
+AGAIN = 0.1  # share of the deadline within which all are asked if the chosen service is gone
+PATIENT = 1.0  # deadline from which a query waits for a busy link instead of being dropped [s]
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Who answered first, and since when (time.monotonic) it alone is asked."""
+    """The service that answered first, and since when (time.monotonic) queries go to it alone."""
 
     key: str
     since: float
 
     @property
     def age(self) -> float:
+        """Time since the service was chosen [s]."""
         return time.monotonic() - self.since
 
 
 class QueryClient:
-    """A session's questions. With Zenoh's own choice (BEST_MATCHING) each goes to a replica of every linked router."""
+    """Asks the queries of a session. Zenoh's target BEST_MATCHING would ask one replica at every linked router."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
@@ -41,7 +42,7 @@ class QueryClient:
         self._chosen: dict[str, _Chosen] = {}
 
     def ask(self, key: str, payload: bytes, timeout: float) -> bytes:
-        """The answer of one that serves `key`, within `timeout` s; errors as `Bus.ask` says."""
+        """Return the answer of a service at `key`. See `Bus.ask`."""
         begun = time.monotonic()
         chosen = self._chosen.get(key)
         if chosen is not None and chosen.age < RENEWED:
@@ -53,12 +54,12 @@ class QueryClient:
         return self._answer(key, key, payload, timeout)
 
     def _answer(self, key: str, at: str, payload: bytes, timeout: float) -> bytes:
-        """Of whom a question reaches `at` (the shared key or one's own); who answered to all is chosen."""
+        """Ask the services at `at`: the shared key, which chooses the first one that answers, or the chosen one's."""
         refusal: Refused | None = None
         late, begun = False, time.monotonic()
         with as_bus_error(f"cannot ask {key}"):
             querier = self._querier(at, timeout)
-            source = zenoh.SourceInfo(querier.id, 0)  # whose turn it is
+            source = zenoh.SourceInfo(querier.id, 0)  # for the server's fair queue
             for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}", source_info=source):
                 if reply.ok is not None:
                     if at == key and reply.replier_id is not None:
@@ -67,12 +68,12 @@ class QueryClient:
                 assert reply.err is not None
                 if reply.err.encoding == zenoh.Encoding.APPLICATION_PROTOBUF:
                     refusal = Refused(pb.Error.FromString(reply.err.payload.to_bytes()))
-                else:  # Zenoh's own error reply: its timer ran out
+                else:  # Zenoh's own error: its timer ran out
                     late = True
         self._forget(key, HELD if late or refusal is not None else 0.0)
-        if refusal is not None:  # it may be busy
+        if refusal is not None:  # the service may be busy
             raise refusal
-        if late or time.monotonic() - begun >= timeout:  # a busy Zenoh may end a question without its timer's reply
+        if late or time.monotonic() - begun >= timeout:  # a busy Zenoh may end a query without the error of its timer
             raise Late(f"no answer to {key} within {timeout * 1e3:.0f} ms")
         raise NoReply(f"nobody answers {key}: is the service running, and on the same bus?")
 
@@ -83,7 +84,7 @@ class QueryClient:
             self._chosen[key] = _Chosen(own, time.monotonic())
 
     def _forget(self, key: str, held: float) -> None:
-        """Who was chosen, unless it was so within `held` s."""
+        """Forget the chosen service, unless it was chosen within the last `held` seconds."""
         with self._lock:
             if (chosen := self._chosen.get(key)) is not None and chosen.age >= held:
                 del self._chosen[key]
@@ -99,15 +100,15 @@ class QueryClient:
                 self._queriers[key, timeout] = self._session.declare_querier(
                     key,
                     target=zenoh.QueryTarget.ALL,
-                    consolidation=zenoh.ConsolidationMode.NONE,  # the first answer is the answer
+                    consolidation=zenoh.ConsolidationMode.NONE,  # the first answer counts
                     timeout=timeout,
                     priority=zenoh.Priority.REAL_TIME,
-                    congestion_control=_congestion(timeout),  # of the answer, too
+                    congestion_control=_congestion(timeout),  # of the answer too
                     express=True,
                 )
             return self._queriers[key, timeout]
 
 
 def _congestion(timeout: float) -> zenoh.CongestionControl:
-    """Who asks is never stalled past a short deadline, and loses nothing before a long one."""
+    """Drop at a short deadline, so that the caller never stalls; wait at a long one, so that nothing is lost."""
     return zenoh.CongestionControl.BLOCK if timeout >= PATIENT else zenoh.CongestionControl.DROP

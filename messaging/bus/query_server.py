@@ -1,4 +1,4 @@
-"""Who answers questions: each asker's in turn, none for which nobody waits any more."""
+"""Answer queries: of each client in turn, and none whose deadline has passed."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ from brakeline.messaging.bus.fair_queue import FairQueue
 from brakeline.messaging.bus.subscription import ReceiverThreads
 from brakeline.messaging.rejected_messages import RejectedMessages
 
-LONGEST = 10.0  # s that a question waits which does not say for how long it is of use
+LONGEST = 10.0  # longest time that a query waits; the default for one without a deadline [s]
 
 
 @dataclass(frozen=True)
 class PendingQuery:
-    """A query, and until when (time.monotonic) an answer is of use."""
+    """A query and its deadline (time.monotonic)."""
 
     query: zenoh.Query
     until: float
 
 
 class QueryServer(ReceiverThreads):
-    """Two threads take the questions of a receiver in turn: one notes when they come in while the other answers, and
-    whoever takes one in when nobody answers does it itself, for to wake another costs a tenth of a millisecond. Who
-    asks at another receiver waits for its turn like the others.
+    """Answers the queries of all receivers, one at a time.
 
-    How long an answer is of use stands in a question's attachment: seconds from when it was asked, as text; they count
-    from its receipt, for the clocks of two machines agree on durations only.
+    Two threads receive in turn at each receiver: one notes the time of new queries while the other one answers. The
+    thread that receives a query while no thread answers starts to answer, since waking another thread takes 0.1 ms.
+
+    The attachment of a query is its timeout in seconds, as text. It counts from the receipt, because the clocks of two
+    machines may differ.
     """
 
     def __init__(
@@ -50,40 +51,40 @@ class QueryServer(ReceiverThreads):
             runs += [run, run]
         super().__init__(name, receivers, runs)
 
-    def _take(self, questions: Any, receiving: threading.Lock) -> None:
+    def _take(self, queries: Any, receiving: threading.Lock) -> None:
         while True:
             try:
                 with receiving:
-                    query = questions.recv()
+                    query = queries.recv()
             except zenoh.ZError:  # closed
                 return
             answering = self._admit(query)
-            while answering and (question := self._next()) is not None:
+            while answering and (pending := self._next()) is not None:
                 with self._rejected.skip_on_error(self._name):
-                    self._answer(question)
+                    self._answer(pending)
 
     def _admit(self, query: zenoh.Query) -> bool:
-        """Let a question wait for its turn; True: nobody answers now."""
-        question = PendingQuery(query, time.monotonic() + _patience(query))
+        """Add a query to the queue. Return whether no thread answers now."""
+        pending = PendingQuery(query, time.monotonic() + _patience(query))
         with self._state:
-            left_out = self._turns.add(_asker(query), question)
+            left_out = self._turns.add(_client(query), pending)
             idle, self._answering = not self._answering, True
         if left_out is not None:
             with left_out.query as one:
-                self._pass_over(one, Busy("too many questions wait"))
+                self._pass_over(one, Busy("too many queries wait"))
         return idle
 
     def _next(self) -> PendingQuery | None:
-        """The question whose turn it is; None: there is none, and nobody answers any more."""
+        """Return the next query; None: the queue is empty, and this thread stops answering."""
         with self._state:
             self._answering = len(self._turns) > 0
             return self._turns.next() if self._answering else None
 
-    def _answer(self, question: PendingQuery) -> None:
-        """Answer one query; without an answer of some kind the service would look dead."""
-        with question.query as query:
-            if time.monotonic() > question.until:
-                self._pass_over(query, Expired("nobody waits for this answer any more"))
+    def _answer(self, pending: PendingQuery) -> None:
+        """Answer a query, at least with an error: without any reply, the service looks dead."""
+        with pending.query as query:
+            if time.monotonic() > pending.until:
+                self._pass_over(query, Expired("the deadline of the query has passed"))
                 return
             try:
                 answer = self._handler(query.payload.to_bytes() if query.payload else b"")
@@ -93,7 +94,7 @@ class QueryServer(ReceiverThreads):
                 raise
 
     def _pass_over(self, query: zenoh.Query, reason: Busy | Expired) -> None:
-        """That the machine does not keep up is nobody's mistake."""
+        """Refuse a query that the machine is too slow for; the log has a warning, not an error."""
         _refuse(query, reason)
         self._rejected.reject(self._name, reason, logging.WARNING)
 
@@ -103,16 +104,16 @@ def _refuse(query: zenoh.Query, error: Exception) -> None:
     query.reply_err(refusal.SerializeToString(), encoding=zenoh.Encoding.APPLICATION_PROTOBUF)
 
 
-def _asker(query: zenoh.Query) -> str:
-    """Whose turn it is: the session's; all that do not say so share one."""
+def _client(query: zenoh.Query) -> str:
+    """Return the session that asks; all sessions that do not identify themselves share one place in the queue."""
     source = query.source_info
     return "" if source is None else str(source.source_id.zid)
 
 
 def _patience(query: zenoh.Query) -> float:
-    """[s]."""
+    """Return the timeout of a query [s]."""
     try:
-        said = float(query.attachment.to_string()) if query.attachment is not None else LONGEST
+        timeout = float(query.attachment.to_string()) if query.attachment is not None else LONGEST
     except (ValueError, zenoh.ZError):
         return LONGEST
-    return said if 0.0 < said < LONGEST else LONGEST
+    return timeout if 0.0 < timeout < LONGEST else LONGEST

@@ -1,9 +1,9 @@
-"""A process's place on the bus: its publishers, subscribers, questions and answers, and who is alive, over Zenoh.
+"""A process on the bus: its publishers, subscriptions, queries and liveliness, over Zenoh.
 
-Each client holds two sessions, one for telemetry and one for queries: a full telemetry queue blocks its link's
-receiving thread, and a robot's safety query must never wait behind it.
+A client has two Zenoh sessions, one for telemetry and one for queries. A full telemetry queue blocks the receiving
+thread of its link, and a safety query must never wait for telemetry.
 
-Threads are Zenoh's, so open a bus only after a process was forked (or start processes by spawning).
+Zenoh starts threads: fork before you open a bus, or spawn processes.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from brakeline.messaging.topics import Delivery, Topic
 
 log = logging.getLogger("brakeline.bus")
 
-# Beyond FIFO the link blocks and with it the publisher; beyond RING the oldest message is dropped.
+# A full FIFO queue blocks the link and its publisher; a full RING queue drops the oldest message.
 FIFO = 16384
 RING = 64
 
 
 class Bus:
-    """A process's place on the bus, under the name `source`; it is alive to others until `close`.
+    """A process on the bus under the name `source`, alive for others until `close`.
 
-    What its handlers can't handle is passed over, and counted in `rejected`.
+    `rejected` counts the messages that the handlers cannot handle.
 
     Raises:
-        Unreachable: no router answered within `patience`, or an endpoint cannot be listened on.
-        ValueError: no endpoint, or a name that cannot be part of a key.
-        Insecure, BadKeys: no keys where there must be some, or not those of `source`.
+        Unreachable: no router answered within `patience`, or the process cannot listen on an endpoint.
+        ValueError: there is no endpoint, or the name cannot be part of a key.
+        Insecure, BadKeys: keys are necessary, or `source` has none.
     """
 
     def __init__(self, settings: BusSettings, source: str) -> None:
@@ -69,7 +69,7 @@ class Bus:
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Send what waits, say goodbye, end the handlers. Returns after `timeout` s even if the network hangs."""
+        """Send waiting messages, leave, and end the handlers; return after `timeout` [s] even if the network hangs."""
         worker = threading.Thread(target=self._close_sessions, name="bus close", daemon=True)
         worker.start()
         worker.join(timeout)
@@ -81,17 +81,20 @@ class Bus:
 
     @property
     def connected(self) -> bool:
-        """Is there a link to anybody? A client without one waits for its router to come back."""
+        """Whether there is a link. A client without one waits for its router."""
         return bool(self._telemetry.info.transports())
 
     def publisher(self, topic: Topic, **names: str) -> Publisher:
-        """The publisher of `topic`; the same one for the same key. `source` is this bus's unless given.
+        """Return the publisher of a topic, the same one for the same key.
+
+        Args:
+            names: of the key; `source` is this process by default.
 
         Raises:
             ValueError: a name is missing or unknown, or the topic is a query.
         """
         if topic.delivery is Delivery.QUERY:
-            raise ValueError(f"{topic.name} is a question: use `ask`")
+            raise ValueError(f"{topic.name} is a query: use `ask`")
         names = {"source": self.source} | names
         key = exact_key(topic, names)
         block = topic.delivery is Delivery.BLOCK
@@ -106,30 +109,30 @@ class Bus:
             return self._publishers[key]
 
     def published(self) -> dict[str, int]:
-        """Messages put so far, per key."""
+        """Return the number of messages put so far, by key."""
         with self._lock:
             return {key: publisher.count for key, publisher in self._publishers.items()}
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Listener:
-        """Call `handler` with every sample of `topic`, in a thread of its own; names left out match any.
+        """Call a handler with every sample of a topic, in a thread of its own. A missing name matches any.
 
-        A sample for which it raises is passed over, as is one with too many bytes or a key of nobody's. One that is
-        slow delays the publisher of a BLOCK topic after `FIFO` samples, and misses the oldest of a DROP topic after
-        `RING`.
+        Samples at which the handler raises an exception are rejected, as are samples that are too large or have an
+        invalid key. A slow handler delays the publisher of a BLOCK topic after `FIFO` samples, and misses the oldest
+        samples of a DROP topic after `RING`.
         """
         channel: Any = FifoChannel(FIFO) if topic.delivery is Delivery.BLOCK else RingChannel(RING)
         key = key_of(topic, names)
         receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
         listener = Listener(topic, key, receiver, self.settings.prefix, handler, self.rejected)
-        self._keep(listener)
+        self._subscriptions.append(listener)
         return listener
 
     def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> QueryServer:
-        """Answer the questions of `topic`, one at a time and every asker's in turn, in a thread of its own.
+        """Answer the queries of a topic, one at a time, of each client in turn, in a thread of its own.
 
-        What the handler raises goes back to who asked as `Refused` (with the exception's `field`, if it has one) and is
-        logged. A question whose asker waits no longer is dropped. Several processes may serve one topic: an asker's
-        questions go to the one that answered first, and to another if that one is gone or late.
+        If the handler raises an exception, the client gets it as `Refused`, with the exception's `field`. A query whose
+        deadline has passed is dropped. Several processes may serve one topic: the queries of a client go to the service
+        that answered first, and to another one if that service is gone or late.
         """
         key = key_of(topic, names)
         shared = self._full(key)
@@ -138,14 +141,17 @@ class Bus:
             for at in (own_key(shared, self._queries.zid()), shared)
         ]
         service = QueryServer(key, receivers, handler, self.rejected)
-        self._keep(service)
+        self._subscriptions.append(service)
         return service
 
     def ask(self, topic: Topic, payload: bytes, timeout: float, **names: str) -> bytes:
-        """The answer to a question, within `timeout` s.
+        """Return the answer to a query.
+
+        Args:
+            timeout: deadline [s].
 
         Raises:
-            NoReply: nobody serves it; known at once, without waiting for the deadline.
+            NoReply: there is no service. This error does not wait for the deadline.
             Late: the deadline passed.
             Refused: the service answered with an error.
             ValueError: a name is missing or unknown.
@@ -153,14 +159,14 @@ class Bus:
         return self._asker.ask(self._full(exact_key(topic, names)), payload, timeout)
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
-        """The sources that are alive now, this one included."""
+        """Return the names of the processes that are alive now, with this one."""
         replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(
             self._full(ALIVE.format(source="*")), timeout=timeout
         )
         return frozenset(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
 
     def watch(self, handler: Callable[[str, bool], None]) -> Subscription:
-        """Call `handler(source, alive)` for each source that is alive now, then whenever one comes or goes."""
+        """Call `handler(source, alive)` for each process that is alive now, and for each that comes or goes."""
         receiver = self._telemetry.liveliness().declare_subscriber(
             self._full(ALIVE.format(source="*")), FifoChannel(FIFO), history=True
         )
@@ -169,17 +175,13 @@ class Bus:
             handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
 
         watching = Subscription("alive/*", receiver, take, self.rejected)
-        self._keep(watching)
+        self._subscriptions.append(watching)
         return watching
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"
 
-    def _keep(self, receiving: ReceiverThreads) -> None:
-        with self._lock:
-            self._subscriptions.append(receiving)
-
     def _close_sessions(self) -> None:
-        closables: list[Any] = [self._queries, self._telemetry]  # Any: their stubs are untyped here
+        closables: list[Any] = [self._queries, self._telemetry]  # Any: the stubs have no types here
         for session in closables:
-            session.close()  # which undeclares all that it declared; closing twice does nothing
+            session.close()  # also undeclares; a second call does nothing

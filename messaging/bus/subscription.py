@@ -1,4 +1,4 @@
-"""Who listens, and what is heard."""
+"""Receive the samples of a topic, and check them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from brakeline.messaging.message_checks import NAME, check
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Topic
 
-MOST_KEYS = 2048  # that one subscription listens to; samples of further ones are passed over
+MOST_KEYS = 2048  # of one subscription; samples at further keys are rejected
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A message as it came from the wire."""
+    """A message as it arrived."""
 
     topic: Topic
     key: str  # without the prefix
@@ -32,10 +32,10 @@ class Sample:
     received: int  # ns since the Unix epoch
 
     def message(self) -> Any:
-        """The payload, decoded as the topic's type.
+        """Decode the payload as the topic's type.
 
         Raises:
-            Malformed: it is not one, or speaks in the name of another robot or source than its key does.
+            Malformed: the payload is invalid, or names another robot or source than the key.
         """
         try:
             message = self.topic.message.FromString(self.payload)
@@ -43,44 +43,45 @@ class Sample:
         except (DecodeError, Implausible) as error:
             raise Malformed(f"{self.key}: not a {self.topic.message.DESCRIPTOR.name}: {error}") from error
         for field, name in names_of(self.topic, self.key).items():
-            for said in _said(message, field):
-                if said not in ("", name):
-                    raise Malformed(f"{self.key}: says that its {field} is {said!r}")
+            for stated in _stated_names(message, field):
+                if stated not in ("", name):
+                    raise Malformed(f"{self.key}: says that its {field} is {stated!r}")
         return message
 
 
-def _said(message: Any, field: str) -> list[str]:
-    """What a message says of its robot or source; the router knows who may publish under which key, and no more."""
+def _stated_names(message: Any, field: str) -> list[str]:
+    """Return the names of the robot or source in a message; the router has only checked those in the key."""
     names = ("robot",) if field == "robot" else ("actor", "process")
-    said = [str(getattr(message, name)) for name in names if name in message.DESCRIPTOR.fields_by_name]
-    return said if field == "robot" else [*said, str(message.header.source)]
+    stated = [str(getattr(message, name)) for name in names if name in message.DESCRIPTOR.fields_by_name]
+    return stated if field == "robot" else [*stated, str(message.header.source)]
 
 
 class ReceiverThreads:
-    """Threads that take from receivers until `close`."""
+    """Threads that read from receivers until `close`."""
 
     def __init__(self, name: str, receivers: Sequence[Any], runs: Sequence[Callable[[], None]]) -> None:
-        """runs: what each thread does; it ends when its receiver is closed."""
+        """Start a thread for each of the functions `runs`, which end when their receiver is closed."""
         self._name, self._receivers = name, receivers
         self._threads = [threading.Thread(target=run, name=f"bus {name}", daemon=True) for run in runs]
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
-        """Stop receiving, and wait for what is in hand for a moment."""
+        """Stop receiving, and wait up to a second for the handler."""
         with as_bus_error(f"closing {self._name}"):
             for receiver in self._receivers:
                 receiver.undeclare()
         self.join(1.0)
 
     def join(self, timeout: float) -> None:
+        """Wait for the threads to end."""
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout)
 
 
 class Subscription(ReceiverThreads):
-    """A thread that hands samples to a handler, one by one, until `close`."""
+    """A thread that calls a handler with each sample until `close`."""
 
     def __init__(self, name: str, receiver: Any, work: Callable[[Any], None], rejected: RejectedMessages) -> None:
         self._samples, self._work, self._rejected = receiver.handler, work, rejected
@@ -93,7 +94,7 @@ class Subscription(ReceiverThreads):
 
 
 class Listener(Subscription):
-    """A subscription that knows who fell silent."""
+    """A subscription that checks samples, and knows which publishers are silent."""
 
     def __init__(
         self,
@@ -105,11 +106,11 @@ class Listener(Subscription):
         rejected: RejectedMessages,
     ) -> None:
         self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
-        self._heard: dict[str, float] = {}  # per key: when (time.monotonic) the latest sample came
+        self._heard: dict[str, float] = {}  # time (time.monotonic) of the latest sample by key
         super().__init__(key, receiver, self._take, rejected)
 
     def stale(self) -> frozenset[str]:
-        """Keys that were heard of, but for three periods of the topic's rate no more."""
+        """Return the keys that had samples, but none in the last three periods of the topic's rate."""
         limit = math.inf if self._topic.stale_after is None else self._topic.stale_after
         now = time.monotonic()
         return frozenset(key for key, moment in self._heard.copy().items() if now - moment > limit)
@@ -125,8 +126,8 @@ class Listener(Subscription):
         self._handler(Sample(self._topic, key, sample.payload.to_bytes(), time.time_ns()))
 
     def _admit(self, key: str) -> None:
-        """Raises Malformed for a key that no publisher of ours has, or that is one too many."""
+        """Check a new key. Raises Malformed."""
         if not all(NAME.fullmatch(part) for part in key.split("/")):
             raise Malformed(f"{key[:200]!r} is no key of {self._topic.name}")
         if len(self._heard) >= MOST_KEYS:
-            raise Malformed(f"{key}: the {MOST_KEYS} keys before it are all that are listened to")
+            raise Malformed(f"{key}: there are already {MOST_KEYS} keys")

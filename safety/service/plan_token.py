@@ -18,7 +18,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
-from brakeline.errors import BadKey
+from brakeline.errors import BadKeys
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.robot import FEEDBACK, HOLD, Robot
@@ -42,7 +42,7 @@ class PlanAuthenticator:
 
     def __init__(self, key: bytes) -> None:
         if len(key) < KEY_SIZE:
-            raise BadKey(f"the key of the plan tokens has {len(key)} bytes; it needs {KEY_SIZE}")
+            raise BadKeys(f"the key of the plan tokens has {len(key)} bytes; it needs {KEY_SIZE}")
         self._key = key
 
     @classmethod
@@ -50,7 +50,7 @@ class PlanAuthenticator:
         """Return an authenticator with the key in a folder, or with a new random key if the folder has none.
 
         Raises:
-            BadKey: the key is too short.
+            BadKeys: the key is too short.
             OSError: the key can't be read.
         """
         if folder is not None and (folder / KEY_FILE).exists():

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from brakeline.errors import BadParameter, RequestRefused, UnknownMode, UnknownRules
+from brakeline.errors import BadParameter, RequestRefused, UnknownMode, UnknownName
 from brakeline.sim.autopilot.autopilot_rules import RULES
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.flight_modes import FlightStateMachine, Mode
@@ -52,11 +52,11 @@ class Autopilot:
             quiet: send only the heartbeat, and messages on request.
 
         Raises:
-            UnknownRules: no rule set has this name.
+            UnknownName: no rule set has this name.
             BadParameter: a parameter does not exist, or cannot have this value.
         """
         if rules not in RULES:
-            raise UnknownRules(f"no rule set is called {rules!r}; there are: {', '.join(RULES)}")
+            raise UnknownName(f"no rule set is called {rules!r}; there are: {', '.join(RULES)}")
         self.vehicle, self.rules = vehicle, RULES[rules]
         self.parameters = Parameters(self.rules.parameters, self.rules.bitwise_integers)
         for name, value in (parameters or {}).items():

@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from brakeline.errors import Px4Error
+from brakeline.errors import LaunchError
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.flight_controller import GRAVITY, Airframe
 
@@ -67,7 +67,7 @@ class Px4Process:
             parameters: values besides `PARAMETERS`.
 
         Raises:
-            Px4Error: the folder holds no PX4, or PX4 did not start.
+            LaunchError: the folder holds no PX4, or PX4 did not start.
         """
         binary, aliases, etc = _find_parts(folder)
         self.remote, self.local = remote, free_udp_port()
@@ -135,7 +135,7 @@ class Px4Process:
                 return self._listener.accept()[0]
             except TimeoutError:
                 continue
-        raise Px4Error(f"PX4 did not connect to its simulator; the end of its output:\n{self.last_output()}")
+        raise LaunchError(f"PX4 did not connect to its simulator; the end of its output:\n{self.last_output()}")
 
 
 def _find_parts(folder: Path) -> tuple[Path, Path, Path]:
@@ -144,7 +144,7 @@ def _find_parts(folder: Path) -> tuple[Path, Path, Path]:
     for place in (folder / "bin", folder):
         if (place / "px4").is_file() and (place / "px4-alias.sh").is_file() and (folder / "etc").is_dir():
             return place / "px4", place / "px4-alias.sh", folder / "etc"
-    raise Px4Error(f"{folder} holds no PX4 for SITL: it must have px4 and px4-alias.sh (or both in bin/), and etc/")
+    raise LaunchError(f"{folder} holds no PX4 for SITL: it must have px4 and px4-alias.sh (or both in bin/), and etc/")
 
 
 def _free_instance() -> tuple[int, socket.socket]:
@@ -156,4 +156,4 @@ def _free_instance() -> tuple[int, socket.socket]:
                 return instance, socket.create_server(("127.0.0.1", FIRST_PORT + instance))
             except OSError:
                 continue
-    raise Px4Error("no free instance of PX4: too many run on this machine")
+    raise LaunchError("no free instance of PX4: too many run on this machine")

@@ -163,8 +163,8 @@ def learning(robot: RobotWithTask, folder: Path) -> Party:
     topics = tuple(topic for topic in TOPICS if "learner" in topic.subscribers)
 
     def look() -> None:
-        loop._say_flow()
-        loop._say_metrics()
+        loop._publish_flow()
+        loop._publish_metrics()
 
     return Party(topics, take, look, wire.rejected)
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.errors import BadStep, DamagedPart, NoCheckpoint, OtherRun
+from brakeline.errors import BadStep, CheckpointError, DamagedPart
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
@@ -215,16 +215,16 @@ def test_checkpoints_fall_between_episodes():
 
 
 def test_restore_refuses_what_is_not_this_run(tmp_path):
-    with pytest.raises(NoCheckpoint):
+    with pytest.raises(CheckpointError, match="no checkpoint"):
         Learner(TOY, CONFIG).restore(tmp_path)
     learner, actor = started()
     run(learner, actor, 4)
     learner.save(tmp_path)
-    with pytest.raises(OtherRun, match="seed"):
+    with pytest.raises(CheckpointError, match="seed"):
         Learner(TOY, replace(CONFIG, seed=3)).restore(tmp_path)
-    with pytest.raises(OtherRun, match="td3"):
+    with pytest.raises(CheckpointError, match="td3"):
         Learner(TOY, replace(CONFIG, td3=replace(CONFIG.td3, gamma=0.5))).restore(tmp_path)
-    with pytest.raises(OtherRun, match="layout"):
+    with pytest.raises(CheckpointError, match="layout"):
         Learner(replace(TOY, period=0.1), CONFIG).restore(tmp_path)
 
 

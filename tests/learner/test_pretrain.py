@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from brakeline.errors import TooFew
+from brakeline.errors import BadData
 from brakeline.learner.rival_networks import FitConfig, fit_cost, fit_linear
 from tests.robots import GROUND
 
@@ -45,7 +45,7 @@ def test_the_seed_decides_alone():
 
 
 def test_too_few_samples_and_senseless_numbers_are_refused():
-    with pytest.raises(TooFew, match="10 samples"):
+    with pytest.raises(BadData, match="10 samples"):
         fit_cost(GROUND, np.zeros((10, 2)), np.zeros(10), 1, HOW, 0)
     for wrong in ({"batch": 0}, {"epochs": 0}, {"hidden": ()}, {"held_out": 0.0}):
         with pytest.raises(ValueError, match="1 or more"):

@@ -170,7 +170,7 @@ def test_lockstep_over_the_bus_is_the_same_bit_for_bit_resumed_or_not(bus, tmp_p
 
 def test_resuming_from_nothing_is_an_error(bus, tmp_path):
     settings = LearnerSettings(BusSettings(connect=bus.settings.listen), out=tmp_path, resume=True, learner=CONFIG)
-    with pytest.raises(checkpoint.NoCheckpoint):
+    with pytest.raises(checkpoint.CheckpointError, match="no checkpoint"):
         main(settings)
 
 

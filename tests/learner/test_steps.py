@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.errors import BadState
 from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.replay import Batch, ReplayBuffer, Transition
@@ -199,14 +198,14 @@ def test_replay_refuses_what_does_not_fit():
     replay = ReplayBuffer(4, 3, 1)
     replay.insert(transition(1.0))
     state = replay.state()
-    with pytest.raises(BadState, match="capacity"):
+    with pytest.raises(ValueError, match="capacity"):
         ReplayBuffer(5, 3, 1).restore(state)
-    with pytest.raises(BadState, match="observation"):
+    with pytest.raises(ValueError, match="observation"):
         ReplayBuffer(4, 2, 1).restore(state)
-    with pytest.raises(BadState, match="action: missing"):
+    with pytest.raises(ValueError, match="action: missing"):
         tensors = {name: array for name, array in state.tensors.items() if name != "action"}
         ReplayBuffer(4, 3, 1).restore(PartState(tensors, state.values))
-    with pytest.raises(BadState, match="next"):
+    with pytest.raises(ValueError, match="next"):
         ReplayBuffer(4, 3, 1).restore(PartState(state.tensors, state.values | {"next": 3}))
     with pytest.raises(ValueError, match="nothing"):
         ReplayBuffer(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))

@@ -17,7 +17,7 @@ from mcap.writer import Writer as McapWriter
 from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline.deploy.cli import main
-from brakeline.errors import BeingRecorded, NotALog
+from brakeline.errors import LogError
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import Log, open_log
 from brakeline.logs.recorder import Inbox, Recording, Rotation, malformed_entry
@@ -107,14 +107,14 @@ def test_everything_in_the_file_is_taken_over_that_of_others_too(tmp_path: Path)
 def test_a_file_that_is_being_recorded_or_is_no_log_is_not_changed(tmp_path: Path) -> None:
     segment = open_segment(tmp_path / "run.mcap", {})
     assert being_written(segment.path)
-    with pytest.raises(BeingRecorded, match="is being recorded"):
+    with pytest.raises(LogError, match="is being recorded"):
         recover(segment.path)
     log = open_log(segment.path)
     assert list(log) == [] and "the file is being recorded" in str(log.cuts[0]) and log.segments[0].recording
     segment.finish()
     assert not being_written(segment.path)
     (tmp_path / "text.mcap").write_text("a long story, but not a log")
-    with pytest.raises(NotALog):
+    with pytest.raises(LogError, match="not an MCAP file"):
         recover(tmp_path / "text.mcap")
     with pytest.raises(FileExistsError, match="exists already"):
         recover(segment.path, tmp_path / "text.mcap")

@@ -10,7 +10,7 @@ from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from brakeline.errors import NoLog, NotALog
+from brakeline.errors import LogError
 from brakeline.logs.reader import find, open_log, read
 from brakeline.logs.recorder import entry, malformed_entry
 from brakeline.logs.segment import Entry, Segment, number_of, open_segment, segments
@@ -130,12 +130,12 @@ def test_a_malformed_message_is_stored_and_counted(tmp_path: Path, say: Say) -> 
 
 
 def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(NoLog, match="no log at"):
+    with pytest.raises(LogError, match="no log at"):
         find(tmp_path)
-    with pytest.raises(NoLog):
+    with pytest.raises(LogError, match="no log at"):
         list(read(tmp_path / "run.mcap"))
     (tmp_path / "text.mcap").write_text("a long story, but not a log")
-    with pytest.raises(NotALog, match="not an MCAP file"):
+    with pytest.raises(LogError, match="not an MCAP file"):
         list(read(tmp_path / "text.mcap"))
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.errors import BadKey
+from brakeline.errors import BadKeys
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
@@ -130,5 +130,5 @@ def test_the_key_of_the_tokens_is_in_the_folder_of_keys(tmp_path: Path) -> None:
     tokens = [one.plan_tokens(request, decision, GROUND) for one in authenticators]
     assert tokens[0] == tokens[1] and tokens[2] != tokens[3] and tokens[0] != tokens[2]
     (tmp_path / "vouchers.key").write_bytes(b"short")
-    with pytest.raises(BadKey):
+    with pytest.raises(BadKeys):
         PlanAuthenticator.of(tmp_path)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.errors import UnknownArena
+from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
@@ -139,11 +139,11 @@ def test_the_generator_determines_the_arena() -> None:
 
 def test_an_unknown_arena_is_refused_with_the_names_that_exist() -> None:
     with pytest.raises(
-        UnknownArena,
+        UnknownName,
         match="no arena is called 'moon'; there are: crossing, default, dense, few-walkers, many-walkers, open, walk",
     ):
         arena("moon", 0)
-    with pytest.raises(UnknownArena, match="default, dense, tall"):
+    with pytest.raises(UnknownName, match="default, dense, tall"):
         arena("open", 0, QUADROTOR)
 
 

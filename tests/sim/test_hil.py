@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brakeline.errors import AutopilotGone, Px4Error
+from brakeline.errors import AutopilotGone, LaunchError
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_link import HilLink
@@ -123,5 +123,5 @@ def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatc
 
 
 def test_a_folder_without_px4_is_refused(tmp_path: Any) -> None:
-    with pytest.raises(Px4Error, match="holds no PX4"):
+    with pytest.raises(LaunchError, match="holds no PX4"):
         Px4Process(tmp_path, 14540)

@@ -1,5 +1,6 @@
 """Scripted policies of both robots drive as their classes say. A point mass without physics stands in for the
-quadrotor."""
+quadrotor.
+"""
 
 from itertools import pairwise
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brakeline.errors import UnknownPolicy
+from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, staged_arena
@@ -103,7 +104,7 @@ def test_the_random_policy_repeats_inputs_within_the_bounds(robot: RobotWithTask
 
 
 def test_an_unknown_name_is_refused_with_the_names_that_exist() -> None:
-    with pytest.raises(UnknownPolicy, match="random, greedy, adversary, astar"):
+    with pytest.raises(UnknownName, match="random, greedy, adversary, astar"):
         scripted("psychic", GROUND, np.random.default_rng(0))
 
 

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 import pytest
 
-from brakeline.errors import BadParameter, UnknownRules
+from brakeline.errors import BadParameter, UnknownName
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.flight_modes import Mode
@@ -116,7 +116,7 @@ def test_integers_travel_as_bits_in_px4_and_as_values_in_ardupilot() -> None:
 
 
 def test_unknown_rules_and_parameters_are_refused() -> None:
-    with pytest.raises(UnknownRules, match="betaflight"):
+    with pytest.raises(UnknownName, match="betaflight"):
         Station("betaflight")
     with pytest.raises(BadParameter):
         Station("px4", parameters={"GUID_TIMEOUT": 1.0})

@@ -7,7 +7,7 @@ from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFF
 from brakeline.actors.ros2.ros2_process import Ros2Settings, driven
 from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
-from brakeline.errors import NoReply, UnsupportedRobot
+from brakeline.errors import Mismatch, NoReply
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2.cdr_messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
@@ -93,7 +93,7 @@ def test_without_a_command_the_proposal_is_to_stand():
 
 def test_a_robot_that_a_twist_cannot_drive_is_refused():
     assert driven("ground") == driven("ground-late") == ROBOT
-    with pytest.raises(UnsupportedRobot, match="quadrotor"):
+    with pytest.raises(Mismatch, match="quadrotor"):
         driven("quadrotor")
     assert Ros2Settings().lead < ROBOT.period
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
 from brakeline.actors.ros2.sensor_frames import PlanarPose
-from brakeline.errors import BadLaserScan
+from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.ros2.cdr_messages import LaserScan, header
@@ -163,5 +163,5 @@ def test_each_beam_starts_where_the_robot_was_at_its_time():
     ],
 )
 def test_an_invalid_scan_is_refused(wrong):
-    with pytest.raises(BadLaserScan):
+    with pytest.raises(BadScan):
         read(scan_of(np.full(BEAMS, 1.0), **wrong))

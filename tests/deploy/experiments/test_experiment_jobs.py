@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, write
-from brakeline.errors import StaleResultError
+from brakeline.errors import ResultError
 from tests.waiting import until
 
 
@@ -98,7 +98,7 @@ def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
 
 def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_path):
     complete([Errand(1)], tmp_path / "results", tmp_path / "runs", workers=1)
-    with pytest.raises(StaleResultError, match="another setting") as refused:
+    with pytest.raises(ResultError, match="another setting") as refused:
         complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", workers=1)
     assert "errand-1.json" in str(refused.value)
     assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"

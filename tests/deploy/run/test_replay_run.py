@@ -13,7 +13,7 @@ from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.run.replay_run import APART, Difference, differences, replay
-from brakeline.errors import ReplayError
+from brakeline.errors import LogError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.model_set import ModelConfig
@@ -51,7 +51,7 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(
     version = drive(tmp_path / "run.mcap", 20, attach=False)
     model = model_for(GROUND, ModelConfig())
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
-    with pytest.raises(ReplayError, match=version):
+    with pytest.raises(LogError, match=version):
         replay(tmp_path)
     model.save(tmp_path / "ground" / "models" / f"{version}.safetensors")
     again = replay(tmp_path)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.errors import BadModel, BadPerceptrons
+from brakeline.errors import BadModel, BadWeights
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.safety.methods import decode, load, ready
@@ -79,7 +79,7 @@ def test_perceptrons_by_their_definition():
     assert np.array_equal(Perceptrons.of(networks.tensors("a"), "a")(x), networks(x))
     broken = networks.tensors("a") | {"a.1.bias": np.full((3, 2), np.nan, np.float32)}
     for wrong in (broken, {"b.0.weight": w0}, {}):
-        with pytest.raises(BadPerceptrons):
+        with pytest.raises(BadWeights):
             Perceptrons.of(wrong, "a")
-    with pytest.raises(BadPerceptrons, match=r"layers\.1"):
+    with pytest.raises(BadWeights, match=r"layers\.1"):
         Perceptrons([layers[0], (rng.normal(size=(3, 2, 6)), layers[1][1])])
