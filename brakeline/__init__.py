@@ -5,7 +5,7 @@ with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:      # ask a r
 
 env = SafetyWrapper(env, Filter(ModelSet.load(path)))                  # in process, for any RL library
 
-Names are imported when they are first used, so that an asker needs no simulator and no solver.
+A name is imported at its first use, so that a client of the service loads no simulator and no solver.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from brakeline.errors import (
+    BadData,
+    BadDescription,
+    BadModel,
+    BadRequest,
+    BadScan,
+    BadShape,
+    BusError,
+    ErrorBoundError,
+    Late,
+    NoReply,
+    Refused,
+    SafetyError,
+    UnknownRobot,
+    Unreachable,
+)
+
 if TYPE_CHECKING:
-    from brakeline.errors import (
-        BadData,
-        BadDescription,
-        BadModel,
-        BadRequest,
-        BadScan,
-        BadShape,
-        BusError,
-        ErrorBoundError,
-        Late,
-        NoReply,
-        Refused,
-        SafetyError,
-        UnknownRobot,
-        Unreachable,
-    )
     from brakeline.messaging.bus import BusSettings
     from brakeline.messaging.obstacle import Obstacle, Shapes
     from brakeline.messaging.obstacle_motion import Motion
@@ -53,82 +54,41 @@ if TYPE_CHECKING:
     from brakeline.safety.service.fleet_client import FleetClient
     from brakeline.safety.service.in_process import InProcess
 
+# The modules of the names that are imported at their first use; the same as above, for the interpreter.
 PLACES = {
-    "brakeline.messaging.bus": ("BusError", "BusSettings", "Late", "NoReply", "Refused", "Unreachable"),
-    "brakeline.messaging.robot_description": ("BadDescription",),
+    "brakeline.messaging.bus": ("BusSettings",),
+    "brakeline.messaging.obstacle": ("Obstacle", "Shapes"),
     "brakeline.messaging.obstacle_motion": ("Motion",),
     "brakeline.messaging.range_image": ("RangeImage",),
-    "brakeline.messaging.robot": ("Disc", "Limit", "Robot", "UnknownRobot", "robot_named"),
-    "brakeline.messaging.scan": ("BadScan", "Scan"),
-    "brakeline.messaging.obstacle": ("BadShape", "Obstacle", "Shapes"),
+    "brakeline.messaging.robot": ("Disc", "Limit", "Robot", "robot_named"),
+    "brakeline.messaging.scan": ("Scan",),
     "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
-    "brakeline.safety.model.error_bounds": ("ErrorBoundError",),
-    "brakeline.safety.service.filter_client": ("Answer", "FilterClient"),
-    "brakeline.safety.service.client": ("SafetyClient", "SafetyError"),
     "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
-    "brakeline.safety.model.dataset": ("BadData", "Dataset", "Trajectory"),
     "brakeline.safety.filter.filter": ("Filter",),
-    "brakeline.safety.model.fitting": ("fit_model_set",),
-    "brakeline.safety.service.fleet_client": ("FleetClient",),
+    "brakeline.safety.filter.request": ("Decision", "Request"),
     "brakeline.safety.gym": ("SafetyWrapper",),
-    "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
-    "brakeline.safety.service.in_process": ("InProcess",),
-    "brakeline.safety.model.model_set": ("BadModel", "ModelSet", "ModelConfig"),
-    "brakeline.safety.filter.request": ("BadRequest", "Decision", "Request"),
+    "brakeline.safety.model.dataset": ("Dataset", "Trajectory"),
+    "brakeline.safety.model.fitting": ("fit_model_set",),
+    "brakeline.safety.model.model_set": ("ModelConfig", "ModelSet"),
     "brakeline.safety.model.validation": ("ValidationReport", "validate"),
+    "brakeline.safety.perception.image_memory": ("filled", "memory_of"),
+    "brakeline.safety.service.client": ("SafetyClient",),
+    "brakeline.safety.service.filter_client": ("Answer", "FilterClient"),
+    "brakeline.safety.service.fleet_client": ("FleetClient",),
+    "brakeline.safety.service.in_process": ("InProcess",),
 }
 _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
+# fmt: off
 __all__ = [
-    "Answer",
-    "BackupPlan",
-    "BadData",
-    "BadDescription",
-    "BadModel",
-    "BadRequest",
-    "BadScan",
-    "BadShape",
-    "BusError",
-    "BusSettings",
-    "Dataset",
-    "Decision",
-    "Disc",
-    "ErrorBoundError",
-    "Filter",
-    "FilterClient",
-    "FleetClient",
-    "InProcess",
-    "Late",
-    "Limit",
-    "ModelConfig",
-    "ModelSet",
-    "Motion",
-    "NoReply",
-    "Obstacle",
-    "Prediction",
-    "RangeImage",
-    "Refused",
-    "Request",
-    "Robot",
-    "RobotWithTask",
-    "SafetyClient",
-    "SafetyError",
-    "SafetyWrapper",
-    "Scan",
-    "Shapes",
-    "Task",
-    "Trajectory",
-    "UnknownRobot",
-    "Unreachable",
-    "ValidationReport",
-    "__version__",
-    "filled",
-    "fit_model_set",
-    "memory_of",
-    "robot_named",
-    "robot_with_task",
-    "validate",
+    "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan", "BadShape", "BusError",
+    "BusSettings", "Dataset", "Decision", "Disc", "ErrorBoundError", "Filter", "FilterClient", "FleetClient",
+    "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion", "NoReply", "Obstacle", "Prediction",
+    "RangeImage", "Refused", "Request", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper",
+    "Scan", "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__",
+    "filled", "fit_model_set", "memory_of", "robot_named", "robot_with_task", "validate",
 ]
+# fmt: on
 
 
 def __getattr__(name: str) -> Any:
@@ -153,5 +113,5 @@ def __dir__() -> list[str]:
     return __all__
 
 
-if "gymnasium" in sys.modules:  # else `brakeline.envs` registers: a client of the service needs no Gymnasium
+if "gymnasium" in sys.modules:  # otherwise import `brakeline.envs`: a client needs no Gymnasium
     from brakeline import envs as _envs  # noqa: F401

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from google.protobuf.descriptor import Descriptor
-from google.protobuf.message import Message
 
 from brakeline.errors import Implausible
 
@@ -19,69 +16,54 @@ MAX_WALL_TIME = 2**62  # [ns since the Unix epoch]
 MAX_VALUE = 1e9  # of a robot's time [s], and of the numbers of a step
 MAX_OBSTACLES = 1000  # in one message
 MAX_NUMBERS = 10_000  # in one repeated field
-STEP_NUMBERS = ("reward", "penalty", "speed")
-
-Check = Callable[[Any], None]
+STEP_NUMBERS = ("reward", "penalty", "speed")  # the numbers of a step that statistics add up
 
 
-def check(message: Message) -> None:
+class _CheckedFields(NamedTuple):
+    header: bool
+    names: tuple[str, ...]
+    sizes: tuple[tuple[str, int], ...]  # repeated field, largest size
+    numbers: tuple[str, ...]
+    request: bool
+
+
+@cache
+def _checked_fields(kind: Descriptor) -> _CheckedFields:
+    fields = kind.fields_by_name
+    names = tuple(name for name in NAME_FIELDS if name in fields and fields[name].type == fields[name].TYPE_STRING)
+    sizes = [(name, MAX_NUMBERS) for name, field in fields.items() if field.is_repeated and field.message_type is None]
+    if "obstacles" in fields:
+        sizes.append(("obstacles", MAX_OBSTACLES))
+    numbers = STEP_NUMBERS if "reward" in fields else ()
+    return _CheckedFields("header" in fields, names, tuple(sizes), numbers, "request" in fields)
+
+
+def check(message: Any) -> None:
     """Check a message.
 
     Raises:
         Implausible: a time, a name or a size is out of bounds; the error names the field.
     """
-    for part in _checks(message.DESCRIPTOR):
-        part(message)
-
-
-@cache
-def _checks(kind: Descriptor) -> tuple[Check, ...]:
-    """Return the checks for a kind of message."""
-    fields = kind.fields_by_name
-    checks: list[Check] = []
-    if "header" in fields:
-        checks.append(_check_header)
-    names = [name for name in NAME_FIELDS if name in fields and fields[name].type == fields[name].TYPE_STRING]
-    checks += [_name_check(name) for name in names]
-    lists = {name: MAX_NUMBERS for name, field in fields.items() if field.is_repeated and field.message_type is None}
-    if "obstacles" in fields:
-        lists["obstacles"] = MAX_OBSTACLES
-    checks += [_size_check(name, most) for name, most in lists.items()]
-    if "reward" in fields:
-        checks.append(_check_step_numbers)
-    if "request" in fields:
-        checks.append(lambda message: check(message.request))
-    return tuple(checks)
-
-
-def _check_header(message: Any) -> None:
-    header = message.header
-    if not 0 <= header.wall_time < MAX_WALL_TIME:
-        raise Implausible(f"wall_time {header.wall_time} ns")
-    if not (math.isfinite(header.time) and abs(header.time) < MAX_VALUE):
-        raise Implausible(f"time {header.time} s")
-    if header.source and not NAME.fullmatch(header.source):
-        raise Implausible(f"source {header.source[:100]!r}")
-
-
-def _check_step_numbers(message: Any) -> None:
-    """Check the numbers of a step that statistics add up."""
-    for name in STEP_NUMBERS:
-        if not abs(value := getattr(message, name)) < MAX_VALUE:  # NaN fails too
+    fields = _checked_fields(message.DESCRIPTOR)
+    if fields.header:
+        header = message.header
+        if not 0 <= header.wall_time < MAX_WALL_TIME:
+            raise Implausible(f"wall_time {header.wall_time} ns")
+        if not abs(header.time) < MAX_VALUE:  # NaN fails too
+            raise Implausible(f"time {header.time} s")
+        _check_name(header, "source")
+    for name in fields.names:
+        _check_name(message, name)
+    for name, most in fields.sizes:
+        if (size := len(getattr(message, name))) > most:
+            raise Implausible(f"{size} {name}")
+    for name in fields.numbers:
+        if not abs(value := getattr(message, name)) < MAX_VALUE:
             raise Implausible(f"{name} {value}")
+    if fields.request:
+        check(message.request)
 
 
-def _name_check(name: str) -> Check:
-    def check_name(message: Any) -> None:
-        if (value := getattr(message, name)) and not NAME.fullmatch(value):
-            raise Implausible(f"{name} {value[:100]!r}")
-
-    return check_name
-
-
-def _size_check(name: str, most: int) -> Check:
-    def check_size(message: Any) -> None:
-        if len(getattr(message, name)) > most:
-            raise Implausible(f"{len(getattr(message, name))} {name}")
-
-    return check_size
+def _check_name(message: Any, field: str) -> None:
+    if (value := getattr(message, field)) and not NAME.fullmatch(value):
+        raise Implausible(f"{field} {value[:100]!r}")

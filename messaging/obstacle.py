@@ -37,6 +37,9 @@ KINDS = (BOX, CYLINDER, SPHERE, WALL)
 class Obstacle:
     """One obstacle in the plane or in space, by the length of `position`.
 
+    >>> Obstacle("cylinder", position=(0.4, 0.0), size=(0.1,)).kind
+    'cylinder'
+
     Attributes:
         kind: box, cylinder, sphere or wall.
         position: center [m]; of a wall: a point on its surface.
@@ -81,6 +84,10 @@ class Obstacle:
 @dataclass(frozen=True)
 class Shapes:
     """n obstacles as arrays.
+
+    >>> shapes = Shapes.of([Obstacle("box", (2.0, 0.0), (1.0, 1.0)), Obstacle("sphere", (3.0, 0.0), (1.0,))], dim=2)
+    >>> shapes.distance(np.zeros(2)).tolist()
+    [1.5, 2.0]
 
     Attributes:
         center: (n, d) [m].

@@ -25,7 +25,11 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of an obstacle. Exactly one of `acceleration` and `speed` bounds it; `speed` ignores the velocity."""
+    """The motion of an obstacle. Exactly one of `acceleration` and `speed` bounds it; `speed` ignores the velocity.
+
+    >>> Motion(velocity=(0.5, 0.0), position_error=0.03, velocity_error=0.05, acceleration=2.0).radius(0.0)
+    0.03
+    """
 
     velocity: tuple[float, ...]  # measured [m/s]
     position_error: float  # δ_p [m]

@@ -17,6 +17,24 @@ Tensor = NDArray[np.float32]
 Layer = tuple[Tensor, Tensor]  # weight (count, out, in), bias (count, out)
 
 
+def check_layers(layers: Sequence[Layer], inputs: int, stack: tuple[int, ...] = ()) -> int:
+    """Return the number of outputs of layers, each with a weight (*stack, out, in) and a bias (*stack, out).
+
+    Raises:
+        BadWeights: the layers do not fit each other or the inputs, or are not finite; the message names the layer.
+    """
+    if not layers:
+        raise BadWeights("layers: there are none")
+    for number, (weight, bias) in enumerate(layers):
+        stacked = bias.ndim == len(stack) + 1 and bias.shape[:-1] == stack and bias.size > 0
+        if not stacked or weight.shape != (*bias.shape, inputs):
+            raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {inputs} inputs")
+        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            raise BadWeights(f"layers.{number}: not finite")
+        inputs = bias.shape[-1]
+    return inputs
+
+
 class Perceptrons:
     """`count` perceptrons of equal shape. Equal inputs give equal outputs, bit for bit."""
 
@@ -27,17 +45,9 @@ class Perceptrons:
             BadWeights: layers do not fit each other, or are not finite.
         """
         self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
-        if not self.layers:
-            raise BadWeights("layers: there are none")
-        self.count, _, self.inputs = self.layers[0][0].shape if self.layers[0][0].ndim == 3 else (0, 0, 0)
-        width = self.inputs
-        for number, (weight, bias) in enumerate(self.layers):
-            if weight.ndim != 3 or weight.shape[::2] != (self.count, width) or bias.shape != weight.shape[:2]:
-                raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {width} inputs")
-            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-                raise BadWeights(f"layers.{number}: not finite")
-            width = weight.shape[1]
-        self.outputs = width
+        first = self.layers[0][0].shape if self.layers else ()
+        self.count, _, self.inputs = first if len(first) == 3 else (0, 0, 0)
+        self.outputs = check_layers(self.layers, self.inputs, (self.count,))
 
     def __call__(self, x: NDArray[Any]) -> Tensor:
         """Return the outputs (count, outputs) for one input (inputs,)."""

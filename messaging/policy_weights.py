@@ -18,11 +18,12 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from brakeline.errors import BadWeights
+from brakeline.messaging.perceptrons import Layer, check_layers
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Array, shipped_robots
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 Matrix = NDArray[np.float32]
-Layers = Sequence[tuple[Matrix, Matrix]]  # weight (out, in), bias (out,)
+Layers = Sequence[Layer]  # weight (out, in), bias (out,)
 
 
 class MLP:
@@ -37,7 +38,9 @@ class MLP:
         Raises:
             BadWeights: the layers do not fit each other or the robot, or are not finite.
         """
-        _check(robot, layers)
+        outputs = check_layers(layers, robot.task.observation_dim)
+        if outputs != robot.action_dim:
+            raise BadWeights(f"layers: {outputs} outputs, but {robot.name} has {robot.action_dim} inputs")
         self.robot, self.version, self.noise = robot, version, noise
         self.layers = [(np.array(weight, np.float32), np.array(bias, np.float32)) for weight, bias in layers]
         self._input = np.zeros(robot.task.observation_dim, np.float32)
@@ -162,17 +165,3 @@ def _array(entries: dict[str, Any], name: str) -> Matrix:
         raise BadWeights(f"{name}: {entry['dtype']}, not F32")
     array: Matrix = np.frombuffer(entry["data"], np.float32).reshape(entry["shape"])
     return array
-
-
-def _check(robot: RobotWithTask, layers: Layers) -> None:
-    if not layers:
-        raise BadWeights("layers: there are none")
-    inputs = robot.task.observation_dim
-    for number, (weight, bias) in enumerate(layers):
-        if weight.ndim != 2 or weight.shape[1] != inputs or bias.shape != weight.shape[:1] or not len(bias):
-            raise BadWeights(f"layers.{number}: {weight.shape} and {bias.shape} behind {inputs} inputs")
-        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            raise BadWeights(f"layers.{number}: not finite")
-        inputs = len(bias)
-    if inputs != robot.action_dim:
-        raise BadWeights(f"layers.{len(layers) - 1}: {inputs} outputs where {robot.name} has {robot.action_dim} inputs")

@@ -35,6 +35,10 @@ class RangeImage:
     No obstacle is narrower than `least_width`: each point of an obstacle's surface is the corner of a cube with such
     edges inside the obstacle. This holds for a box with such edges, for a ball with a radius of at least 0.87 times
     that length, and for an upright cylinder of at least that height with a radius of at least 0.71 times that length.
+
+    >>> image = RangeImage(ranges=np.full((45, 90), 20.0), at=(0.0, 0.0, 1.0))
+    >>> [round(math.degrees(angle), 2) for angle in image.step]
+    [4.09, 4.0]
     """
 
     ranges: Array  # (E, A) [m]; `far`: no hit; 0: no information

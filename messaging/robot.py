@@ -34,6 +34,9 @@ ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
 class Disc:
     """A disc (a sphere in space) fixed to the robot's frame.
 
+    >>> Disc(at=(0.3, 0.4), radius=0.1).arm
+    0.5
+
     Attributes:
         at: center (d,) relative to the position [m].
         radius: [m].
@@ -52,6 +55,9 @@ class Disc:
 class Limit:
     """A half-space `weights · state <= most` that every plan must respect, as it respects obstacles.
 
+    >>> Limit("stay left of x = 2 m", weights=(1.0, 0.0, 0.0, 0.0, 0.0), most=2.0).most
+    2.0
+
     Attributes:
         weights: (n,), one for each state coordinate.
     """
@@ -64,6 +70,10 @@ class Limit:
 @dataclass(frozen=True)
 class Robot:
     """A kind of robot with n state coordinates and m inputs.
+
+    >>> robot = robot_named("ground")
+    >>> robot.action, robot.period, robot.horizon
+    (('speed [m/s]', 'turn rate [rad/s]'), 0.2, 3)
 
     A plan has `horizon` inputs, one for each period. The first `free_steps` inputs are free. After them, each input
     follows its own `stop` rule, at the end of which the robot stands:
@@ -125,20 +135,15 @@ class Robot:
         return int(self.late)
 
     def in_real_time(self) -> Self:
-        """Return the same robot in real time, where the world moves on while the filter decides.
+        """Return the same robot in a world that moves on while the filter decides.
 
         Raises:
             UnknownRobot: the robot stops by feedback, so the input in force is unknown when the filter decides.
         """
         if self.feedback:
             raise UnknownRobot(f"{self.name} stops by feedback: it has no real-time mode")
-        return replace(
-            self,
-            name=self.name + REAL_TIME_SUFFIX,
-            late=True,
-            horizon=self.horizon + 1,
-            free_steps=self.free_steps + 1,
-        )
+        name, horizon, free_steps = self.name + REAL_TIME_SUFFIX, self.horizon + 1, self.free_steps + 1
+        return replace(self, name=name, late=True, horizon=horizon, free_steps=free_steps)
 
     def in_lockstep(self) -> Self:
         """Return the same robot in a world that waits for each decision."""
@@ -301,6 +306,9 @@ def shipped_robots() -> tuple[str, ...]:
 def robot_named(name: str) -> Robot:
     """Read a robot by its name or path.
 
+    >>> robot_named("quadrotor").position_dim
+    3
+
     Args:
         name: the name of a shipped robot, or the path of a description (.toml). With the suffix `-late`, the robot is
             returned in real time. A task's name after the robot's (`ground+tracks`) does not change the robot.
@@ -316,10 +324,8 @@ def robot_named(name: str) -> Robot:
     else:
         base = base.partition(TASK_SEPARATOR)[0]
         if base not in shipped_robots():
-            raise UnknownRobot(
-                f"no robot is called {name!r}; there are: {', '.join(shipped_robots())}, or the path of a description "
-                "(.toml)"
-            )
+            names = ", ".join(shipped_robots())
+            raise UnknownRobot(f"no robot is called {name!r}; there are: {names}, or the path of a description (.toml)")
         robot = read_robot(ROBOTS_FOLDER / f"{base}.toml")
     return robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
 

@@ -87,6 +87,10 @@ class Scan:
     No obstacle is narrower than `least_width`: from each point of an obstacle's surface, two edges of that length at a
     right angle lie in the obstacle. This holds for a box with such edges, and for a disc with a radius of at least √½
     times that length.
+
+    >>> scan = Scan(ranges=np.full(360, 3.5), angles=np.radians(np.arange(360)), pose=(0.0, 0.0, 0.0))
+    >>> bool(scan.valid_beams.all())
+    True
     """
 
     ranges: Array  # (R,) [m]; `far`: no hit; 0 or NaN: no information

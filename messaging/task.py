@@ -34,6 +34,7 @@ from brakeline.messaging.robot import (
     robot_named,
 )
 
+TASK_SUFFIX = ".task.toml"
 _STRICT = ConfigDict(extra="forbid")
 
 
@@ -113,7 +114,12 @@ class Rivals:
 
 @dataclass(frozen=True)
 class Task:
-    """The task in a file."""
+    """The task in a file.
+
+    >>> task = robot_with_task("ground").task
+    >>> task.observation_dim, task.arenas["default"].step_limit > 0
+    (26, True)
+    """
 
     __pydantic_config__ = _STRICT
     simulator: str  # code: (conditions, tap) -> MakeVehicle
@@ -202,6 +208,9 @@ class RobotWithTask(Robot):
     """A robot with its task, as environments, policies and learners need it.
 
     The filter, its requests, model sets and data sets use a `Robot` without a task.
+
+    >>> isinstance(robot_with_task("ground"), Robot)
+    True
     """
 
     task: Task = field(kw_only=True, hash=False)
@@ -224,6 +233,9 @@ def with_task(robot: Robot, task: Task) -> RobotWithTask:
 def robot_with_task(name: str) -> RobotWithTask:
     """Read a robot by its name or path, with its task.
 
+    >>> robot_with_task("quadrotor").task.observation_dim
+    189
+
     Args:
         name: as for `robot_named`. The task of `my.toml` is `my.task.toml` beside it; `ground+tracks` is the robot
             `ground` with the additional task `tracks`.
@@ -236,15 +248,10 @@ def robot_with_task(name: str) -> RobotWithTask:
 
 
 def robot_maybe_with_task(name: str) -> Robot:
-    """Read a robot by its name or path, with its task if there is one; a robot from a path may have no task.
-
-    Raises:
-        UnknownRobot, UnknownTask: as for `robot_with_task`.
-    """
-    robot = robot_named(name)
-    if name.endswith(".toml") and not _task_beside(name).is_file():
-        return robot
-    return with_task(robot, read_task(task_path(name)))
+    """Read a robot like `robot_with_task`; a robot from a path may have no task."""
+    if name.endswith(".toml") and not _task_file(name).is_file():
+        return robot_named(name)
+    return robot_with_task(name)
 
 
 def needs_task(robot: Robot) -> RobotWithTask:
@@ -266,23 +273,20 @@ def task_path(name: str) -> Path:
     Raises:
         UnknownRobot, UnknownTask: there is no such robot, or no such file.
     """
-    if name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
-        path = _task_beside(name)
-    else:
-        path = ROBOTS_FOLDER / f"{name.removesuffix(REAL_TIME_SUFFIX)}.task.toml"
+    path = _task_file(name)
     if path.is_file():
         return path
     kind = robot_named(name).kind
-    if TASK_SEPARATOR in name and not name.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
-        names = sorted(
-            p.name.removesuffix(".task.toml") for p in ROBOTS_FOLDER.glob(f"{kind}{TASK_SEPARATOR}*.task.toml")
-        )
+    if path.parent == ROBOTS_FOLDER and TASK_SEPARATOR in name:
+        others = ROBOTS_FOLDER.glob(f"{kind}{TASK_SEPARATOR}*{TASK_SUFFIX}")
+        names = sorted(other.name.removesuffix(TASK_SUFFIX) for other in others)
         raise UnknownTask(f"there is no task {name}; additional tasks of {kind}: {', '.join(names)}")
     raise UnknownTask(f"{kind} has no task: write its observation, rewards and arenas to {path}")
 
 
-def _task_beside(path: str) -> Path:
-    return Path(path.removesuffix(REAL_TIME_SUFFIX)).with_suffix(".task.toml")
+def _task_file(name: str) -> Path:
+    base = name.removesuffix(REAL_TIME_SUFFIX)
+    return Path(base).with_suffix(TASK_SUFFIX) if base.endswith(".toml") else ROBOTS_FOLDER / f"{base}{TASK_SUFFIX}"
 
 
 def address(name: str) -> str:
@@ -313,9 +317,8 @@ def read_task(path: Path) -> Task:
         values = _with_base(path)
         arenas = values.get("arenas", {})
         values["arenas"] = {name: _arena(arenas, name) for name in arenas}
-        return TypeAdapter(Task).validate_python(
-            values | {"folder": path.parent, "name": path.name.removesuffix(".task.toml")}
-        )
+        place = {"folder": path.parent, "name": path.name.removesuffix(TASK_SUFFIX)}
+        return TypeAdapter(Task).validate_python(values | place)
     except ValidationError as error:
         lines = "".join(f"\n  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise UnknownTask(f"{path} is no task:{lines}") from error
@@ -327,7 +330,7 @@ def _with_base(path: Path) -> dict[str, Any]:
     """Return the values in a task's file, with those of the task that it is `like` as defaults."""
     values = tomllib.loads(path.read_text())
     base = values.pop("like", None)
-    return ({} if base is None else _with_base(path.with_name(f"{base}.task.toml"))) | values
+    return ({} if base is None else _with_base(path.with_name(f"{base}{TASK_SUFFIX}"))) | values
 
 
 def _arena(arenas: dict[str, Any], name: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from brakeline.deploy.run.autopilot_run import PAD, arena_or_field, open_truth
 from brakeline.errors import AutopilotGone
-from brakeline.messaging.process_clock import Clock, WallClock
+from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender
@@ -93,7 +93,7 @@ def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda veh
 
 
 def serve(
-    hil: HilLink, clock: Clock, speed: float, stop: Callable[[], bool], truth: TruthSender | None = None
+    hil: HilLink, clock: WallClock, speed: float, stop: Callable[[], bool], truth: TruthSender | None = None
 ) -> FlightResult:
     """Simulate step by step until `stop` returns True.
 

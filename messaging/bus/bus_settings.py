@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 import re
 import time
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import zenoh
 from brakeline.errors import Insecure, Unreachable
 from brakeline.messaging.bus.access_control import access
 from brakeline.messaging.bus.identity import names_in, tls
+from brakeline.messaging.bus.zenoh_sessions import zenoh_config
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # between two attempts to connect to a router [s]
 SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # the place in Zenoh's source in an error message
@@ -25,6 +25,9 @@ class BusSettings:
 
     With `keys`, all endpoints are `tls/HOST:PORT`, both ends of a link authenticate themselves, and a router enforces
     the table of topics. Without keys, a bus that other machines can reach does not start, unless it is `insecure`.
+
+    >>> BusSettings(connect=("tcp/10.0.0.7:7447",)).warning
+    'INSECURE: no keys at tcp/10.0.0.7:7447; whoever reaches it can command the robots'
 
     Attributes:
         connect: endpoints of routers. A client uses the first one that answers, and reconnects by itself later.
@@ -102,25 +105,16 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         "connect/exit_on_failure": client,
         # With 0 a client tries each endpoint once, and `open_session` repeats; otherwise Zenoh retries only the first.
         "connect/timeout_ms": 0 if client else -1,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
         "listen/endpoints": settings.listen,
-        "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        # With shared memory, queries were lost silently when a receiver stalled.
-        "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": int(settings.lease * 1e3),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": int(settings.stall * 1e6),
-        # With the default of 1 ms, one query in 1000 was lost on two busy cores, and large messages on busy links.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
     }
     if settings.keys is not None:
         values["transport/link/tls"] = tls(settings.keys, source, listens=not client)
         if not client:
             values["access_control"] = access(names_in(settings.keys), settings.prefix)
-    config = zenoh.Config()
-    for key, value in values.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return zenoh_config(values)
 
 
 def open_session(settings: BusSettings, source: str) -> zenoh.Session:

@@ -9,7 +9,7 @@ import zenoh
 from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import as_bus_error
+from brakeline.messaging.bus.zenoh_sessions import as_bus_error
 from brakeline.messaging.topics import Topic
 
 

@@ -10,8 +10,8 @@ import zenoh
 
 from brakeline.errors import Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.topic_keys import own_key
+from brakeline.messaging.bus.zenoh_sessions import as_bus_error
 
 RENEWED = 30.0  # time after which all services are asked again, as there may be a new or a less busy one [s]
 HELD = 1.0  # time for which a late service keeps its place [s]: asking all makes all of them later

@@ -8,7 +8,6 @@ Zenoh starts threads: fork before you open a bus, or spawn processes.
 
 from __future__ import annotations
 
-import logging
 import secrets
 import threading
 from collections.abc import Callable, Iterable
@@ -24,11 +23,10 @@ from brakeline.messaging.bus.query_client import QueryClient
 from brakeline.messaging.bus.query_server import QueryServer
 from brakeline.messaging.bus.subscription import Listener, ReceiverThreads, Sample, Subscription
 from brakeline.messaging.bus.topic_keys import exact_key, key_of, own_key
+from brakeline.messaging.bus.zenoh_sessions import close_sessions
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Delivery, Topic
-
-log = logging.getLogger("brakeline.bus")
 
 # A full FIFO queue blocks the link and its publisher; a full RING queue drops the oldest message.
 FIFO = 16384
@@ -70,14 +68,7 @@ class Bus:
 
     def close(self, timeout: float = 2.0) -> None:
         """Send waiting messages, leave, and end the handlers; return after `timeout` [s] even if the network hangs."""
-        worker = threading.Thread(target=self._close_sessions, name="bus close", daemon=True)
-        worker.start()
-        worker.join(timeout)
-        if worker.is_alive():
-            log.warning("the bus did not close within %.1f s; leaving it", timeout)
-            return
-        for subscription in self._subscriptions:
-            subscription.join(timeout)
+        close_sessions([self._queries, self._telemetry], [one.join for one in self._subscriptions], timeout)
 
     @property
     def connected(self) -> bool:
@@ -180,8 +171,3 @@ class Bus:
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"
-
-    def _close_sessions(self) -> None:
-        closables: list[Any] = [self._queries, self._telemetry]  # Any: the stubs have no types here
-        for session in closables:
-            session.close()  # also undeclares; a second call does nothing

@@ -13,8 +13,8 @@ import zenoh
 from google.protobuf.message import DecodeError
 
 from brakeline.errors import Implausible, Malformed
-from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.topic_keys import names_of
+from brakeline.messaging.bus.zenoh_sessions import as_bus_error
 from brakeline.messaging.message_checks import NAME, check
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import Topic

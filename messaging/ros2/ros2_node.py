@@ -7,8 +7,6 @@ with Node(RosSettings(), "brakeline") as node:
 
 from __future__ import annotations
 
-import json
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -28,8 +26,8 @@ from zenoh.ext import (
 from zenoh.handlers import RingChannel
 
 from brakeline.errors import BadRosName, Malformed, Unreachable
-from brakeline.messaging.bus.bus_errors import as_bus_error
 from brakeline.messaging.bus.subscription import Subscription
+from brakeline.messaging.bus.zenoh_sessions import as_bus_error, close_sessions, zenoh_config
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.ros2.cdr_messages import decode, digest_of, encode, type_of
 from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
@@ -43,8 +41,6 @@ from brakeline.messaging.ros2.rmw_names import (
     full_name,
     topic_key,
 )
-
-log = logging.getLogger("brakeline.ros2")
 
 M = TypeVar("M")
 ROUTER = "tcp/localhost:7447"  # rmw_zenoh's default
@@ -81,24 +77,17 @@ class RosSettings:
     def configuration(self) -> zenoh.Config:
         """Return the configuration of the Zenoh session."""
         router = bool(self.listen)
-        values: dict[str, object] = {
-            "mode": "router" if router else "peer",
-            "connect/endpoints": [] if router else self.connect,
-            "connect/exit_on_failure": not router,
-            "connect/timeout_ms": -1 if router else int(self.patience * 1e3),
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
-            "listen/endpoints": self.listen if router else ["tcp/localhost:0"],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": True,
-            "timestamping/enabled": True,  # latched topics need it
-            "transport/shared_memory/enabled": False,
-            # With the default of 1 ms, busy machines lost messages.
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
-        }
-        config = zenoh.Config()
-        for key, value in values.items():
-            config.insert_json5(key, json.dumps(value))
-        return config
+        return zenoh_config(
+            {
+                "mode": "router" if router else "peer",
+                "connect/endpoints": [] if router else self.connect,
+                "connect/exit_on_failure": not router,
+                "connect/timeout_ms": -1 if router else int(self.patience * 1e3),
+                "listen/endpoints": self.listen if router else ["tcp/localhost:0"],
+                "scouting/gossip/enabled": True,
+                "timestamping/enabled": True,  # latched topics need it
+            }
+        )
 
 
 class RosPublisher(Generic[M]):
@@ -166,15 +155,7 @@ class RosNode:
 
     def close(self, timeout: float = 2.0) -> None:
         """Leave the graph. Return after `timeout` seconds even if the network hangs."""
-        closable: Any = self._session
-        worker = threading.Thread(target=closable.close, name="ros2 close", daemon=True)
-        worker.start()
-        worker.join(timeout)
-        if worker.is_alive():
-            log.warning("the ROS 2 session did not close within %.1f s; leaving it", timeout)
-            return
-        for subscription in self._subscriptions:
-            subscription.join(timeout)
+        close_sessions([self._session], [one.join for one in self._subscriptions], timeout)
 
     def full_name(self, topic: str) -> str:
         """Return a topic's name in the graph. Raises BadRosName."""

@@ -28,7 +28,13 @@ Array = NDArray[np.float64]
 
 
 class InProcess:
-    """Requests decisions about one robot from a method, and keeps its backup plan: `SafetyClient` without a service."""
+    """Requests decisions about one robot from a method, and keeps its backup plan: `SafetyClient` without a service.
+
+    >>> from brakeline.safety.filter.filter import Filter
+    >>> safety = InProcess(Filter.load("ground"))
+    >>> safety.decide(state=[0, 0, 0, 0, 0], action=[0.2, 0], known_free=True).kind
+    'allowed'
+    """
 
     def __init__(self, method: Method, accept_bound: float | None = None) -> None:
         """Make a client.

@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from brakeline.messaging.byte_links import Link
-from brakeline.messaging.process_clock import Clock
+from brakeline.messaging.process_clock import WallClock
 from brakeline.sim.autopilot.endpoint import TICK, Autopilot
 from brakeline.sim.quadrotor import Quadrotor
 
@@ -69,7 +69,7 @@ class ServerStats:
 def serve(
     autopilots: Sequence[Autopilot],
     link: Link,
-    clock: Clock,
+    clock: WallClock,
     stop: Callable[[], bool],
     truth: TruthSender | None = None,
 ) -> ServerStats:

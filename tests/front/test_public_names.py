@@ -21,8 +21,9 @@ def test_every_public_name_can_be_imported(name):
 
 
 def test_the_table_of_names_is_complete():
-    offered = {name for names in brakeline.PLACES.values() for name in names}
-    assert offered | {"__version__"} == set(brakeline.__all__)
+    lazy = {name for names in brakeline.PLACES.values() for name in names}
+    errors = {name for name in brakeline.__all__ if name in vars(brakeline.errors)}
+    assert lazy | errors | {"__version__"} == set(brakeline.__all__)
     with pytest.raises(AttributeError, match="SafetyClient"):
         _ = brakeline.SaftyClient
 
@@ -54,18 +55,8 @@ def wheel(tmp_path_factory):
 def editable(tmp_path_factory):
     """Install the checkout in editable mode in a folder of its own."""
     site = tmp_path_factory.mktemp("editable")
-    words = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--target",
-        str(site),
-        "--editable",
-        str(ROOT),
-    ]
+    options = ["--quiet", "--no-deps", "--target", str(site), "--editable", str(ROOT)]
+    words = [sys.executable, "-m", "pip", "install", *options]
     made = subprocess.run(words, check=False, capture_output=True, text=True)
     if made.returncode:
         pytest.skip(f"nothing can be installed here: {made.stderr.strip().splitlines()[-1]}")
@@ -76,11 +67,10 @@ def editable(tmp_path_factory):
 def crowded(tmp_path_factory):
     """A user's folder whose own modules have the names of our parts."""
     folder = tmp_path_factory.mktemp("crowded")
-    for name in PARTS:
-        (folder / f"{name}.py").write_text("MINE = True\n")
-    (folder / "safety.py").unlink()
     (folder / "safety").mkdir()
-    (folder / "safety" / "__init__.py").write_text("MINE = True\n")
+    for name in PARTS:
+        path = folder / "safety" / "__init__.py" if name == "safety" else folder / f"{name}.py"
+        path.write_text("MINE = True\n")
     return folder
 
 
@@ -121,23 +111,11 @@ def test_a_wheel_has_everything(wheel):
     files = {
         path.relative_to(wheel / "brakeline").as_posix() for path in (wheel / "brakeline").rglob("*") if path.is_file()
     }
-    for needed in (
-        *(
-            "py.typed",
-            "robots/ground.toml",
-            "robots/quadrotor.task.toml",
-            "robots/template.txt",
-            "robots/ground.model.safetensors",
-        ),
-        *(
-            "policies/ground/trained.safetensors",
-            "sim/ground.xml",
-            "sim/quadrotor.xml",
-            "deploy/experiments/paper.json",
-        ),
-        *("logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json", "messaging/brakeline.proto"),
-    ):
-        assert needed in files, needed
+    robots = ("ground.toml", "quadrotor.task.toml", "template.txt", "ground.model.safetensors")
+    needed = {"py.typed", "policies/ground/trained.safetensors", *(f"robots/{name}" for name in robots)}
+    needed |= {"sim/ground.xml", "sim/quadrotor.xml", "deploy/experiments/paper.json", "messaging/brakeline.proto"}
+    needed |= {"logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json"}
+    assert needed <= files, needed - files
     tracked = subprocess.run(["git", "ls-files", *PARTS], capture_output=True, text=True, check=True, cwd=ROOT)
     assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= files, "a package is missing in pyproject.toml"
 

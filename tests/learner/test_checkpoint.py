@@ -41,11 +41,6 @@ def test_round_trip_and_only_the_latest_stays(tmp_path):
     assert checkpoint.exists(tmp_path)
 
 
-def test_none():
-    with pytest.raises(checkpoint.CheckpointError, match="no checkpoint"):
-        checkpoint.load(Path("/nowhere/at/all"), NAMES)
-
-
 def test_missing_parts_are_named(tmp_path):
     place = save(tmp_path, 1)
     with pytest.raises(checkpoint.DamagedPart) as caught:

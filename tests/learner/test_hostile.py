@@ -8,15 +8,14 @@ import pytest
 from brakeline.errors import BadStep
 from brakeline.learner.learner import AHEAD, MOST_ACTORS, Learner
 from brakeline.learner.transition_reader import MOST_OBSERVED, StepReader
-from brakeline.messaging import brakeline_pb2 as pb
-from tests.learner.test_core import step
+from tests.learner.test_core import joining, step
 from tests.learner.toy import CONFIG, TOY
 
 
 @pytest.fixture
 def learner() -> Learner:
     learner = Learner(TOY, replace(CONFIG, lockstep=False))
-    learner.join(pb.Join(robot="toy", actor="actor-0", layout=TOY.learning_layout()))
+    learner.join(joining())
     return learner
 
 
@@ -39,10 +38,14 @@ def test_steps_of_an_actor_that_never_joined_are_refused_and_counted(learner: Le
         *(({"action": [value], "proposed": [1.0]}, "action") for value in (2.1, -0.1, 1e30, np.nan)),
         *(({"proposed": [value], "action": [1.0]}, "proposed") for value in (1e30, -np.inf)),
         *(({name: 2**32 - 1}, "episode") for name in ("episode", "step")),
-        *(({"index": index}, "index") for index in (10**9, 2**64 - 1, AHEAD + 1 + CONFIG.window)),
+        *(({"index": index}, "index") for index in (0, 10**9, 2**64 - 1, AHEAD + 1 + CONFIG.window)),
+        *(({name: [0.0]}, name) for name in ("observation", "next_observation")),
+        ({"action": [1.0, 1.0]}, "action"),
+        ({"robot": "ground"}, "robot"),
+        ({"actor": ""}, "actor"),
     ],
 )
-def test_what_is_out_of_the_tasks_bounds_is_refused(learner: Learner, fields: dict, field: str) -> None:
+def test_a_step_that_is_wrong_names_its_field_and_changes_nothing(learner: Learner, fields: dict, field: str) -> None:
     learner.flow()
     with pytest.raises(BadStep) as refused:
         learner.insert(step(1, **fields))
@@ -55,19 +58,25 @@ def test_proposals_out_of_bounds_are_clipped_as_ever(learner: Learner) -> None:
     assert learner.insert(step(1, proposed=[3.0], action=[2.0]))
 
 
-@pytest.mark.parametrize("place", [{"index": 2**64 - 1}, {"episode": 2**32 - 1}])
-def test_an_actor_that_comes_from_nowhere_is_refused(learner: Learner, place: dict) -> None:
-    join = pb.Join(robot="toy", actor="far", layout=TOY.learning_layout(), **place)
-    assert learner.join(join).error.field == "index"
-    assert "far" not in learner.flow().limit
+@pytest.mark.parametrize(
+    ("fields", "wrong"),
+    [
+        ({"index": 2**64 - 1}, "index"),
+        ({"episode": 2**32 - 1}, "index"),
+        ({"robot": "ground"}, "robot"),
+        ({"layout": "0123"}, "layout"),
+        ({"actor": ""}, "actor"),
+    ],
+)
+def test_an_actor_that_does_not_fit_is_refused(learner: Learner, fields: dict, wrong: str) -> None:
+    reply = learner.join(joining(**({"actor": "far"} | fields)))
+    assert (reply.error.type, reply.error.field) == ("Refused", wrong)
+    assert not reply.HasField("weights") and not reply.HasField("flow") and "far" not in learner.flow().limit
 
 
 def test_there_is_an_end_of_actors(learner: Learner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brakeline.learner.learner.MOST_ACTORS", 10)
     assert MOST_ACTORS > 1000
-    errors = [
-        learner.join(pb.Join(robot="toy", actor=f"a{n}", layout=TOY.learning_layout())).error.field for n in range(12)
-    ]
+    errors = [learner.join(joining(f"a{n}")).error.field for n in range(12)]
     assert errors == [""] * 9 + ["actor"] * 3
-    again = pb.Join(robot="toy", actor="a0", layout=TOY.learning_layout())
-    assert not learner.join(again).HasField("error"), "who is in may come again"
+    assert not learner.join(joining("a0")).HasField("error"), "who is in may come again"

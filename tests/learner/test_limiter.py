@@ -9,11 +9,13 @@ def may_insert(limiter: RateLimiter) -> bool:
     return limiter.error + limiter.samples_per_insert < limiter.ceiling
 
 
-RATIOS = st.sampled_from([0.5, 1.0, 4.0, 8.0, 16.0, 64.0])
-
-
-@given(st.lists(st.booleans(), max_size=300), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
-def test_error_stays_in_its_band_and_someone_may_always_move(wishes, ratio, warmup, ahead):
+@given(
+    st.lists(st.booleans(), max_size=300),
+    st.sampled_from([0.5, 1.0, 4.0, 8.0, 16.0, 64.0]),
+    st.integers(0, 20),
+    st.sampled_from([0.0, 1.0, 5.0]),
+)
+def test_error_stays_in_its_band_and_room_is_the_number_of_inserts_allowed_in_a_row(wishes, ratio, warmup, ahead):
     limiter = RateLimiter(ratio, batch=8, warmup=warmup, ahead=ahead)
     for wants_insert in wishes:
         assert may_insert(limiter) or limiter.may_sample()
@@ -24,16 +26,6 @@ def test_error_stays_in_its_band_and_someone_may_always_move(wishes, ratio, warm
             limiter.sample()
         assert limiter.error < limiter.ceiling
         assert limiter.error >= (0.0 if limiter.samples else -ratio * warmup)
-
-
-@given(st.lists(st.booleans(), max_size=100), RATIOS, st.integers(0, 20), st.sampled_from([0.0, 1.0, 5.0]))
-def test_room_is_the_number_of_inserts_allowed_in_a_row(wishes, ratio, warmup, ahead):
-    limiter = RateLimiter(ratio, batch=8, warmup=warmup, ahead=ahead)
-    for wants_insert in wishes:
-        if wants_insert and may_insert(limiter):
-            limiter.insert()
-        elif limiter.may_sample():
-            limiter.sample()
     room, allowed = limiter.room(), 0
     while may_insert(limiter):
         limiter.insert()
@@ -51,12 +43,3 @@ def test_lockstep_alternates_and_owes_nothing_for_the_warmup(updates_per_step):
             assert not may_insert(limiter)
             limiter.sample()
         assert limiter.samples // 8 == int(max(0, step - 10) * updates_per_step)
-
-
-def test_state_round_trip():
-    one, other = RateLimiter(4.0, 8, 3), RateLimiter(4.0, 8, 3)
-    for _ in range(7):
-        one.insert()
-    one.sample()
-    other.restore(one.state())
-    assert (other.inserts, other.samples, other.error) == (one.inserts, one.samples, one.error)

@@ -52,15 +52,6 @@ def test_gradients(count, outputs):
     torch.testing.assert_close(gradient, inputs.grad[:, 1:4], atol=1e-5, rtol=1e-5)
 
 
-def test_first_shares_parameters():
-    network = Network((5, 8, 1), 2, 4)
-    network.initialise(torch.Generator().manual_seed(0))
-    first, x = network.first(), torch.ones(1, 4, 5)
-    assert torch.equal(first.forward(x)[0], network.forward(x)[0])
-    network.parameters.mul_(0.5)
-    assert torch.equal(first.forward(x)[0], network.forward(x)[0])
-
-
 def test_bfloat16_is_close():
     exact, rounded = Network((26, 128, 128, 1), 2, 64), Network((26, 128, 128, 1), 2, 64, "bfloat16")
     exact.initialise(torch.Generator().manual_seed(2))

@@ -11,6 +11,9 @@ from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.replay import Batch, ReplayBuffer, Transition
 from brakeline.learner.step_ledger import StepLedger, mark
+from brakeline.learner.transition_reader import StepReader
+from brakeline.messaging import brakeline_pb2 as pb
+from tests.robots import GROUND
 
 GAMMA = 0.9
 
@@ -126,21 +129,9 @@ def test_windows_against_their_definition(drawn, n, checkpointed):
             state, windows = windows.state(), NStepWindows(n, GAMMA)
             windows.restore(state)
         got += windows.push("a", m)
-    got += windows.push("a", move(99, 0, 0.0, terminated=True))[
-        :-1
-    ]  # what was still open closes before the next episode
+    # The open windows close before the next episode.
+    got += windows.push("a", move(99, 0, 0.0, terminated=True))[:-1]
     assert comparable(got) == comparable(expected_transitions(arrived, n))
-
-
-def test_truncation_is_not_termination():
-    for n in (1, 3):
-        ends = {}
-        for kind in ("terminated", "truncated"):
-            windows = NStepWindows(n, GAMMA)
-            steps = [move(0, 0, 1.0), move(0, 1, 1.0, **{kind: True})]
-            ends[kind] = [t.discount for m in steps for t in windows.push("a", m)]
-        assert ends["truncated"] == pytest.approx([GAMMA ** min(n, 2), GAMMA])
-        assert ends["terminated"] == pytest.approx([GAMMA if n == 1 else 0.0, 0.0])
 
 
 def test_actors_do_not_mix():
@@ -167,11 +158,17 @@ def transition(number: float) -> Transition:
 
 
 @given(st.integers(1, 12), st.integers(1, 40))
-def test_replay_holds_the_newest(capacity, count):
-    replay, batch = ReplayBuffer(capacity, 3, 1), Batch(256, 3, 1)
+def test_replay_holds_the_newest_also_when_restored(capacity, count):
+    replay, restored, batch = ReplayBuffer(capacity, 3, 1), ReplayBuffer(capacity, 3, 1), Batch(256, 3, 1)
     for number in range(count):
+        if number == count - 1:
+            restored.restore(replay.state())
+            restored.insert(transition(number))
         replay.insert(transition(number))
     replay.sample(np.random.default_rng(0), batch)
+    again = Batch(256, 3, 1)
+    restored.sample(np.random.default_rng(0), again)
+    assert all((a == b).all() for a, b in zip(batch.arrays, again.arrays, strict=True))
     assert len(replay) == min(capacity, count)
     kept = set(range(max(0, count - capacity), count))
     assert set(batch.reward.flatten().tolist()) <= kept
@@ -180,33 +177,20 @@ def test_replay_holds_the_newest(capacity, count):
     assert (batch.observation[0, :, :1] == batch.reward[0]).all() and (batch.action[0] == -batch.reward[0]).all()
 
 
-@given(st.integers(1, 12), st.integers(1, 40))
-def test_restored_replay_draws_and_goes_on_alike(capacity, count):
-    one, other = ReplayBuffer(capacity, 3, 1), ReplayBuffer(capacity, 3, 1)
-    for number in range(count):
-        one.insert(transition(number))
-    other.restore(one.state())
-    for replay in (one, other):
-        replay.insert(transition(77.0))
-    batches = [Batch(64, 3, 1), Batch(64, 3, 1)]
-    for replay, batch in zip((one, other), batches, strict=True):
-        replay.sample(np.random.default_rng(1), batch)
-    assert all((a == b).all() for a, b in zip(*(batch.arrays for batch in batches), strict=True))
-
-
 def test_replay_refuses_what_does_not_fit():
     replay = ReplayBuffer(4, 3, 1)
     replay.insert(transition(1.0))
     state = replay.state()
-    with pytest.raises(ValueError, match="capacity"):
-        ReplayBuffer(5, 3, 1).restore(state)
-    with pytest.raises(ValueError, match="observation"):
-        ReplayBuffer(4, 2, 1).restore(state)
-    with pytest.raises(ValueError, match="action: missing"):
-        tensors = {name: array for name, array in state.tensors.items() if name != "action"}
-        ReplayBuffer(4, 3, 1).restore(PartState(tensors, state.values))
-    with pytest.raises(ValueError, match="next"):
-        ReplayBuffer(4, 3, 1).restore(PartState(state.tensors, state.values | {"next": 3}))
+    without = PartState({name: array for name, array in state.tensors.items() if name != "action"}, state.values)
+    other_next = PartState(state.tensors, state.values | {"next": 3})
+    for sizes, saved, what in (
+        ((5, 3, 1), state, "capacity"),
+        ((4, 2, 1), state, "observation"),
+        ((4, 3, 1), without, "action: missing"),
+        ((4, 3, 1), other_next, "next"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            ReplayBuffer(*sizes).restore(saved)
     with pytest.raises(ValueError, match="nothing"):
         ReplayBuffer(4, 3, 1).sample(np.random.default_rng(0), Batch(2, 3, 1))
 
@@ -225,3 +209,55 @@ def test_a_corrected_step_is_two_lessons():
     ]
     single = NStepWindows(1, 0.5, "executed").push("a", moves[0])
     assert [(t.action[0], t.reward) for t in single] == [(0.0, 0.75)]
+
+
+LOWEST = -100.0
+
+
+def cut_move(step: int, cut: bool = False, terminated: bool = False) -> ActorStep:
+    here, after = np.array([step], np.float32), np.array([step + 1], np.float32)
+    action, proposed = np.array([0.0 if cut else 0.5], np.float32), np.array([0.5], np.float32)
+    return ActorStep(0, step, here, action, proposed, 1.0, 1.0 - LOWEST if cut else 0.0, after, terminated, False, cut)
+
+
+PROPOSED = (2, 0.5, LOWEST, 0.0, 3)
+BEFORE = [(0, 0.5, round(1 + 0.9 + 0.81 * LOWEST, 6), 0.0, 3), (1, 0.5, round(1 + 0.9 * LOWEST, 6), 0.0, 3)]
+AFTER = [
+    (3, 0.5, round(1 + 0.9 + 0.81, 6), round(0.9**3, 6), 6),
+    (4, 0.5, round(1 + 0.9 + 0.81, 6), round(0.9**3, 6), 7),
+]
+
+
+@pytest.mark.parametrize(
+    ("stored", "terminated", "steps", "expected"),
+    [
+        ("executed", False, 5, [*BEFORE, PROPOSED]),  # steps 3 and 4 are still open
+        ("executed", False, 7, [*BEFORE, PROPOSED, *AFTER]),
+        ("both", False, 5, [*BEFORE, (2, 0.0, 1.0, GAMMA, 3), PROPOSED]),  # the backup policy's action has a value
+        ("both", True, 3, [*BEFORE, (2, 0.0, 1.0, 0.0, 3), PROPOSED]),
+    ],
+)
+def test_a_cut_ends_the_episode_for_the_learner_with_the_lowest_reward(stored, terminated, steps, expected):
+    windows = NStepWindows(3, GAMMA, stored)
+    transitions = [t for k in range(steps) for t in windows.push("a", cut_move(k, k == 2, terminated and k == 2))]
+    found = [
+        (
+            *map(int, t.observation),
+            *map(float, t.action),
+            round(t.reward, 6),
+            round(t.discount, 6),
+            *map(int, t.next_observation),
+        )
+        for t in transitions
+    ]
+    assert found == expected
+
+
+def test_a_cut_is_read_from_the_message():
+    vector = [0.0] * GROUND.task.observation_dim
+    step = pb.Step(robot="ground", actor="a", index=1, observation=vector, next_observation=vector)
+    step.action.extend([0.0, 0.0])
+    step.proposed.extend([0.1, 0.0])
+    assert not StepReader(GROUND).move(step).cut
+    step.cut = True
+    assert StepReader(GROUND).move(step).cut

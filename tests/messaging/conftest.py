@@ -8,8 +8,7 @@ import pytest
 
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
-
-Join = Callable[..., Bus]
+from tests.messaging.programs import Join
 
 
 @pytest.fixture

@@ -34,15 +34,8 @@ def scraped(port):
 
 def everything(**more):
     figures = {name: float(i + 1) for i, name in enumerate(FIGURES)}
-    state = {
-        "process": "safety-3",
-        "live": True,
-        "ready": True,
-        "connected": True,
-        "figures": figures,
-        "published": {"log/a": 2},
-    }
-    return ProcessStatus(**(state | more))
+    state = dict.fromkeys(("live", "ready", "connected"), True)
+    return ProcessStatus(**({"process": "safety-3", "figures": figures, "published": {"log/a": 2}} | state | more))
 
 
 @pytest.fixture

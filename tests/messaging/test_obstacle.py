@@ -112,16 +112,11 @@ def test_distances_by_hand():
     assert space.distance(np.array([2.0, 0.0, 2.0])) == pytest.approx([np.sqrt(2), np.sqrt(8) - 1])
 
 
-def test_a_wall_is_wide_and_deep():
+def test_a_wall_is_wide_and_deep_and_there_may_be_no_obstacle():
+    assert Shapes.of([], 2).distance(np.zeros((4, 2))).shape == (0, 4)
     wall = Shapes.of([Obstacle(WALL, (0.0, 0.0))], 2)
     for point, distance in (((0.5, 5000.0), 0.5), ((-5000.0, 0.0), 0.0), ((0.1, -9000.0), 0.1)):
         assert wall.distance(np.array(point))[0] == pytest.approx(distance, abs=1e-9)
-
-
-def test_no_obstacles():
-    none = Shapes.of([], 2)
-    assert len(none) == 0
-    assert none.distance(np.zeros((4, 2))).shape == (0, 4)
 
 
 NAN, INF = float("nan"), float("inf")
@@ -132,6 +127,7 @@ NAN, INF = float("nan"), float("inf")
     [
         ("kind", ("cone", (0, 0), (1,))),
         ("position", (SPHERE, (0,), (1,))),
+        ("position", (SPHERE, (0, 0, 0), (1,))),
         ("position", (SPHERE, (0, 0, 0, 0), (1,))),
         ("position", (SPHERE, (0, NAN), (1,))),
         ("yaw", (WALL, (0, 0), (), INF)),
@@ -143,13 +139,7 @@ NAN, INF = float("nan"), float("inf")
         ("size", (WALL, (0, 0), (1,))),
     ],
 )
-def test_what_is_no_obstacle_is_refused_by_its_field(field, arguments):
+def test_what_is_no_obstacle_in_the_plane_is_refused_by_its_field(field, arguments):
     with pytest.raises(BadShape) as caught:
-        Obstacle(*arguments)
+        Shapes.of([Obstacle(*arguments)], 2)
     assert caught.value.field == field
-
-
-def test_dimensions_do_not_mix():
-    with pytest.raises(BadShape) as caught:
-        Shapes.of([Obstacle(SPHERE, (0, 0, 0), (1,))], 2)
-    assert caught.value.field == "position"

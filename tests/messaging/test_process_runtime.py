@@ -2,19 +2,16 @@
 
 import logging
 import signal
-import subprocess
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.topics import HEALTH, LOG
-
-Join = Callable[..., Bus]
-Spawn = Callable[[str], "subprocess.Popen[str]"]
+from tests.messaging.programs import Join, Spawn
+from tests.waiting import until
 
 PROCESS = """
 from brakeline.messaging.bus import BusSettings
@@ -31,20 +28,13 @@ with Process(BusSettings(connect=("{endpoint}",)), "worker") as process:
 def listen(bus: Bus) -> tuple[list[Any], list[Any]]:
     health: list[Any] = []
     lines: list[Any] = []
-
-    def into(messages: list[Any]) -> Callable[[Sample], None]:
-        return lambda sample: messages.append(sample.message())
-
-    bus.subscribe(HEALTH, into(health))
-    bus.subscribe(LOG, into(lines))
+    bus.subscribe(HEALTH, lambda sample: health.append(sample.message()))
+    bus.subscribe(LOG, lambda sample: lines.append(sample.message()))
     return health, lines
 
 
 def wait_for_goodbye(health: list[Any]) -> Any:
-    deadline = time.monotonic() + 8.0
-    while not (health and health[-1].last):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    until(lambda: health and health[-1].last)
     return health[-1]
 
 

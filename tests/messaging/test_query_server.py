@@ -18,13 +18,6 @@ from tests.messaging.programs import ROUTER, SERVICE, Join, Spawn, answers
 from tests.waiting import until
 
 
-def test_a_question_is_answered_by_another_process(join: Join, spawn: Spawn, endpoint: str) -> None:
-    join("launcher", listen=True)
-    spawn(SERVICE.format(place="connect", endpoint=endpoint, name="a"))
-    actor = join("actor-0")
-    until(lambda: answers(actor) == b"a:?")  # that it serves is known at the router a moment later
-
-
 def test_failures_of_a_question_are_typed(
     join: Join, caplog: pytest.LogCaptureFixture, stalled: Callable[[], float]
 ) -> None:
@@ -90,7 +83,7 @@ def test_a_question_that_ends_without_a_word_is_late_after_its_deadline_and_unhe
         QueryClient(_Silent(0.0)).ask("a/key", b"", 5.0)
 
 
-def test_another_replica_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
+def test_another_process_answers_when_one_is_killed(join: Join, spawn: Spawn, endpoint: str) -> None:
     join("launcher", listen=True)
     replicas = {name: spawn(SERVICE.format(place="connect", endpoint=endpoint, name=name)) for name in "ab"}
     actor = join("actor-0")
@@ -139,9 +132,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
             assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == second.encode()
         services[second].close()
         slow.clear()
-        assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == first.encode(), (
-            "of one that is gone it is known"
-        )
+        assert asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") == first.encode(), "it is known who is gone"
 
 
 def test_a_question_does_not_wait_behind_telemetry(join: Join, stalled: Callable[[], float]) -> None:

@@ -76,13 +76,39 @@ def free_towards(image, points):
     return free[rings, columns], far
 
 
-@settings(max_examples=12)
-@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.1, 0.3]), st.sampled_from([0.0, 0.03]))
-def test_nothing_is_where_it_is_said_to_be_free(seed, dropped, noise):
+def drop(share):
+    def spoil(ranges, lone, rng):
+        ranges[rng.random(ranges.shape) < share] = 0.0
+
+    return spoil
+
+
+def see_through(ranges, lone, rng):
+    ranges[lone] = FAR
+
+
+def see_ghosts(ranges, lone, rng):
+    ranges[lone] *= rng.random(int(lone.sum()))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "noise", "doubt"),
+    [
+        *((drop(share), noise, 0) for share in (0.0, 0.1, 0.3) for noise in (0.0, 0.03)),
+        (see_through, 0.0, 1),
+        (see_ghosts, 0.0, 0),
+    ],
+)
+@settings(max_examples=5)
+@given(st.integers(0, 100_000))
+def test_nothing_is_where_it_is_said_to_be_free(spoil, noise, doubt, seed):
+    """With beams that are dropped, noisy, see through obstacles, or see ghosts."""
     rng = np.random.default_rng(seed)
     obstacles = hall(rng)
-    image = taken(rng, obstacles, noise)
-    image.ranges[rng.random(image.ranges.shape) < dropped] = 0.0
+    image = taken(rng, obstacles, noise, doubt=doubt)
+    lone = np.zeros(image.ranges.shape, dtype=bool)
+    lone[1::3, ::3] = rng.random((RINGS // 3, COLUMNS // 3)) < 0.3  # never two of a mesh
+    spoil(image.ranges, lone, rng)
     free, far = free_towards(image, solid(obstacles, rng))
     assert (far >= free - 1e-9).all()
 
@@ -97,23 +123,6 @@ def test_much_of_what_is_free_is_said_to_be(dropped, least):
         image.ranges[rng.random(image.ranges.shape) < dropped] = 0.0
         shares.append(patch_free_ranges(image)[1].mean() / image.ranges.mean())
     assert np.median(shares) > least
-
-
-@settings(max_examples=8)
-@given(st.integers(0, 100_000))
-def test_neither_ghosts_nor_beams_that_see_through_free_what_is_not(seed):
-    rng = np.random.default_rng(seed)
-    obstacles = hall(rng)
-    image = taken(rng, obstacles, doubt=1)
-    lone = np.zeros(image.ranges.shape, dtype=bool)
-    lone[1::3, ::3] = rng.random((RINGS // 3, COLUMNS // 3)) < 0.3  # never two of a mesh
-    image.ranges[lone] = FAR
-    free, far = free_towards(image, solid(obstacles, rng))
-    assert (far >= free - 1e-9).all()
-    ghostly = taken(rng, obstacles)
-    ghostly.ranges[lone] *= rng.random(int(lone.sum()))
-    free, far = free_towards(ghostly, solid(obstacles, rng))
-    assert (far >= free - 1e-9).all()
 
 
 def test_a_lone_ghost_is_none_and_a_thing_as_narrow_as_things_may_be_is_no_ghost():
@@ -239,14 +248,11 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
     assert len(flat["hits"]) <= 50 and all(len(point) == 2 for point in (*flat["hits"], *flat["free"]))
 
 
-def test_a_place_and_an_attitude_may_come_as_any_numbers():
-    image = RangeImage(np.ones((RINGS, COLUMNS)), np.array([1, 2, 3]), [1, 0, 0, 0], low=-EDGE, high=EDGE)
+@pytest.mark.parametrize("given", [lambda a: a.astype(np.float32), np.asfortranarray, np.ndarray.tolist])
+def test_ranges_a_place_and_an_attitude_come_as_any_numbers(given):
+    """As a driver or a log has them; the loops are compiled for one kind only, and compiling takes seconds."""
+    image = RangeImage(given(np.ones((RINGS, COLUMNS))), np.array([1, 2, 3]), [1, 0, 0, 0], low=-EDGE, high=EDGE)
     assert (image.at, image.attitude) == ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
     assert all(type(value) is float for value in (*image.at, *image.attitude, *image.mount))
-
-
-@pytest.mark.parametrize("given", [lambda a: a.astype(np.float32), np.asfortranarray, np.ndarray.tolist])
-def test_ranges_come_as_any_numbers(given):
-    """As a driver or a log has them; the loops are compiled for one kind only, and compiling takes seconds."""
-    ranges = RangeImage(given(np.ones((RINGS, COLUMNS))), (0.0, 0.0, 0.0), low=-EDGE, high=EDGE).ranges
+    ranges = image.ranges
     assert ranges.dtype == np.float64 and ranges.flags.c_contiguous and (ranges == 1.0).all()

@@ -76,7 +76,9 @@ def test_what_no_honest_sender_says_is_malformed(topic: Topic, message: object) 
         Sample(topic, topic.at(robot="ground", source="a"), message.SerializeToString(), 1).message()
 
 
-def test_what_honest_senders_say_is_not() -> None:
+def test_what_honest_senders_say_is_not_but_other_bytes_are() -> None:
+    with pytest.raises(Malformed, match="not a Step"):
+        Sample(STEP, "step/ground/x", b"\xff\xff\xff", 0).message()
     name = "actor-host.example_1"
     step = pb.Step(header=stamped(4.2, 1_800_000_000 * 10**9, name), robot="ground", actor=name)
     step.clearance = math.inf

@@ -14,7 +14,7 @@ from brakeline.errors import BadDescription, UnknownRobot, UnknownTask
 from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import UNITS, describe, read_robot, robot_from_description
 from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
-from tests.robots import GROUND, QUADROTOR, ROBOTS
+from tests.robots import GROUND, ROBOTS
 
 pytestmark = pytest.mark.fast
 
@@ -197,10 +197,6 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
     (tmp_path / "a.task.toml").write_text(text.replace("[lidar]", "[radar]"))
     with pytest.raises(UnknownTask, match="radar"):
         read_task(tmp_path / "a.task.toml")
-
-
-def test_observations_are_what_they_were():
-    assert (GROUND.task.observation_dim, QUADROTOR.task.observation_dim) == (26, 189)
 
 
 def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():

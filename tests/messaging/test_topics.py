@@ -37,9 +37,10 @@ def test_what_is_published_is_numbered_and_a_question_has_an_answer(topic: Topic
         assert (header.message_type, header.number) == (pb.Header.DESCRIPTOR, 1)
 
 
-def test_no_question_is_recorded() -> None:
+def test_no_question_is_recorded_and_the_recorders_hear_all_that_is() -> None:
     assert RECORDED
-    assert all(topic.delivery is Delivery.BLOCK for topic in RECORDED)
+    for topic in RECORDED:
+        assert topic.delivery is Delivery.BLOCK and {"recorder", "viewer", "launcher"} <= set(topic.listeners)
 
 
 @each
