@@ -33,12 +33,8 @@ class Unreachable(BusError):
     """No router answers at any endpoint, or the process cannot listen on an endpoint."""
 
 
-class Insecure(BusError):
-    """Other machines could reach this bus without authentication."""
-
-
 class BadKeys(BusError):
-    """A key or certificate is missing or too short; the message names it."""
+    """A key or certificate is missing or too short, or a bus that other machines can reach has no keys."""
 
 
 class NoReply(BusError):

@@ -111,17 +111,20 @@ class Learner:
     def join(self, join: pb.Join) -> pb.JoinReply:
         """Accept an actor, or give the reason for the refusal in `error`."""
         layout, known = self.robot.learning_layout(), join.actor in self._limits
-        refusals = {
-            ("robot", f"{join.robot!r}, not {self.robot.name!r}"): join.robot != self.robot.name,
-            ("layout", f"{join.layout!r}, but {self.robot.name} has {layout!r} here"): join.layout != layout,
-            ("actor", "empty"): not join.actor,
-            ("index", f"{join.index} steps, episode {join.episode}"): max(join.index, join.episode) >= LATEST,
-            ("actor", f"{join.actor!r} is one more than {MOST_ACTORS}"): not known and len(self._limits) == MOST_ACTORS,
-            ("actor", f"{join.actor!r}, but lockstep allows one actor, {next(iter(self._limits), '')!r}"): (
-                self.config.lockstep and bool(self._limits.keys() - {join.actor})
+        first = next(iter(self._limits), "")
+        refusals = (
+            (join.robot != self.robot.name, "robot", f"{join.robot!r}, not {self.robot.name!r}"),
+            (join.layout != layout, "layout", f"{join.layout!r}, but {self.robot.name} has {layout!r} here"),
+            (not join.actor, "actor", "empty"),
+            (max(join.index, join.episode) >= LATEST, "index", f"{join.index} steps, episode {join.episode}"),
+            (not known and len(self._limits) == MOST_ACTORS, "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"),
+            (
+                self.config.lockstep and bool(self._limits.keys() - {join.actor}),
+                "actor",
+                f"{join.actor!r}, but lockstep allows one actor, {first!r}",
             ),
-        }
-        for (field, why), refused in refusals.items():
+        )
+        for refused, field, why in refusals:
             if refused:
                 return pb.JoinReply(error=pb.Error(type="Refused", field=field, message=why))
         episode = self._ledger.join(join.actor, join.index, join.episode)

@@ -41,7 +41,7 @@ class Process:
     - With `settings.metrics`, the process serves its status over HTTP (messaging/metrics_endpoint.py).
 
     Raises:
-        Unreachable, Insecure, BadKeys: on entering, if the process cannot join the bus at `settings`.
+        Unreachable, BadKeys: on entering, if the process cannot join the bus at `settings`.
         ValueError, OSError: on entering, if the process cannot serve its metrics at `settings.metrics`.
     """
 

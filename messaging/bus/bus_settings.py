@@ -10,7 +10,7 @@ from pathlib import Path
 
 import zenoh
 
-from brakeline.errors import Insecure, Unreachable
+from brakeline.errors import BadKeys, Unreachable
 from brakeline.messaging.bus.access_control import access
 from brakeline.messaging.bus.identity import names_in, tls
 from brakeline.messaging.bus.zenoh_sessions import zenoh_config
@@ -62,7 +62,7 @@ class BusSettings:
 
         Raises:
             ValueError: there is no endpoint, or an endpoint needs keys and there are none, or the reverse.
-            Insecure: other machines could connect, and there are no keys.
+            BadKeys: other machines could connect, and there are no keys.
         """
         endpoints = (*self.connect, *self.listen)
         if not endpoints:
@@ -72,7 +72,7 @@ class BusSettings:
                 raise ValueError(f"{endpoint}: with keys a bus is at tls/HOST:PORT, and without it is not")
         open_to_others = [endpoint for endpoint in self.listen if not local(endpoint)]
         if self.keys is None and not self.insecure and open_to_others:
-            raise Insecure(
+            raise BadKeys(
                 f"{', '.join(open_to_others)} is open to other machines: give --keys FOLDER (`brakeline keys` makes "
                 "one) and tls/HOST:PORT, or listen on 127.0.0.1; --insecure goes without"
             )
@@ -94,8 +94,8 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
     """Return the Zenoh configuration of a session of the process `source`.
 
     Raises:
-        ValueError, Insecure: see `BusSettings.check`.
-        BadKeys: the process has no keys, or none to listen with.
+        ValueError: see `BusSettings.check`.
+        BadKeys: see `BusSettings.check`; or the process has no keys, or none to listen with.
     """
     settings.check()
     client = not settings.listen
@@ -122,7 +122,7 @@ def open_session(settings: BusSettings, source: str) -> zenoh.Session:
 
     Raises:
         Unreachable: no router answered, or the process cannot listen on an endpoint.
-        ValueError, Insecure, BadKeys: see `configuration`.
+        ValueError, BadKeys: see `configuration`.
     """
     until = time.monotonic() + (0.0 if settings.listen else settings.patience)
     pause = FIRST_PAUSE

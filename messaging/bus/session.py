@@ -41,7 +41,7 @@ class Bus:
     Raises:
         Unreachable: no router answered within `patience`, or the process cannot listen on an endpoint.
         ValueError: there is no endpoint, or the name cannot be part of a key.
-        Insecure, BadKeys: keys are necessary, or `source` has none.
+        BadKeys: keys are necessary, or `source` has none.
     """
 
     def __init__(self, settings: BusSettings, source: str) -> None:
@@ -57,7 +57,7 @@ class Bus:
         self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
         self._queries = self._telemetry if settings.listen else open_session(settings, source)
-        self._asker = QueryClient(self._queries)
+        self._query_client = QueryClient(self._queries)
         self._token = self._telemetry.liveliness().declare_token(self._full(ALIVE.format(source=source)))
 
     def __enter__(self) -> Self:
@@ -147,7 +147,7 @@ class Bus:
             Refused: the service answered with an error.
             ValueError: a name is missing or unknown.
         """
-        return self._asker.ask(self._full(exact_key(topic, names)), payload, timeout)
+        return self._query_client.ask(self._full(exact_key(topic, names)), payload, timeout)
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
         """Return the names of the processes that are alive now, with this one."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from brakeline.errors import BadKeys, BusError, Insecure, NoReply, Unreachable
+from brakeline.errors import BadKeys, BusError, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
 from brakeline.messaging.bus.access_control import grants
@@ -301,7 +301,7 @@ def test_what_is_within_this_machine(endpoint: str, here: bool) -> None:
 def test_a_bus_that_others_reach_does_not_start_without_keys(keys: Path) -> None:
     port = free_endpoint().rsplit(":", 1)[1]
     open_to_all = f"tcp/0.0.0.0:{port}"
-    with pytest.raises(Insecure, match="--keys"):
+    with pytest.raises(BadKeys, match="--keys"):
         Bus(BusSettings(listen=(open_to_all,)), "launcher")
     with pytest.raises(ValueError, match="tls/"):
         Bus(BusSettings(listen=(open_to_all,), keys=keys), "launcher")
