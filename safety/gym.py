@@ -37,6 +37,12 @@ UNANSWERED = "unanswered"  # in place of a decision's kind: no service answered,
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Replaces each action by the filter's decision on it, and subtracts a penalty from the reward.
 
+    >>> from brakeline import Filter
+    >>> env = SafetyWrapper(gymnasium.make("brakeline.envs:brakeline/Ground-v0"), Filter.load("ground"))
+    >>> observation, info = env.reset(seed=0)
+    >>> env.step(np.zeros(2))[4]["safety"].verified
+    True
+
     `info` may hold `scan` (a `Scan`, or a `RangeImage` in space) instead of obstacles. `step` adds to `info`:
 
         safety: the `Answer`; None if a service did not answer.

@@ -107,12 +107,21 @@ class ImageMemory(VisibilityMemory[RangeImage]):
 
 
 def memory_of(robot: Robot) -> FanMemory | ImageMemory:
-    """Return an empty memory for a robot's sensor."""
+    """Return an empty memory for a robot's sensor.
+
+    >>> from brakeline import robot_named
+    >>> memory_of(robot_named("ground")).unused
+    True
+    """
     return FanMemory(robot.footprint) if robot.position_dim == 2 else ImageMemory(robot.footprint)
 
 
 def filled(memory: FanMemory | ImageMemory, info: Mapping[str, Any], elapsed: float) -> Scan | RangeImage | None:
     """Return `info["scan"]` of an environment, with unknown beams filled in from memory.
+
+    >>> from brakeline import robot_named
+    >>> filled(memory_of(robot_named("ground")), {}, elapsed=0.2) is None
+    True
 
     Args:
         memory: of the robot. A scan of the other kind is returned unchanged.

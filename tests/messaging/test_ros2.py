@@ -147,15 +147,12 @@ def test_an_invalid_token_is_refused(token):
 
 
 @given(st.floats(-3.1, 3.1), st.floats(0.0, 2e9))
-def test_angles_and_times_survive_a_conversion(yaw, moment):
-    assert yaw_of(quaternion(yaw)) == pytest.approx(yaw, abs=1e-9)
+def test_angles_and_times_survive_a_conversion_and_what_is_no_rotation_has_no_yaw(yaw, moment):
+    rotation = quaternion(yaw)
+    assert yaw_of(rotation) == pytest.approx(yaw, abs=1e-9)
+    rotation.w = rotation.z = 0.0
+    assert np.isnan(yaw_of(rotation))
     assert seconds(time_of(moment)) == pytest.approx(moment, abs=1e-6)
-
-
-def test_a_quaternion_that_is_not_a_rotation_has_no_yaw():
-    nothing = quaternion(0.0)
-    nothing.w = 0.0
-    assert np.isnan(yaw_of(nothing))
 
 
 @pytest.fixture
@@ -236,14 +233,11 @@ def test_an_invalid_message_does_not_stop_the_next_one(nodes, caplog):
     assert "/cmd_vel: Malformed: not a geometry_msgs/msg/Twist" in caplog.text
 
 
-def test_without_a_router_the_error_says_what_to_do():
+def test_without_a_router_the_error_says_what_to_do_and_a_taken_endpoint_is_one(nodes):
     begun = time.monotonic()
     with pytest.raises(Unreachable, match="rmw_zenohd"):
         RosNode(RosSettings(connect=(free_endpoint(),), patience=0.5), "alone")
     assert time.monotonic() - begun < 20.0
-
-
-def test_a_taken_endpoint_is_an_error(nodes):
     taken = nodes("first").settings.listen
     with pytest.raises(Unreachable, match="cannot listen"):
         RosNode(RosSettings(listen=taken), "second")

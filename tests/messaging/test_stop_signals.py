@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 
-from brakeline.messaging.stop_signals import stop_on_signals
+from brakeline.messaging.stop_signals import NUMBERS, stop_on_signals
 
 WAITS = """
 import signal
@@ -49,22 +49,19 @@ def test_a_signal_that_another_thread_was_handed() -> None:
     ended(process)
 
 
-def test_what_was_there_before_is_there_again() -> None:
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+def test_the_handlers_are_restored_and_another_thread_changes_none() -> None:
+    before = [signal.getsignal(number) for number in NUMBERS]
     with stop_on_signals(threading.Event()) as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.wait(10.0)
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-def test_not_in_the_main_thread_nothing_is_changed() -> None:
-    before, seen = signal.getsignal(signal.SIGTERM), []
+    assert [signal.getsignal(number) for number in NUMBERS] == before
+    seen = []
 
     def elsewhere() -> None:
         with stop_on_signals(threading.Event()):
-            seen.append(signal.getsignal(signal.SIGTERM))
+            seen.extend(signal.getsignal(number) for number in NUMBERS)
 
     thread = threading.Thread(target=elsewhere)
     thread.start()
     thread.join()
-    assert seen == [before]
+    assert seen == before
