@@ -206,7 +206,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
         advance: is called after each request.
 
     Raises:
-        NoLog, NotALog: the paths are no log.
+        LogError: the paths are no log.
         LogError, BadModel: a model that was in use is missing or damaged.
     """
     log = open_log(paths)
