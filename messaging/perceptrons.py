@@ -45,7 +45,7 @@ class Perceptrons:
             BadWeights: layers do not fit each other, or are not finite.
         """
         self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
-        first = self.layers[0][0].shape if self.layers else ()
+        first: tuple[int, ...] = self.layers[0][0].shape if self.layers else ()
         self.count, _, self.inputs = first if len(first) == 3 else (0, 0, 0)
         self.outputs = check_layers(self.layers, self.inputs, (self.count,))
 
