@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,7 +26,6 @@ from brakeline.actors.episode_runner import (
     SharedWorld,
     decide,
 )
-from brakeline.actors.learner_client import LearnerClient
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder, MessageSink
 from brakeline.actors.policies import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, Stop
 from brakeline.messaging import brakeline_pb2 as pb
@@ -76,7 +75,7 @@ class EnvironmentFactory(Protocol):
 
 WorldFactory = Callable[[RobotWithTask, str, int, int], SharedWorld]  # (robot, arena, number of robots, seed)
 
-STOP_PRACTICE = "Practised: the stop goes on as it was verified"  # the failure of an outcome that was not needed
+STOP_PRACTICE = "Practised: the stop goes on as it was verified"  # the failure of an outcome during a practised stop
 STANDSTILL = 2  # periods that a practised stop lasts after its plan
 
 
@@ -137,9 +136,9 @@ class ActorRunner:
 
         Args:
             offset: the robot's number in this process.
-            propose: creates the policy. None: the robot learns.
+            propose: makes the policy; None: the robot learns.
             continuous: see `EpisodeRunner`.
-            env: the robot's environment in a shared world. None: `make` creates one.
+            env: the robot's environment in a shared world; None: `make` makes one.
         """
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
@@ -158,8 +157,8 @@ class ActorRunner:
             continuous=continuous,
         )
         if propose is None:
-            learner = LearnerClient(process.bus, robot, actor, settings.lockstep)
-            self.proposer: Proposer = RealTimePolicy(learner) if continuous else LearnedPolicy(learner)
+            learned = RealTimePolicy if continuous else LearnedPolicy
+            self.proposer: Proposer = learned(process.bus, robot, actor, settings.lockstep)
         else:
             self.proposer = FixedPolicy(propose, settings.seed + identity.number, settings.steps)
         self.next_episode = 0
@@ -217,7 +216,7 @@ class ActorRunner:
         return outcome
 
     def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
-        """Return the outcome to act on: here the same; in real time the plan may come too late."""
+        """Return the outcome to act on; in real time the plan may come too late."""
         return outcome
 
     def publish(self, step: pb.Step) -> None:
@@ -246,15 +245,8 @@ class ActorStats:
 
     def figures(self, seconds: float) -> dict[str, float]:
         """Return the figures for Health after this many seconds."""
-        return {
-            "steps": self.steps,
-            "steps_per_s": self.steps / max(seconds, 1e-9),
-            "fallbacks": self.fallbacks,
-            "waits": self.waits,
-            "collisions": self.collisions,
-            "contacts_robots": self.contacts_robots,
-            "round_trip_ms": self.round_trip_ms / max(self.steps, 1),
-        }
+        round_trip_ms = self.round_trip_ms / max(self.steps, 1)
+        return asdict(self) | {"steps_per_s": self.steps / max(seconds, 1e-9), "round_trip_ms": round_trip_ms}
 
 
 class ActorGroup:
@@ -284,10 +276,8 @@ class ActorGroup:
             stats.waits += 1
             time.sleep(RETRY_INTERVAL)
             return
-        settled = [
-            None if outcome is None else actor.settle(outcome)
-            for actor, outcome in zip(self.actors, outcomes, strict=True)
-        ]
+        turns = zip(self.actors, outcomes, strict=True)
+        settled = [None if outcome is None else actor.settle(outcome) for actor, outcome in turns]
         stats.round_trip_ms += sum(outcome.round_trip_ms for outcome in settled if outcome is not None)
         versions = [actor.proposer.version for actor in self.actors]
         for actor, step in zip(self.actors, self.robots.execute(proposals, settled, versions), strict=True):
@@ -326,10 +316,9 @@ def run(
     """Drive until the run is over (True), or until SIGINT or SIGTERM (False).
 
     Args:
-        settings: the settings of the process.
         make: makes the environment of a robot that is alone.
-        propose: makes each robot's policy; None: the robots learn. The run is then over after as many steps as the
-            settings say, in a fleet once one robot has taken them.
+        propose: makes each robot's policy, which acts for `settings.steps` steps, in a fleet until one robot has taken
+            them; None: the robots learn until the learner ends the run.
         make_world: makes the world of a fleet.
 
     Raises:

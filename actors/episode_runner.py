@@ -25,8 +25,12 @@ from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KIND_NUMBERS
 from brakeline.sim.scripted_policies import Policy
 
-StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # what an environment's `step` returns
+StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # the result of an environment's `step`
 EPISODE_STRIDE = 4096  # robots of one run never share a seed: seed = episode * stride + number of the robot
+COPIED = (  # values of `info` that a step records under the same name
+    *("collision", "contact_moving", "contact_standing", "contact_robot"),
+    *("speed", "clearance", "outside", "turned"),
+)
 
 
 class Environment(Protocol):
@@ -105,7 +109,7 @@ class EpisodeRunner:
             filtered: whether the safety service decides about the proposals.
             ends_on_intervention: an intervention ends the episode instead of costing a penalty (SAILR's training).
                 The learner receives a terminal step with the lowest reward.
-            continuous: a reset sets a new goal and leaves the robot where it is. The backup plan stays in force.
+            continuous: a reset sets a new goal, leaves the robot where it is and keeps its backup plan in force.
         """
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
@@ -163,7 +167,7 @@ class EpisodeRunner:
         return None if ask is None else request_decisions(ask, [self.request(proposal)], self.robot)[0]
 
     def execute(self, proposal: Array, outcome: DecisionOutcome | None, weights_version: int = 0) -> pb.Step:
-        """Act on an outcome for one period; without an outcome, execute the proposal. Return the recorded step."""
+        """Act on an outcome for one period; without an outcome, execute the proposal. Return the step."""
         action = self.command(proposal, outcome)
         return self.record(proposal, outcome, action, self.env.step(action), weights_version)
 
@@ -189,7 +193,7 @@ class EpisodeRunner:
         self.step += 1
 
     def idle(self, result: StepResult) -> None:
-        """Take in a period after the end of this robot's episode, while others in its world are still driving."""
+        """Take in a period after the end of this robot's episode, while others in its world still drive."""
         self.observation, _, _, _, self.info = result
         self._fill_scan()
         self.step += 1
@@ -204,8 +208,8 @@ class EpisodeRunner:
     ) -> pb.Step:
         """Take in the result of a command, and return the step."""
         before, input_before = self.observation, self.info["input_in_force"]
-        self.observation, reward, terminated, truncated, self.info = result
-        info = self.info
+        self.observation, reward, terminated, truncated, info = result
+        self.info = info
         self._fill_scan()
         self.running = not (terminated or truncated)
         if outcome is None:
@@ -226,19 +230,12 @@ class EpisodeRunner:
             terminated=terminated,
             truncated=truncated,
             goal=info["at_goal"],
-            collision=info["collision"],
-            contact_moving=info["contact_moving"],
-            contact_standing=info["contact_standing"],
-            contact_robot=info["contact_robot"],
             fleet=self.fleet_size,
-            speed=info["speed"],
-            clearance=info["clearance"],
             state=info["state"].tolist(),
             true_state=info["true_state"].tolist(),
-            outside=info["outside"],
             path=info["subsamples"].ravel().tolist(),
-            turned=info["turned"],
             weights_version=weights_version,
+            **{name: info[name] for name in COPIED},
         )
         step.header.time = info["time"]
         self.step += 1
@@ -249,7 +246,7 @@ class EpisodeRunner:
         return step
 
     def _record_decision(self, step: pb.Step, outcome: DecisionOutcome) -> None:
-        """Write into the step the decision, and whether the new state is in the set that the filter predicted."""
+        """Record the decision, and whether the new state is in the set that the filter predicted."""
         answer = outcome.answer
         if answer is None:
             step.fallback = True
@@ -290,7 +287,7 @@ class RobotGroup:
 
         Args:
             runners: the robots. Without a world, exactly one.
-            world: the world that the robots share. None: the robot has an environment of its own.
+            world: the world that the robots share.
             reserving: whether the robots of a world reserve space for each other. Without reservations the filter
                 does not know about the other robots.
         """
@@ -306,7 +303,7 @@ class RobotGroup:
         return any(runner.running for runner in self.runners)
 
     def begin(self, episode: int) -> list[pb.Episode]:
-        """Begin the episode of this number with all robots at their starts."""
+        """Begin an episode with all robots at their starts."""
         if self.world is not None:
             self.world.draw(self.runners[0].identity.episode_seed(episode))
         return [runner.begin(episode) for runner in self.runners]
@@ -325,7 +322,6 @@ class RobotGroup:
         versions = versions or [0] * len(self.runners)
         turns = list(zip(self.runners, proposals, outcomes, versions, strict=True))
         inputs = [runner.command(proposal, outcome) for runner, proposal, outcome, _ in turns]
-        results: list[StepResult]
         results = [self.runners[0].env.step(inputs[0])] if self.world is None else self.world.step(inputs)
         steps: list[pb.Step | None] = []
         for (runner, proposal, outcome, version), action, result in zip(turns, inputs, results, strict=True):
@@ -340,15 +336,14 @@ class RobotGroup:
 def decide(
     groups: Sequence[RobotGroup], proposals: Sequence[Sequence[Array]], ask: Ask | None
 ) -> list[list[DecisionOutcome | None]]:
-    """Ask one question about all robots of the groups.
+    """Ask one question about all robots of groups of one kind.
 
     Args:
-        groups: groups of robots of one kind.
-        proposals: of each group, the proposal (m,) of each robot.
+        proposals: the proposal (m,) of each robot of each group.
         ask: sends the requests; None: there is no filter.
 
     Returns:
-        Of each group, the outcome of each robot; None where there is no filter.
+        The outcome of each robot of each group; None without a filter.
     """
     if ask is None:
         return [[None] * len(group.runners) for group in groups]
@@ -369,14 +364,7 @@ def joint_outcomes(outcomes: Sequence[DecisionOutcome]) -> list[DecisionOutcome 
 def run_episode(
     group: RobotGroup, policies: Sequence[Policy], ask: Ask | None, episode: int
 ) -> Iterator[list[pb.Step]]:
-    """Run one episode, and yield the steps of each period.
-
-    Args:
-        group: the robots.
-        policies: the policy of each robot.
-        ask: the safety service; None: there is no filter.
-        episode: its number.
-    """
+    """Run one episode, and yield the steps of each period. policies: one for each robot; ask: see `decide`."""
     group.begin(episode)
     while group.running:
         proposals = [

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any
 
 import numpy as np
 from google.protobuf.message import Message
@@ -34,7 +33,7 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.decision_guard import Ask, DecisionOutcome, request_decisions
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.frame_recorder import MessageSink
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
 from brakeline.actors.policies import PolicyFactory, Stop
@@ -55,10 +54,11 @@ log = logging.getLogger("brakeline.flight")
 
 GOALS = 12  # of a flight, which then come again: a policy prepares for each of them before the flight
 RETRY_INTERVAL = 0.2  # s between two questions to a service that does not answer yet
+DRAIN_TIMEOUT = 2.0  # s for the last messages of a flight
 
 
 class BackgroundPublisher:
-    """Publishes in a thread of its own, so that a receiver that does not read cannot hold up the flight."""
+    """Publishes in a thread of its own, so that a receiver that does not read cannot delay the flight."""
 
     def __init__(self) -> None:
         self._queue: SimpleQueue[tuple[MessageSink, Message] | None] = SimpleQueue()
@@ -66,13 +66,13 @@ class BackgroundPublisher:
         self._thread.start()
 
     def wrap(self, publisher: MessageSink) -> MessageSink:
-        """Return a sink that passes its messages to a publisher in the background."""
+        """Return a sink that publishes in the background."""
         return QueuedSink(publisher, self._queue)
 
-    def close(self, timeout: float = 2.0) -> None:
-        """Wait until everything is published, for `timeout` seconds at most."""
+    def close(self) -> None:
+        """Wait until everything is published, for `DRAIN_TIMEOUT` at most."""
         self._queue.put(None)
-        self._thread.join(timeout)
+        self._thread.join(DRAIN_TIMEOUT)
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
@@ -101,7 +101,7 @@ class RealTimeVehicle:
     The true state is unknown here. The estimate takes its place, also for the rays of a virtual scan.
 
     Attributes:
-        current_period: the latest control period.
+        current_period: the latest period that the environment observed.
         skipped: number of periods that passed without an observation.
     """
 
@@ -210,12 +210,9 @@ class FlightRunner(ActorRunner):
         if self._vehicle is None:
             return {}
         needed = max(self.answers.total() - self.answers["not needed"], 1)
-        return {
-            **{f"answers {result}": self.answers[result] for result in ("in time", "late", "none", "lost")},
-            "answers in time share": self.answers["in time"] / needed,
-            "periods skipped": self._vehicle.skipped,
-            **self._vehicle.vehicle.figures(),
-        }
+        counts = {f"answers {result}": self.answers[result] for result in ("in time", "late", "none", "lost")}
+        shares = {"answers in time share": self.answers["in time"] / needed, "periods skipped": self._vehicle.skipped}
+        return counts | shares | self._vehicle.vehicle.figures
 
     def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> EnvironmentFactory:
         """Make the environment: obstacles are virtual, and a scan is computed from the estimated pose."""
@@ -236,24 +233,13 @@ class FlightRunner(ActorRunner):
         return make
 
 
-def prepared(propose: PolicyFactory, stages: Sequence[Arena], seed: int) -> Any:
-    """Return the policy, prepared for each arena if it can prepare."""
-    policy = propose(seed)
-    if hasattr(policy, "prepare"):
-        for stage in stages:
-            policy.prepare(stage)
-    return policy
-
-
 def takeoff_verified(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop) -> bool:
-    """Wait until the safety service decides about hovering at the start. Return False if `stop` returned true.
+    """Wait until the safety service decides about hovering at the start. Return False after a stop.
 
     Args:
-        question: asks the service.
         robot: the robot in real time.
         stage: the first arena.
         filtered: whether our own filter decides; a rival method does not tell whether it can verify hovering.
-        stop: once it returns true, nothing here waits any more.
 
     Raises:
         TakeoffNotVerified: the filter cannot verify hovering there.
@@ -293,11 +279,9 @@ def run(
     The vehicle then brakes, and stays with its autopilot.
 
     Args:
-        settings: the settings of the process.
-        flight: the autopilot.
         arena: the map.
-        propose: makes the policy, which flies the settings' number of steps; None: the robot learns until the learner
-            ends the run.
+        propose: makes the policy, which flies `settings.steps` steps; None: the robot learns until the learner ends
+            the run.
         conditions: of these only perception counts.
 
     Raises:
@@ -309,7 +293,9 @@ def run(
         raise Mismatch("a real-time flight needs the filter, and a robot whose plans allow for the delay")
     stages = goal_sequence(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
-        policy = prepared(propose, stages, settings.seed)
+        policy = propose(settings.seed)
+        for stage in stages if hasattr(policy, "prepare") else ():
+            policy.prepare(stage)  # type: ignore[attr-defined]
         propose = lambda _: policy  # noqa: E731
     stats, publisher = ActorStats(), BackgroundPublisher()
     with Process(settings.bus, settings.name) as process:

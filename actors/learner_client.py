@@ -29,7 +29,6 @@ class LearnerClient:
     Attributes:
         policy: the newest policy; None before the first join.
         flow: the learner's latest message about permissions.
-        joins: number of successful joins.
     """
 
     def __init__(self, bus: Bus, robot: RobotWithTask, actor: str, lockstep: bool = False) -> None:
@@ -37,7 +36,6 @@ class LearnerClient:
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
         self.policy: MLP | None = None
         self.flow = pb.Flow()
-        self.joins = 0
         self._incarnation = 0  # of the learner that accepted this actor; 0: none
         self._index = 0  # of the latest step that this actor waited for
         self._doubtful = False  # whether a message contradicts our learner, so that we have to join again
@@ -53,25 +51,20 @@ class LearnerClient:
         return self.flow.done
 
     @property
-    def warmup(self) -> bool:
-        """Whether the learner asks for random actions."""
-        return self.flow.warmup
-
-    @property
     def joined(self) -> bool:
-        """Whether the learner that accepted this actor is still running, and no message contradicts that."""
+        """Whether the learner that accepted this actor still runs, and no message contradicts that."""
         return self.flow.incarnation == self._incarnation and not self._doubtful
 
     def join(self, index: int, episode: int, stop: Callable[[], bool]) -> int | None:
         """Wait until a learner accepts this actor.
 
         Args:
-            index: the number of steps so far.
+            index: number of steps so far.
             episode: the next episode by the actor's own count.
-            stop: once it returns true, the actor does not wait any more.
+            stop: ends the wait when it returns true.
 
         Returns:
-            The episode to go on with; None if `stop` returned true.
+            The episode to go on with; None after a stop.
 
         Raises:
             RefusedByLearner: with the learner's reason.
@@ -96,7 +89,6 @@ class LearnerClient:
                 self.flow, self._index, self._doubtful = reply.flow, index, False
                 self._incarnation = reply.flow.incarnation
                 self._take(reply.weights, joining=True)
-            self.joins += 1
             return reply.episode
         return None
 
@@ -136,24 +128,19 @@ class LearnerClient:
             self._changed.notify_all()
 
     def _take(self, message: pb.Weights, joining: bool) -> None:
-        """Take newer weights; when joining, any. Log weights that are not valid, and keep the ones we have.
-
-        Raises:
-            Implausible: they are too far ahead of ours.
-        """
+        """Take newer weights; when joining, any. Log invalid weights. Raises Implausible: they are too far ahead."""
         if not joining:
             if self.policy is None:
-                return  # another actor's: ours come with the learner's reply to our join
+                return  # for another actor: ours come with the learner's reply to our join
             if message.version > self.policy.version + MOST_VERSIONS_AHEAD:
                 self._doubtful = True
                 raise Implausible(f"weights {message.version} after weights {self.policy.version}")
         try:
             policy = decode(message.file, self.robot)
+            if policy.version != message.version:
+                raise BadWeights(f"the file has version {policy.version}")
         except BadWeights as error:
             log.error("weights %d are not valid: %s", message.version, error)
-            return
-        if policy.version != message.version:
-            log.error("weights %d are not valid: the file has version %d", message.version, policy.version)
             return
         if joining or self.policy is None or policy.version > self.policy.version:
             self.policy = policy

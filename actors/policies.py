@@ -28,10 +28,7 @@ class Proposer(Protocol):
         """The version of the weights that propose; 0: a policy without versions."""
 
     def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """Wait until there are proposals. Return the episode to begin with; None if `stop` returned true.
-
-        index: the number of steps so far; episode: the next one by the actor's own count.
-        """
+        """Wait until there are proposals, see `LearnerClient.join`."""
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
         """Wait for permission for step number `index`. Return False at the end of the run."""
@@ -43,36 +40,27 @@ class Proposer(Protocol):
         """Return a proposal (m,); the caller checks it."""
 
 
-class LearnedPolicy:
+class LearnedPolicy(LearnerClient):
     """Explores with a learner's newest weights, and takes no more steps than the learner permits."""
-
-    def __init__(self, learner: LearnerClient) -> None:
-        self.learner = learner
 
     @property
     def version(self) -> int:
         """The version of the newest weights; 0: none have arrived."""
-        return 0 if self.learner.policy is None else self.learner.policy.version
-
-    def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """Join the learner, see `LearnerClient.join`. Raises RefusedByLearner."""
-        return self.learner.join(index, episode, stop)
+        return 0 if self.policy is None else self.policy.version
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Wait for the learner's permission, see `LearnerClient.wait`."""
-        return self.learner.wait(index, episode, stop)
+        """Wait for the learner's permission."""
+        return self.wait(index, episode, stop)
 
     def begin(self, rng: np.random.Generator) -> None:
         """Begin an episode."""
-        self._rng = rng
-        self._random = scripted("random", self.learner.robot, rng)
+        self._rng, self._random = rng, scripted("random", self.robot, rng)
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
         """Return the exploring policy's action; during warm-up, a random one."""
-        policy = self.learner.policy
-        if policy is None or self.learner.warmup:
+        if self.policy is None or self.flow.warmup:
             return self._random(observation, info)
-        return np.asarray(policy.explore(observation, self._rng), dtype=float)
+        return np.asarray(self.policy.explore(observation, self._rng), dtype=float)
 
 
 class RealTimePolicy(LearnedPolicy):
@@ -82,11 +70,10 @@ class RealTimePolicy(LearnedPolicy):
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
         """Return False at the end of the run. Never waits."""
-        if not self.learner.joined and (self._joining is None or not self._joining.is_alive()):
-            arguments = (index - 1, episode, stop)
-            self._joining = threading.Thread(target=self.learner.join, args=arguments, name="join", daemon=True)
+        if not self.joined and (self._joining is None or not self._joining.is_alive()):
+            self._joining = threading.Thread(target=self.join, args=(index - 1, episode, stop), daemon=True)
             self._joining.start()
-        return not self.learner.done
+        return not self.done
 
 
 class FixedPolicy:
@@ -106,7 +93,7 @@ class FixedPolicy:
         return not stop() and not 0 < self._steps < index
 
     def begin(self, rng: np.random.Generator) -> None:
-        """Do nothing: scripted policies notice a new episode by themselves."""
+        """Do nothing: scripted policies detect a new episode by themselves."""
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
         """Return the policy's action."""

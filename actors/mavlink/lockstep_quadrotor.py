@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Protocol
 
@@ -28,61 +29,72 @@ class Endpoint(Protocol):
     def advance(self, seconds: float) -> None: ...
 
 
-class LockstepQuadrotor:
-    """A quadrotor flown by a simulated autopilot in this process: time passes only in `step`.
+class LockstepVehicle(ABC):
+    """A simulated quadrotor that an autopilot flies over MAVLink: time passes only in `step`.
 
-    The measured state comes from telemetry; the true state and the contacts come from the simulator. The autopilot
-    starts in the air, and changes its mode before time begins.
+    The measured state comes from the autopilot; the true state and the contacts come from the simulator.
 
     Attributes:
         input: the input in force (3,) [m/s].
         measured, true: the state (9,).
     """
 
-    def __init__(self, endpoint: Endpoint, robot: Robot, tap: FrameTap | None = None) -> None:
-        """tap: called with every MAVLink frame. Raises MavlinkError: the autopilot refuses something."""
-        self._endpoint, self._client = endpoint, AutopilotClient(endpoint.receive, tap=tap)
-        self._robot, period = robot, robot.period
+    def __init__(self, robot: Robot, vehicle: Quadrotor) -> None:
+        self._robot, self._vehicle = robot, vehicle
         self.input = np.zeros(robot.action_dim)
-        wait = self._wait
-        for what, interval in ((MOTION, period / SAMPLES), (ATTITUDE, period), (FORCE, period)):
-            self._request(what, interval)
-        self._client.follow_setpoints(wait)
-        self.true, self.measured = endpoint.vehicle.state(), self._measured()
+        self.true = self.measured = vehicle.state()
+
+    @abstractmethod
+    def _fly(self) -> Array:
+        """Fly one period at `input`, update `measured`, and return the positions (S, 3) [m] at even times."""
 
     def step(self, input: Array) -> Period:
         """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
 
         Raises:
             BadInput: the input is not three finite numbers.
+            AutopilotGone: the autopilot does not answer.
         """
-        self.input = clip_input(self._robot, input, self.input)
-        client, endpoint, start = self._client, self._endpoint, self.measured[:3]
-        client.path.clear()
-        client.setpoint(self.input)
-        endpoint.vehicle.begin_period()
-        endpoint.advance(self._robot.period)
-        client.feed(endpoint.take())
-        self.measured = self._measured()
-        path = np.array([position for _, position in client.path]) - start
-        period = endpoint.vehicle.end_period(self.measured, path)
+        self.input, start = clip_input(self._robot, input, self.input), self.measured[:3]
+        self._vehicle.begin_period()
+        path = self._fly()
+        period = self._vehicle.end_period(self.measured, path - start)
         self.true = period.true
         return period
 
     def initial_period(self) -> Period:
         """Return the report before the first step: the current state, as of a period without motion."""
-        clearance = float(self._endpoint.vehicle.clearance(self.true[:3]))
+        clearance = float(self._vehicle.clearance(self.true[:3]))
         return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
 
     def alter(self, **changes: float) -> None:
         """Change the simulated vehicle, see `Quadrotor.alter`."""
-        self._endpoint.vehicle.alter(**changes)
+        self._vehicle.alter(**changes)
 
-    def _measured(self) -> Array:
-        """Return the state (9,) of the latest telemetry."""
-        client = self._client
-        assert client.position is not None
-        return np.concatenate((client.position, client.velocity, client.acceleration))
+
+class LockstepQuadrotor(LockstepVehicle):
+    """A quadrotor behind a simulated autopilot in this process, which starts in the air.
+
+    The autopilot changes its mode before time begins.
+    """
+
+    def __init__(self, endpoint: Endpoint, robot: Robot, tap: FrameTap | None = None) -> None:
+        """tap: called with every MAVLink frame. Raises MavlinkError: the autopilot refuses something."""
+        super().__init__(robot, endpoint.vehicle)
+        self._endpoint, self._client = endpoint, AutopilotClient(endpoint.receive, tap=tap)
+        for what, interval in ((MOTION, robot.period / SAMPLES), (ATTITUDE, robot.period), (FORCE, robot.period)):
+            self._request(what, interval)
+        self._client.follow_setpoints(self._wait)
+        self.measured = self._client.state()
+
+    def _fly(self) -> Array:
+        client, endpoint = self._client, self._endpoint
+        client.path.clear()
+        client.setpoint(self.input)
+        endpoint.advance(self._robot.period)
+        client.feed(endpoint.take())
+        self.measured = client.state()
+        return np.array([position for _, position in client.path])
 
     def _request(self, what: str, interval: float) -> None:
         """Request the best message that the autopilot grants, at an interval [s] and now. Raises CommandRefused."""

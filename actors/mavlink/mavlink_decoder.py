@@ -17,17 +17,7 @@ import numpy as np
 from brakeline.actors.mavlink import telemetry
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
-from brakeline.actors.mavlink.telemetry import (
-    ATTITUDE,
-    FORCE,
-    GRAVITY,
-    LANDED,
-    MOTION,
-    SOURCES,
-    TRUTH,
-    Array,
-    GeoPosition,
-)
+from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, SOURCES, TRUTH, Array, GeoPosition
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -80,7 +70,7 @@ class MavlinkDecoder:
         self._sequence: int | None = None
         self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
         self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
-        self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -GRAVITY)], 1)
+        self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -telemetry.GRAVITY)], 1)
         self._acks: dict[int, int] = {}
         self._parameters: dict[str, float] = {}
         self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
@@ -96,6 +86,12 @@ class MavlinkDecoder:
         count = len(self._forces)
         x, y, z = (sum(force[axis] for force in self._forces) / count for axis in range(3))
         return telemetry.acceleration(self._attitude, (x, y, z))
+
+    def state(self, origin: Array | float = 0.0, ahead: float = 0.0) -> Array:
+        """Return the state (9,), extrapolated by `ahead` seconds. origin: (3,) m, of the autopilot's local frame."""
+        assert self.position is not None
+        v, a = self.velocity, self.acceleration
+        return np.concatenate((self.position + origin + ahead * v + 0.5 * ahead**2 * a, v + ahead * a, a))
 
     @property
     def offboard(self) -> bool:

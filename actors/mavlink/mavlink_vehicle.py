@@ -7,18 +7,19 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVehicle
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
-from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array
+from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array, resampled
 from brakeline.errors import MavlinkError, TelemetryMissing
-from brakeline.messaging.byte_links import Link
+from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES
@@ -35,25 +36,7 @@ LOW_BATTERY = 20.0  # %, below which the log says so
 LATE = 0.02  # s after its time at which a period's start counts as late
 
 
-@dataclass(frozen=True)
-class ControlPeriod:
-    """One control period, at the moment when it begins.
-
-    Attributes:
-        number: its number; the first is 0.
-        input: (3,) m/s, in force from this moment on.
-        report: the outcome of the period before.
-        lost: why the measurement or our control does not count: no recent telemetry, or the autopilot does not follow
-            our setpoints. Empty if both count.
-    """
-
-    number: int
-    input: Array
-    report: Period
-    lost: str = ""
-
-
-class MavlinkVehicle:
+class MavlinkVehicle(PeriodicVehicle):
     """A quadrotor in real time on a link, with any autopilot that speaks MAVLink, simulated or not.
 
     Periods follow each other by the clock. `commit` takes a plan: one input for each period that has not begun. The
@@ -69,67 +52,58 @@ class MavlinkVehicle:
 
     def __init__(
         self,
-        link: Link,
         robot: Robot,
+        flight: FlightSettings,
         *,
-        system: int = 1,
-        height: float = 3.0,
-        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        truth: UdpGroundTruth | None = None,
         tap: FrameTap | None = None,
         rejected: RejectedMessages | None = None,
         stop: Callable[[], bool] = lambda: False,
-        raise_limits: bool = False,
         mavlink_truth: MavlinkGroundTruth | None = None,
-        lead: bool = False,
     ) -> None:
-        """Take control, climb to `height` [m] above the ground unless the vehicle flies already, begin period 0.
+        """Take control, climb to `flight.height` unless the vehicle flies already, and begin period 0.
 
         Args:
-            link: to the autopilot; this object closes it.
-            robot: the robot's description: its bounds, slew and period.
-            system: the autopilot's MAVLink system id.
-            height: m above the ground.
-            origin: the start of the autopilot's local frame in our world frame, m.
-            truth: the ground truth that our own simulator sends over UDP.
             tap: called with each MAVLink frame.
             rejected: counts messages that cannot be handled.
             stop: once it returns true, nothing here waits any more.
-            raise_limits: set each autopilot parameter that is below the robot's bounds.
-            mavlink_truth: the ground truth of the autopilot's own simulator; without effect if `truth` is given.
-            lead: send positions ahead of the vehicle instead of velocities (`position_lookahead`).
+            mavlink_truth: the ground truth of the autopilot's own simulator; without effect if `flight.truth` is set.
 
         Raises:
+            BadLink, OSError: the link cannot be opened.
             MavlinkError: no autopilot answers, it refuses something, or `stop` returned true.
         """
-        self._robot, self._stop_requested = robot, stop
-        self._link, self._truth = link, truth
-        self._mavlink_truth = mavlink_truth if truth is None else None
-        self._client = AutopilotClient(link.send, system, tap, lambda text: log.info("it says: %s", text))
-        self._origin, self._rejected = np.asarray(origin), rejected or RejectedMessages()
+        super().__init__(robot)
+        self._stop_requested, self._rejected = stop, rejected or RejectedMessages()
+        self._origin = np.asarray(flight.origin)
         self.timing = FlightTiming()
         self._plan: list[Array] = []  # the inputs after the one in force
         self._sent_at = self._heartbeat_at = self._synced_at = -math.inf
         self._counted: dict[str, int] = {}  # messages by their quantity
         self._received_at: dict[str, float] = {}  # s, arrival of the latest of them
         self._logged_loss, self._logged_battery = "", False
-        self._takeoff = Takeoff(self._client, robot, self._wait, self._hold, raise_limits, lead)
-        self.notes = self._takeoff.notes
         self._velocity: Array | None = None  # the setpoint that is repeated
         self._offsets = ClockOffset()
-        self._changed, self._ended, self._failure = threading.Condition(), threading.Event(), ""
+        self._ended = threading.Event()
+        self._link = open_link(flight.url)
+        self._truth: UdpGroundTruth | None = None
+        self._mavlink_truth = None if flight.truth else mavlink_truth
+        self._client = AutopilotClient(self._link.send, flight.system, tap, lambda text: log.info("it says: %s", text))
+        self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold)
+        self.notes = self._takeoff.notes
         try:
-            self._takeoff.fly(height)
+            if flight.truth:
+                self._truth = UdpGroundTruth(flight.truth, flight.system, self._rejected)
+            self._takeoff.fly()
         except BaseException:
-            link.close()
+            self._disconnect()
             raise
-        self._collisions = 0 if truth is None else truth.collisions
+        self._collisions = 0 if self._truth is None else self._truth.collisions
         if self._mavlink_truth is not None:
             self._request_truth()
         state = self._state(time.monotonic())
         standing = Period(state, state, False, math.inf, math.inf, np.zeros((SAMPLES, 3)), 0.0)
-        self.current_period = ControlPeriod(0, np.zeros(self._robot.action_dim), standing)
-        self._due = time.monotonic() + self._robot.period  # s, start of the next period
+        self._begin(ControlPeriod(0, np.zeros(robot.action_dim), standing))
+        self._due = time.monotonic() + robot.period  # s, start of the next period
         self._pump = threading.Thread(target=self._run, name="mavlink", daemon=True)
         self._pump.start()
 
@@ -150,22 +124,6 @@ class MavlinkVehicle:
                 unchanged = [*self._plan, *[np.zeros(self._robot.action_dim)] * before][:before]
                 self._plan = unchanged + rows
         return in_time
-
-    def wait(self, number: int) -> ControlPeriod:
-        """Wait until period `number` has begun, and return the current period.
-
-        Raises:
-            MavlinkError: the period does not begin in time, or the vehicle's thread has died.
-        """
-        with self._changed:
-            patience = 2.0 + self._robot.period * max(0, number - self.current_period.number)
-            if not self._changed.wait_for(
-                lambda: self.current_period.number >= number or bool(self._failure), patience
-            ):
-                raise MavlinkError(f"period {number} does not begin")
-            if self._failure:
-                raise MavlinkError(f"nobody flies any more: {self._failure}")
-            return self.current_period
 
     def step(self, input: Array) -> Period:
         """Wait for the current period to end, then brake after one period with `input` (3,) [m/s]. Raises BadInput."""
@@ -190,11 +148,6 @@ class MavlinkVehicle:
         return not self._plan and not self.current_period.input.any()
 
     @property
-    def failed(self) -> bool:
-        """Whether the vehicle's thread has died."""
-        return bool(self._failure)
-
-    @property
     def silence(self) -> float:
         """Seconds since the last message of the autopilot."""
         return time.monotonic() - max(self._received_at.values(), default=-math.inf)
@@ -217,6 +170,9 @@ class MavlinkVehicle:
     def close(self) -> None:
         """Stop sending. Unless the vehicle has landed, the autopilot's timeout brakes it."""
         self._stop()
+        self._disconnect()
+
+    def _disconnect(self) -> None:
         self._link.close()
         if self._truth is not None:
             self._truth.close()
@@ -235,26 +191,23 @@ class MavlinkVehicle:
                 with self._changed:
                     now = time.monotonic()
                     if now >= self._due:
-                        self._begin(now)
+                        self._begin_next(now)
                     self._exchange(now)
         except Exception as error:  # any error: without setpoints the autopilot brakes
             log.exception("no more setpoints are sent")
-            with self._changed:
-                self._failure = f"{type(error).__name__}: {error}"
-                self._changed.notify_all()
+            self._fail(MavlinkError(f"nobody flies any more: {type(error).__name__}: {error}"))
 
-    def _begin(self, now: float) -> None:
+    def _begin_next(self, now: float) -> None:
         """Begin a period: send its input first, then report on the period before."""
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
         self._velocity = clip_input(self._robot, following, self.current_period.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.current_period.report.measured[:3], self._state(now)
-        report = self._report(state, self._path(now, state) - start)
-        self.current_period = ControlPeriod(self.current_period.number + 1, self._velocity, report, self._lost(now))
-        self._log_loss(self.current_period.lost)
+        report, lost = self._report(state, self._path(now, state) - start), self._lost(now)
+        self._begin(ControlPeriod(self.current_period.number + 1, self._velocity, report, lost))
+        self._log_loss(lost)
         self._client.path = self._client.path[-1:]
-        self._changed.notify_all()
 
     def _keep_time(self, lateness: float) -> None:
         timing = self.timing
@@ -309,20 +262,15 @@ class MavlinkVehicle:
 
     def _state(self, now: float) -> Array:
         """Return the state (9,) at time `now`: the latest telemetry, extrapolated by its velocity and acceleration."""
-        client = self._client
-        assert client.position is not None
-        ahead = min(max(now - self._offset - client.time, 0.0), STALE)
-        v, a = client.velocity, client.acceleration
-        position = client.position + self._origin + ahead * v + 0.5 * ahead**2 * a
-        return np.concatenate((position, v + ahead * a, a))
+        ahead = min(max(now - self._offset - self._client.time, 0.0), STALE)
+        return self._client.state(self._origin, ahead)
 
     def _path(self, now: float, state: Array) -> Array:
         """Return S positions (S, 3) [m] at even times of the period that ends now in `state` (9,)."""
-        path = self._client.path
+        path, period = self._client.path, self._robot.period
         times = [t + self._offset for t, _ in path] + [now]
         positions = np.array([p + self._origin for _, p in path] + [state[:3]])
-        at = now - self._robot.period + self._robot.period / SAMPLES * np.arange(1, SAMPLES + 1)
-        return np.stack([np.interp(at, times, positions[:, axis]) for axis in range(3)], axis=1)
+        return resampled(times, positions, now - period + period / SAMPLES * np.arange(1, SAMPLES + 1))
 
     def _report(self, state: Array, path: Array) -> Period:
         truth = self._truth or self._mavlink_truth

@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
+from brakeline.actors.mavlink.lockstep_quadrotor import LockstepVehicle
+from brakeline.actors.mavlink.telemetry import Array, resampled
 from brakeline.errors import AutopilotGone, MavlinkError
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
@@ -25,9 +26,6 @@ from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from brakeline.sim.vehicle import Period, clip_input
-
-Array = NDArray[np.float64]
 
 RECEIVE_EVERY, SETPOINT_EVERY = 4, 20  # physics steps
 INTERVALS = {
@@ -179,13 +177,10 @@ class Px4Flight:
     def _replace(self, vehicle: Quadrotor) -> None:
         """Replace the simulated vehicle; shift its position so that nothing changes for PX4."""
         hil = self.hil
-        (x, y, z), (a, b, c), (p, q, r) = (
-            hil.shift,
-            hil.vehicle.true_reading().position,
-            vehicle.true_reading().position,
-        )
+        before, after = hil.vehicle.true_reading().position, vehicle.true_reading().position
+        x, y, z = (shift + old - new for shift, old, new in zip(hil.shift, before, after, strict=True))
         vehicle.copy_motion(hil.vehicle)
-        hil.vehicle, hil.shift = vehicle, (x + a - p, y + b - q, z + c - r)
+        hil.vehicle, hil.shift = vehicle, (x, y, z)
 
     def _on_frame(self, frame: CapturedFrame) -> None:
         message = frame.message
@@ -206,65 +201,37 @@ def _shut(px4: Px4Process, link: socket.socket) -> None:
     link.close()
 
 
-class Px4Vehicle:
-    """A quadrotor flown by PX4 over MAVLink, for one episode: time passes only in `step`.
+class Px4Vehicle(LockstepVehicle):
+    """A quadrotor flown by PX4, for one episode.
 
-    The measured state is PX4's estimate; the true state and the contacts come from the simulator. At the start, where
-    the vehicle hovers, PX4's local frame is aligned with the arena's, as if PX4 were switched on at a known place.
-
-    Attributes:
-        input: the input in force (3,) [m/s].
-        measured, true: the state (9,).
+    The measured state is PX4's estimate. At the start, where the vehicle hovers, PX4's local frame is aligned with the
+    arena's, as if PX4 were switched on at a known place.
     """
 
     def __init__(self, flight: Px4Flight, vehicle: Quadrotor, robot: Robot) -> None:
         """Raises the errors of `Px4Flight.enter`."""
-        self._flight, self._vehicle, self._robot = flight, vehicle, robot
-        self.input = np.zeros(robot.action_dim)
         flight.enter(vehicle)
+        super().__init__(robot, vehicle)
+        self._flight = flight
         flight.send_setpoint(self.input)
         flight.settle()
         self._offset = np.zeros(3)
-        self.true = vehicle.state()
         self._offset = self.true[:3] - self._estimate()[:3]
         self.measured = self._estimate()
 
-    def step(self, input: Array) -> Period:
-        """Fly one period at a velocity setpoint (3,) [m/s], clipped to bounds and slew.
-
-        Raises:
-            BadInput: the input is not three finite numbers; AutopilotGone: PX4 does not answer.
-        """
-        self.input = clip_input(self._robot, input, self.input)
-        flight, client, start, begin = self._flight, self._flight.client, self.measured[:3], self._flight.hil.time
-        client.path.clear()
-        self._vehicle.begin_period()
+    def _fly(self) -> Array:
+        flight, path = self._flight, self._flight.client.path
+        start, begin = self.measured[:3], flight.hil.time
+        path.clear()
         flight.send_setpoint(self.input)
         flight.advance(self._robot.period)
         flight.settle()
         self.measured = self._estimate()
-        times = [begin, *(at for at, _ in client.path), flight.hil.time]
-        places = np.array([start, *(where + self._offset for _, where in client.path), self.measured[:3]])
-        samples = begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES
-        path = np.column_stack([np.interp(samples, times, places[:, axis]) for axis in range(3)])
-        period = self._vehicle.end_period(self.measured, path - start)
-        self.true = period.true
-        return period
-
-    def initial_period(self) -> Period:
-        """Return the report before the first step: the current state, as of a period without motion."""
-        clearance = float(self._vehicle.clearance(self.true[:3]))
-        return Period(self.measured, self.true, False, clearance, clearance, np.zeros((SAMPLES, 3)), 0.0)
-
-    def alter(self, **changes: float) -> None:
-        """Change the simulated vehicle, see `Quadrotor.alter`."""
-        self._vehicle.alter(**changes)
+        times = [begin, *(time for time, _ in path), flight.hil.time]
+        positions = np.array([start, *(position + self._offset for _, position in path), self.measured[:3]])
+        return resampled(times, positions, begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES)
 
     def _estimate(self) -> Array:
         """Return the state (9,) of the latest telemetry, extrapolated to the current time."""
         client = self._flight.client
-        assert client.position is not None
-        age, acceleration = max(self._flight.hil.time - client.time, 0.0), client.acceleration
-        velocity = client.velocity + age * acceleration
-        position = client.position + self._offset + age * client.velocity + 0.5 * age**2 * acceleration
-        return np.concatenate((position, velocity, acceleration))
+        return client.state(self._offset, max(self._flight.hil.time - client.time, 0.0))

@@ -10,15 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, Wait, message_id
-from brakeline.actors.mavlink.autopilot_limits import (
-    AUTOPILOT_LIMITS,
-    FIXED_TIMEOUT,
-    SHORTEST,
-    TIMEOUTS,
-    demand,
-    limits_below_demand,
-)
+from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, limits_below_demand
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, missing
 from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.robot import Robot
@@ -34,6 +28,9 @@ ESTIMATOR_SILENCE = 30.0  # s without the estimator's state, after which the tak
 REST = 0.2  # m/s: a slower vehicle hovers; the estimate may be wrong by half of that for good
 STOPPING = 20.0  # s until the vehicle hovers: it may have been flying at full speed
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
+TIMEOUTS = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}  # s without a setpoint until it brakes by itself
+FIXED_TIMEOUT = {"ardupilot": 3.0}  # s, in versions without that parameter
+SHORTEST_TIMEOUT = 0.5  # s: a busy machine's setpoints do not trip a timeout of this length
 
 
 class Takeoff:
@@ -47,27 +44,21 @@ class Takeoff:
         self,
         client: AutopilotClient,
         robot: Robot,
+        flight: FlightSettings,
         wait: Wait,
         hold: Callable[[Array | None], None],
-        raise_limits: bool,
-        lead: bool = False,
     ) -> None:
         """Prepare the takeoff of one vehicle.
 
         Args:
-            client: the autopilot.
-            robot: the robot's description: its bounds, slew and measurement error.
             wait: exchanges messages until a condition holds, or a time [s] is over.
-            hold: called with a setpoint (3,) [m/s] to repeat from now on. None: send none.
-            raise_limits: set each autopilot parameter that is below the robot's bounds.
-            lead: send positions ahead of the vehicle (`brakeline.actors.mavlink.position_lookahead`).
+            hold: called with a setpoint (3,) [m/s] to repeat from now on; None: send none.
         """
-        self._client, self._robot, self._wait, self._hold = client, robot, wait, hold
-        self._raise_limits, self._lead = raise_limits, lead
+        self._client, self._robot, self._flight, self._wait, self._hold = client, robot, flight, wait, hold
         self.notes: list[str] = []
 
-    def fly(self, height: float) -> None:
-        """Climb to a height [m] above the ground unless the vehicle flies already, and come to rest.
+    def fly(self) -> None:
+        """Climb to the height above the ground unless the vehicle flies already, and come to rest.
 
         Raises:
             MavlinkError: the autopilot refuses something, or the vehicle does not hover in the end.
@@ -85,7 +76,7 @@ class Takeoff:
             with contextlib.suppress(MavlinkError):
                 client.stream(message_id(message), interval, wait)
         self._compare_limits(kind)
-        if self._lead:
+        if self._flight.lead:
             client.lead(wait)
             self.note("it gets positions: if setpoints stop, it stops at the last one")
         self._hold(np.zeros(3))
@@ -93,7 +84,7 @@ class Takeoff:
         if not client.armed:
             client.arm(wait)
         if not client.airborne:
-            self._climb(kind, height)
+            self._climb(kind, self._flight.height)
         self._hold(np.zeros(3))
         if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, STOPPING):
             raise MavlinkError("the vehicle does not come to rest")
@@ -139,11 +130,10 @@ class Takeoff:
     def _compare_limits(self, kind: str) -> None:
         """Compare its parameters with the robot's bounds, and set or note those that are too low."""
         client, wait = self._client, self._wait
-        replies = {c.parameter: client.parameter(c.parameter, wait) for c in AUTOPILOT_LIMITS[kind]}
-        values = {name: value for name, value in replies.items() if value is not None}
-        for limit, value in limits_below_demand(kind, values, self._robot):
-            needed = limit.value(demand(self._robot))
-            if self._raise_limits:
+        names = (limit.parameter for limit in AUTOPILOT_LIMITS[kind])
+        values = {name: value for name in names if (value := client.parameter(name, wait)) is not None}
+        for limit, value, needed in limits_below_demand(kind, values, self._robot):
+            if self._flight.raise_limits:
                 done = client.set_parameter(limit.parameter, needed, wait)
                 self.note(f"{limit.parameter}: {value:g} -> {needed:g}" + ("" if done else ", which it refuses"))
             else:
@@ -153,11 +143,11 @@ class Takeoff:
                 )
         name = TIMEOUTS[kind]
         timeout = client.parameter(name, wait)
-        if self._lead:
+        if self._flight.lead:
             return
         if timeout is None and kind in FIXED_TIMEOUT:
             self.note(f"it has no {name}: if setpoints stop, it flies on for {FIXED_TIMEOUT[kind]:g} s")
-        elif timeout is not None and timeout > SHORTEST[kind]:
+        elif timeout is not None and timeout > SHORTEST_TIMEOUT:
             self.note(f"{name} is {timeout:g}: if setpoints stop, it flies on for so many seconds")
 
     def _climb(self, kind: str, height: float) -> None:

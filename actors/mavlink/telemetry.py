@@ -9,12 +9,14 @@ forward-right-down. `acceleration` combines these two.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 
 Array = NDArray[np.float64]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
@@ -23,7 +25,8 @@ Triple = tuple[float, float, float]
 GRAVITY = 9.81  # m/s²
 MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
 MOTION, ATTITUDE, FORCE, LANDED = "position and velocity", "attitude", "acceleration", "landed state"
-COPTER_EARTH, PX4_EARTH = 6378100.0, 6371000.0  # m, the radius of the Earth in each simulator
+# m of latitude in 1e-7 degrees: each simulator has its own radius of the Earth.
+COPTER_UNIT, PX4_UNIT = 1e-7 * math.radians(1.0) * 6378100.0, 1e-7 * math.radians(1.0) * 6371000.0
 TRUTH = "truth"  # ground truth of a simulator inside the autopilot
 LOCAL, BODY = (1,), (8, 12)  # MAV_FRAME: LOCAL_NED; for a velocity also BODY_NED and BODY_FRD
 ON_GROUND, UNKNOWN = 1, 0  # MAV_LANDED_STATE
@@ -47,7 +50,7 @@ class GeoPosition:
     Attributes:
         latitude, longitude: in units of 1e-7 degrees.
         altitude: m; None: the message has none.
-        metres: m of latitude in one unit; each simulator has its own radius of the Earth.
+        metres: m of latitude in one unit.
     """
 
     latitude: int
@@ -111,6 +114,11 @@ def acceleration(attitude: Quaternion, force: Triple) -> Array:
     return np.array([east, north, -down - GRAVITY])
 
 
+def resampled(times: Sequence[float], positions: Array, at: Array) -> Array:
+    """Return positions (S, 3) at the times `at` (S,), interpolated between `positions` (n, 3) at `times` (n,)."""
+    return np.column_stack([np.interp(at, times, positions[:, axis]) for axis in range(3)])
+
+
 def _position(m: Message) -> MotionSample:
     return MotionSample(1e-3 * m.time_boot_ms, enu_of((m.x, m.y, m.z)), enu_of((m.vx, m.vy, m.vz)))
 
@@ -123,14 +131,6 @@ def _odometry(m: Message) -> MotionSample | None:
     if m.child_frame_id in BODY:
         velocity = rotate(tuple(m.q), velocity)
     return MotionSample(1e-6 * m.time_usec, enu_of((m.x, m.y, m.z)), enu_of(velocity))
-
-
-def _quaternion(m: Message) -> Quaternion:
-    return (m.q1, m.q2, m.q3, m.q4)
-
-
-def _odometry_attitude(m: Message) -> Quaternion | None:
-    return tuple(m.q) if m.frame_id in LOCAL else None
 
 
 def _euler(m: Message) -> Quaternion:
@@ -146,45 +146,32 @@ def _euler(m: Message) -> Quaternion:
     )
 
 
-def _metric(m: Message) -> Triple:
-    return (m.xacc, m.yacc, m.zacc)
-
-
 def _milligravities(m: Message) -> Triple:
     return (MILLIGRAVITY * m.xacc, MILLIGRAVITY * m.yacc, MILLIGRAVITY * m.zacc)
 
 
-def _airborne(m: Message) -> bool | None:
-    return None if m.landed_state == UNKNOWN else m.landed_state != ON_GROUND
-
-
-def _simstate(m: Message) -> GeoPosition:
-    return GeoPosition(m.lat, m.lng, None, 1e-7 * math.radians(1.0) * COPTER_EARTH)
-
-
-def _hil_state(m: Message) -> GeoPosition:
-    return GeoPosition(m.lat, m.lon, 1e-3 * m.alt, 1e-7 * math.radians(1.0) * PX4_EARTH)
-
-
 SOURCES: dict[str, tuple[TelemetrySource, ...]] = {
     ATTITUDE: (
-        TelemetrySource("ATTITUDE_QUATERNION", _quaternion),
-        TelemetrySource("ODOMETRY", _odometry_attitude),
+        TelemetrySource("ATTITUDE_QUATERNION", lambda m: (m.q1, m.q2, m.q3, m.q4)),
+        TelemetrySource("ODOMETRY", lambda m: tuple(m.q) if m.frame_id in LOCAL else None),
         TelemetrySource("ATTITUDE", _euler),
     ),
     FORCE: (
-        TelemetrySource("HIGHRES_IMU", _metric),
+        TelemetrySource("HIGHRES_IMU", lambda m: (m.xacc, m.yacc, m.zacc)),
         TelemetrySource("SCALED_IMU", _milligravities),
-        TelemetrySource(
-            "RAW_IMU", _milligravities, ("ardupilot",)
-        ),  # the standard says raw; ArduPilot sends the units of SCALED_IMU
+        # The standard says that its values are raw; ArduPilot sends the units of SCALED_IMU.
+        TelemetrySource("RAW_IMU", _milligravities, ("ardupilot",)),
         TelemetrySource("SCALED_IMU2", _milligravities),
     ),
-    LANDED: (TelemetrySource("EXTENDED_SYS_STATE", _airborne),),
+    LANDED: (
+        TelemetrySource(
+            "EXTENDED_SYS_STATE", lambda m: None if m.landed_state == UNKNOWN else m.landed_state != ON_GROUND
+        ),
+    ),
     MOTION: (TelemetrySource("LOCAL_POSITION_NED", _position), TelemetrySource("ODOMETRY", _odometry)),
     TRUTH: (
-        TelemetrySource("SIMSTATE", _simstate, ("ardupilot",)),
-        TelemetrySource("HIL_STATE_QUATERNION", _hil_state, ("px4",)),
+        TelemetrySource("SIMSTATE", lambda m: GeoPosition(m.lat, m.lng, None, COPTER_UNIT), ("ardupilot",)),
+        TelemetrySource("HIL_STATE_QUATERNION", lambda m: GeoPosition(m.lat, m.lon, 1e-3 * m.alt, PX4_UNIT), ("px4",)),
     ),
 }
 IN_FLIGHT = (MOTION, ATTITUDE, FORCE)  # telemetry counts as lost if one of these stops
@@ -207,11 +194,6 @@ def missing(flags: int) -> list[str]:
     return unknown + ["anything except that the vehicle stands still"] * bool(flags & CONSTANT_POSITION)
 
 
-COPTER_MODES = {
-    0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND",
-    11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW", 19: "AVOID_ADSB",
-    20: "GUIDED_NOGPS", 21: "SMART_RTL",
-}  # fmt: skip
 PX4_MODES = {1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
 PX4_AUTO = {1: "READY", 2: "TAKEOFF", 3: "HOLD", 4: "MISSION", 5: "RETURN", 6: "LAND", 8: "FOLLOW", 9: "PRECLAND"}
 
@@ -219,7 +201,8 @@ PX4_AUTO = {1: "READY", 2: "TAKEOFF", 3: "HOLD", 4: "MISSION", 5: "RETURN", 6: "
 def mode_name(kind: str, custom: int) -> str:
     """Return the name of the custom mode in a HEARTBEAT."""
     if kind == "ardupilot":
-        return COPTER_MODES.get(custom, f"mode {custom}")
+        known = mavlink.enums["COPTER_MODE"].get(custom)
+        return f"mode {custom}" if known is None else known.name.removeprefix("COPTER_MODE_")
     main, sub = custom >> 16 & 0xFF, custom >> 24 & 0xFF
     names, number = (PX4_AUTO, sub) if main == 4 else (PX4_MODES, main)
     return names.get(number, f"mode {main}.{sub}")

@@ -14,9 +14,9 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVehicle
 from brakeline.actors.mavlink.telemetry import Array
-from brakeline.actors.mavlink.vehicle_messages import FlightRequest, error_of, level_of, period_of, request_message
+from brakeline.actors.mavlink.vehicle_messages import FlightRequest, error_of, period_of, request_message
 from brakeline.actors.mavlink.vehicle_socket import MessageSocket, connect
 from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
@@ -34,8 +34,12 @@ ENDED = "the vehicle server has ended"
 SERVER = "brakeline.actors.mavlink.vehicle_server"
 
 
-class VehicleClient:
-    """A vehicle in flight, used like a `MavlinkVehicle`. It flies its plan to the end even if this process dies."""
+class VehicleClient(PeriodicVehicle):
+    """A vehicle in flight, used like a `MavlinkVehicle`. It flies its plan to the end even if this process dies.
+
+    Attributes:
+        figures: the latest figures for Health: lateness, and the ground truth of a simulated flight.
+    """
 
     def __init__(
         self,
@@ -47,7 +51,6 @@ class VehicleClient:
         """Connect to the vehicle's server, or start one, and wait until the vehicle flies.
 
         Args:
-            request: the vehicle to fly.
             tap: called with each MAVLink frame.
             rejected: counts messages that cannot be handled, the server's too.
             stop: once it returns true, the client does not wait any more.
@@ -57,9 +60,8 @@ class VehicleClient:
                 flies it, or if `stop` returned true.
             BadMessage: the request is not valid, or too large.
         """
+        super().__init__(request.robot)
         self._tap, self._rejected, self._passed_over = tap, rejected, 0
-        self._robot = request.robot
-        self._changed = threading.Condition()
         self._lines: SimpleQueue[pb.LogLine] = SimpleQueue()
         threading.Thread(target=self._log, name="vehicle server's log", daemon=True).start()
         self._process: subprocess.Popen[bytes] | None = None
@@ -74,12 +76,6 @@ class VehicleClient:
                 if not (attempts_left and isinstance(error, HandoverRefused)):
                     raise
                 log.info("taking control of it anew: %s", error)
-
-    @property
-    def current_period(self) -> ControlPeriod:
-        """The latest control period."""
-        assert self._current is not None
-        return self._current
 
     def commit(self, plan: Array, number: int) -> bool:
         """Carry out a plan, see `MavlinkVehicle.commit`.
@@ -99,20 +95,6 @@ class VehicleClient:
         if reply.HasField("error"):
             raise error_of(reply.error)
         return reply.in_time
-
-    def wait(self, number: int) -> ControlPeriod:
-        """Wait for a period, see `MavlinkVehicle.wait`. Raises MavlinkError."""
-        with self._changed:
-            patience = 2.0 + self._robot.period * max(0, number - self.current_period.number)
-            done = lambda: self.current_period.number >= number or self._failure is not None  # noqa: E731
-            if not self._changed.wait_for(done, patience):
-                raise MavlinkError(f"period {number} does not begin")
-            self._check()
-            return self.current_period
-
-    def figures(self) -> dict[str, float]:
-        """Return figures for Health: lateness, and the ground truth of a simulated flight."""
-        return self._figures
 
     def close(self) -> None:
         """Give up the vehicle: its server brakes unless the vehicle hovers, and ends."""
@@ -134,7 +116,7 @@ class VehicleClient:
         """Connect to the vehicle's server, start one if there is none, and send the flight request."""
         self._current: ControlPeriod | None = None
         self._failure: Exception | None = None
-        self._figures: dict[str, float] = {}
+        self.figures: dict[str, float] = {}
         self._replies: SimpleQueue[pb.CommitReply | None] = SimpleQueue()
         self._received, self._received_at = False, time.monotonic()
         command = pb.VehicleCommand(fly=request_message(request))
@@ -173,10 +155,6 @@ class VehicleClient:
                     raise MavlinkError(why)
                 self._changed.wait(POLL)
 
-    def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
-
     def _ask(self, command: pb.VehicleCommand) -> pb.CommitReply | None:
         """Send a command and return its reply; None: no reply in time. Raises MavlinkError: the server is gone."""
         self._commands += 1
@@ -186,7 +164,7 @@ class VehicleClient:
             while True:
                 reply = self._replies.get(timeout=REPLY_TIMEOUT)
                 self._check()
-                if reply is not None and reply.number == command.number:  # else: the late reply to an older command
+                if reply is not None and reply.number == command.number:  # not a late reply to an older command
                     return reply
         except OSError as error:
             raise self._failure or MavlinkError(ENDED) from error
@@ -227,23 +205,19 @@ class VehicleClient:
 
     def _log(self) -> None:
         """Log the server's lines, in a thread: each of them goes over the bus, which may wait."""
+        levels = logging.getLevelNamesMapping()
         while True:
             line = self._lines.get()
-            log.log(level_of(line), "%s", line.text)
+            log.log(levels.get(line.level, logging.INFO), "%s", line.text)
 
     def _take(self, update: pb.VehicleUpdate) -> None:
         for frame in update.frames:
             self._tap(frame)
         self._rejected.count += max(0, update.passed_over - self._passed_over)
         self._passed_over = update.passed_over
-        self._figures = dict(update.figures) or self._figures
-        period = period_of(update.period, self._robot)
-        with self._changed:
-            self._current = period
-            self._changed.notify_all()
+        self.figures = dict(update.figures) or self.figures
+        self._begin(period_of(update.period, self._robot))
 
     def _fail(self, error: Exception) -> None:
-        with self._changed:
-            self._failure = self._failure or error
-            self._changed.notify_all()
-        self._replies.put(None)  # wake whoever waits for a reply
+        super()._fail(error)
+        self._replies.put(None)  # wake the thread that waits for a reply

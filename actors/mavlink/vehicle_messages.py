@@ -6,15 +6,15 @@ Every function `…_of` checks sizes and numbers before it returns, and raises B
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.telemetry import Array
 from brakeline.errors import BadInput, BadLink, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
@@ -28,7 +28,6 @@ from brakeline.sim.vehicle import Period
 
 LONGEST_TEXT = 8000  # characters of a log line or an error
 MOST_PORTS, MOST_SYSTEMS = 65535, 255
-
 
 # The errors that keep their type on the way to the actor; another one arrives as a MavlinkError. Subclasses come first.
 ERRORS: tuple[type[Exception], ...] = (HandoverRefused, MavlinkError, BadInput, BadLink, BadMessage, OSError)
@@ -45,18 +44,12 @@ class FlightRequest:
 
 def request_message(request: FlightRequest) -> pb.FlightRequest:
     """Return the message of a flight request."""
-    flight, robot = request.flight, request.robot
+    robot = request.robot
     return pb.FlightRequest(
-        url=flight.url,
-        system=flight.system,
-        truth=flight.truth,
-        height=flight.height,
-        origin=flight.origin,
-        raise_limits=flight.raise_limits,
-        lead=flight.lead,
         robot=json.dumps(robot.description),
         late=robot.late,
         obstacles=obstacle_messages(request.obstacles),
+        **asdict(request.flight),
     )
 
 
@@ -72,18 +65,11 @@ def request_of(message: pb.FlightRequest) -> FlightRequest:
         raise BadMessage(f"flight request: {robot.name} has another state or another input than a quadrotor")
     if not 1 <= message.system <= MOST_SYSTEMS or message.truth > MOST_PORTS:
         raise BadMessage(f"flight request: system {message.system}, truth port {message.truth}")
-    x, y, z = _vector("origin", message.origin, 3).tolist()
-    if not 0.0 <= message.height <= FARTHEST or max(map(abs, (x, y, z))) > FARTHEST:  # NaN fails too
-        raise BadMessage(f"flight request: height {message.height} m, origin {[x, y, z]} m")
-    flight = FlightSettings(
-        url=message.url,
-        system=message.system,
-        truth=message.truth,
-        height=message.height,
-        origin=(x, y, z),
-        raise_limits=message.raise_limits,
-        lead=message.lead,
-    )
+    origin = _vector("origin", message.origin, 3)
+    if not 0.0 <= message.height <= FARTHEST or np.abs(origin).max() > FARTHEST:  # NaN fails too
+        raise BadMessage(f"flight request: height {message.height} m, origin {origin.tolist()} m")
+    values: dict[str, Any] = {option.name: getattr(message, option.name) for option in fields(FlightSettings)}
+    flight = FlightSettings(**values | {"origin": tuple(origin.tolist())})
     return FlightRequest(flight, robot, obstacles)
 
 
@@ -120,17 +106,17 @@ def period_message(period: ControlPeriod) -> pb.ControlPeriod:
 
 def period_of(message: pb.ControlPeriod, robot: Robot) -> ControlPeriod:
     """Return the control period in a message."""
-    if math.isnan(message.closest) or math.isnan(message.clearance) or not math.isfinite(message.turned):
-        values = f"closest {message.closest}, clearance {message.clearance}, turned {message.turned}"
-        raise BadMessage(f"control period: {values}")
+    closest, clearance, turned = message.closest, message.clearance, message.turned
+    if math.isnan(closest) or math.isnan(clearance) or not math.isfinite(turned):
+        raise BadMessage(f"control period: closest {closest}, clearance {clearance}, turned {turned}")
     report = Period(
         measured=_vector("measured", message.measured, robot.state_dim),
         true=_vector("true_state", message.true_state, robot.state_dim),
         collision=message.collision,
-        closest=message.closest,
-        clearance=message.clearance,
+        closest=closest,
+        clearance=clearance,
         subsamples=_vector("path", message.path, SAMPLES * robot.position_dim).reshape(SAMPLES, robot.position_dim),
-        turned=message.turned,
+        turned=turned,
     )
     return ControlPeriod(message.number, _vector("input", message.input, robot.action_dim), report, message.lost)
 
@@ -143,20 +129,8 @@ def error_message(error: Exception) -> pb.Error:
 
 def error_of(message: pb.Error) -> Exception:
     """Return the error in a message: of its own type if that is one of `ERRORS`, else a MavlinkError."""
-    for kind in ERRORS:
-        if kind.__name__ == message.type:
-            return kind(message.message)
-    return MavlinkError(f"{message.type}: {message.message}")
-
-
-def log_message(record: logging.LogRecord, text: str) -> pb.LogLine:
-    """Return the message of a log record with this text."""
-    return pb.LogLine(level=record.levelname, text=text_of(text))
-
-
-def level_of(message: pb.LogLine) -> int:
-    """Return the logging level of a line; INFO if it names none."""
-    return logging.getLevelNamesMapping().get(message.level, logging.INFO)
+    kind = next((kind for kind in ERRORS if kind.__name__ == message.type), None)
+    return MavlinkError(f"{message.type}: {message.message}") if kind is None else kind(message.message)
 
 
 def text_of(text: str) -> str:

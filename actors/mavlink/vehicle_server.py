@@ -23,21 +23,21 @@ from queue import SimpleQueue
 import numpy as np
 
 from brakeline.actors.mavlink.frame_log import CapturedFrame
-from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod, MavlinkVehicle
+from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
+from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.takeoff import REST, STOPPING
 from brakeline.actors.mavlink.vehicle_messages import (
     FlightRequest,
     error_message,
-    log_message,
     period_message,
     plan_of,
     request_of,
+    text_of,
 )
 from brakeline.actors.mavlink.vehicle_socket import MessageSocket, listening, same_user
 from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
@@ -123,7 +123,8 @@ class ActorLog(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Queue a record with its traceback, if it has one."""
         try:
-            self._outbox.put(pb.VehicleMessage(log=log_message(record, self.format(record))))
+            line = pb.LogLine(level=record.levelname, text=text_of(self.format(record)))
+            self._outbox.put(pb.VehicleMessage(log=line))
         except Exception:
             self.handleError(record)
 
@@ -140,25 +141,18 @@ class VehicleServer:
             MavlinkError, BadLink, OSError: the vehicle does not fly; MavlinkError also if `stop` is set before it
                 flies, or if the actor hangs up or sends anything.
         """
-        self.request, self._outbox, self._stop = request, outbox, stop
-        self._robot, flight = request.robot, request.flight
+        self.request, self._robot, self._outbox, self._stop = request, request.robot, outbox, stop
         self._frames: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
         self._updating = threading.Lock()
         self._rejected = RejectedMessages()
         footprint, shapes = self._robot.footprint, Shapes.of(request.obstacles, self._robot.position_dim)
         self._vehicle = MavlinkVehicle(
-            open_link(flight.url),
-            self._robot,
-            system=flight.system,
-            height=flight.height,
-            origin=flight.origin,
-            truth=UdpGroundTruth(flight.truth, flight.system, self._rejected) if flight.truth else None,
+            request.robot,
+            request.flight,
             tap=self._store_frame,
             rejected=self._rejected,
             stop=lambda: stop.is_set() or actor.poll(),
-            raise_limits=flight.raise_limits,
             mavlink_truth=MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
-            lead=flight.lead,
         )
         threading.Thread(target=self._send_updates, name="updates", daemon=True).start()
 

@@ -12,13 +12,14 @@ import logging
 import math
 import threading
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
-from brakeline.actors.ros2.ros_clock import RosClock, RosSimulatedClock, SystemClock
+from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, Mismatch
@@ -105,21 +106,19 @@ class FilterNode:
             tap: called with every message.
 
         Raises:
-            Unreachable, BadRosName, UnknownRobot, Mismatch
+            Unreachable, BadRosName, UnknownRobot, Mismatch: with what to do.
         """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
         self.gate = CommandGate(self.robot, ask, settings.name)
-        self.clock: RosClock = RosSimulatedClock() if settings.sim_time else SystemClock()
+        self.clock = RosSimulatedClock() if settings.sim_time else SystemClock()
         self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
         self._ending = False
         self._diagnosed_at, self._diagnosed = -math.inf, ("", "")  # s; kind and reason of the last diagnostics
         self.node = RosNode(settings.ros, settings.name, tap)
         names = settings.topics
-        if settings.stamped:
-            self._stamped: RosPublisher[TwistStamped] | None = self.node.publisher(names.command, TwistStamped)
-        else:
-            self._stamped, self._plain = None, self.node.publisher(names.command, Twist)
+        self._twist: type[Any] = TwistStamped if settings.stamped else Twist
+        self._commands: RosPublisher[Any] = self.node.publisher(names.command, self._twist)
         self._markers = self.node.publisher(names.markers, MarkerArray)
         self._diagnostics = self.node.publisher(names.diagnostics, DiagnosticArray)
         self._subscribe()
@@ -194,7 +193,7 @@ class FilterNode:
             self._markers.put(markers(began, self.inputs.frame, outcome.answer, around))
 
     def _resend_until(self, moment: float, stop: threading.Event) -> bool:
-        """Wait for a moment [s], and send the input in force again meanwhile. Return False as `RosClock.wait` does.
+        """Wait for a moment [s], and send the input in force again meanwhile. Return False as `SystemClock.wait` does.
 
         In a simulation nothing is sent again: a simulation may wait for the next command.
         """
@@ -206,12 +205,9 @@ class FilterNode:
         return clock.wait(moment, stop, SILENCE)
 
     def _send(self, action: Array) -> None:
-        speed, turn_rate = map(float, action)
-        message = twist(speed, turn_rate)
-        if self._stamped is not None:
-            self._stamped.put(TwistStamped(header=header(self.clock.now(), ""), twist=message))
-        else:
-            self._plain.put(message)
+        message = twist(*map(float, action))
+        stamped = self.settings.stamped
+        self._commands.put(TwistStamped(header=header(self.clock.now(), ""), twist=message) if stamped else message)
 
     def _diagnose(self) -> None:
         """Publish diagnostics every second and when the decision changes; log a change of its kind."""
@@ -235,11 +231,7 @@ class FilterNode:
         else:
             subscribe(names.odometry, Odometry, inputs.on_odometry, SENSOR)
         subscribe(names.scan, LaserScan, inputs.on_scan, SENSOR)
-        on_command = lambda message: inputs.on_command(message, self.clock.now())  # noqa: E731
-        if self.settings.stamped:
-            subscribe(names.raw, TwistStamped, on_command)
-        else:
-            subscribe(names.raw, Twist, on_command)
+        subscribe(names.raw, self._twist, lambda message: inputs.on_command(message, self.clock.now()))
 
 
 def run(settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> dict[str, float]:

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Protocol
 
 from brakeline.messaging.ros2.cdr_messages import Clock, seconds
 
 JUMP = 0.05  # s: a smaller difference to the system time counts as drift
 POLL = 0.02  # s between two checks whether to stop
-
-
-class RosClock(Protocol):
-    """A clock in seconds since the Unix epoch, or since the beginning of the simulation."""
-
-    def now(self) -> float:
-        """Return the time [s]."""
-
-    def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
-        """Wait for a moment [s]. Return False if `stop` is set, or if the clock stood still for `patience` s."""
-
-    def jumped(self) -> float:
-        """Return by how many seconds the clock was set since the last call."""
 
 
 class SystemClock:
@@ -32,15 +18,15 @@ class SystemClock:
         self._offset = time.time() - time.monotonic()
 
     def now(self) -> float:
-        """Return the time [s]."""
+        """Return the time [s]: since the Unix epoch, or since the beginning of a simulation."""
         return time.monotonic() + self._offset
 
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
-        """Wait for a moment [s]. Return False if `stop` is set."""
+        """Wait for a moment [s]. Return False if `stop` is set, or if the clock stood still for `patience` s."""
         return not stop.wait(max(0.0, moment - self.now()))
 
     def jumped(self) -> float:
-        """Return by how many seconds the date was set since the last call, and adopt it."""
+        """Return by how many seconds the clock was set since the last call, and adopt the new time."""
         difference = time.time() - self.now()
         if abs(difference) < JUMP:
             return 0.0
@@ -48,8 +34,8 @@ class SystemClock:
         return difference
 
 
-class RosSimulatedClock:
-    """The time on /clock."""
+class RosSimulatedClock(SystemClock):
+    """The time on /clock; 0 before the first message."""
 
     RESTART = 1.0  # s: a clock that goes back by more has restarted
 
@@ -69,11 +55,9 @@ class RosSimulatedClock:
             self._moved.notify_all()
 
     def now(self) -> float:
-        """Return the time [s]; 0 before the first message."""
         return self._now
 
     def wait(self, moment: float, stop: threading.Event, patience: float) -> bool:
-        """Wait for a moment [s]. Return False if `stop` is set, or if the clock stood still for `patience` s."""
         with self._moved:
             last, since = self._now, time.monotonic()
             while self._now < moment - 1e-9 and not self._jump:
@@ -85,7 +69,6 @@ class RosSimulatedClock:
         return not stop.is_set()
 
     def jumped(self) -> float:
-        """Return by how many seconds the simulation was set back since the last call."""
         with self._moved:
             jump, self._jump = self._jump, 0.0
         return jump

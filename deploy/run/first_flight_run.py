@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
 
@@ -53,6 +52,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
         BadLink, MavlinkError: the vehicle can't be flown; the message says what to do.
         BadData: nothing was recorded.
     """
+    from brakeline.actors.actor_settings import FlightSettings
     from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
     from brakeline.actors.mavlink.vehicle_socket import listening
     from brakeline.deploy.data.first_flight import Box, FirstFlight
@@ -64,15 +64,10 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
         ) as stop,  # a second signal must not leave the vehicle in the air
         listening(url, settings.system),  # so that no actor of this machine takes the vehicle
     ):
-        vehicle = MavlinkVehicle(
-            open_link(url),
-            robot,
-            system=settings.system,
-            height=settings.height,
-            stop=stop.is_set,
-            raise_limits=settings.raise_limits,
-            lead=settings.lead,
+        flight_settings = FlightSettings(
+            url, settings.system, height=settings.height, raise_limits=settings.raise_limits, lead=settings.lead
         )
+        vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set)
         try:
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))

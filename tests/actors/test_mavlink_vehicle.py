@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.flight_timing import ClockOffset
 from brakeline.actors.mavlink.frame_log import CapturedFrame
-from brakeline.actors.mavlink.ground_truth import UdpGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.telemetry import ATTITUDE
 from brakeline.errors import BadInput
@@ -42,20 +43,16 @@ def flying(request: pytest.FixtureRequest) -> Iterator[Flying]:
         target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel)
     )
     thread.start()
-    there = open_link(f"udpout:127.0.0.1:{link.port}")  # type: ignore[union-attr]
+    url = f"udpout:127.0.0.1:{link.port}"  # type: ignore[union-attr]
     try:
-        vehicle = MavlinkVehicle(
-            there, QUADROTOR, height=2.0, truth=UdpGroundTruth(truth_port, 1), tap=frames.append, raise_limits=True
-        )
-        try:
+        flight = FlightSettings(url, truth=truth_port, height=2.0, raise_limits=True)
+        with contextlib.closing(MavlinkVehicle(QUADROTOR, flight, tap=frames.append)) as vehicle:
             yield vehicle, autopilot, frames
-        finally:
-            vehicle.close()
     finally:
         stop.set()
         thread.join()
-        for end in (there, link, channel):
-            end.close()
+        link.close()
+        channel.close()
 
 
 def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:

@@ -252,9 +252,11 @@ def test_parameters_below_the_robots_bounds_are_found() -> None:
     }
     known = {name: value for name, value in values.items() if value is not None}
     assert known == {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0}
-    assert [limit.parameter for limit, _ in limits_below_demand("ardupilot", known, QUADROTOR)] == ["WPNAV_ACCEL"]
+    below = limits_below_demand("ardupilot", known, QUADROTOR)
+    assert [(limit.parameter, value) for limit, value, _ in below] == [("WPNAV_ACCEL", 100.0)]
     asked = demand(QUADROTOR)
-    assert (asked.speed, asked.climb, asked.horizontal_acceleration) == pytest.approx((50**0.5, 5.0, 32**0.5))
+    assert (asked["speed"], asked["climb"], asked["acceleration"]) == pytest.approx((50**0.5, 5.0, 32**0.5))
+    assert below[0][2] == pytest.approx(100.0 * 32**0.5, abs=0.1), "in the unit of the parameter"
 
 
 def test_missing_quantities_of_the_estimator_have_names() -> None:

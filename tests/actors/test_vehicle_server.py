@@ -20,7 +20,7 @@ import pytest
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink import vehicle_client
 from brakeline.actors.mavlink.frame_log import decode_frame
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest, period_message
 from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, ActorOutbox, next_actor

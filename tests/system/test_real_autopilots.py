@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from benchmarks.timing import stalls
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.autopilot_commands import message_id
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_decoder import OFFBOARD
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
-from brakeline.messaging.byte_links import open_link
 from tests.accepting import WORDS
 from tests.real import KINDS, autopilot, autopilots
 from tests.robots import QUADROTOR
@@ -47,7 +47,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
     frames: list[CapturedFrame] = []
     with autopilot(kind, tmp_path) as (url, system):
         vehicle = MavlinkVehicle(
-            open_link(url), QUADROTOR, system=system, height=5.0, tap=frames.append, raise_limits=True
+            QUADROTOR, FlightSettings(url, system, height=5.0, raise_limits=True), tap=frames.append
         )
         try:
             client = vehicle._client
@@ -97,7 +97,7 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
 def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_comes(tmp_path: Path) -> None:
     """Told velocities, a version without GUID_TIMEOUT flies on for 3 s: 12 m."""
     with autopilot("ardupilot", tmp_path) as (url, system):
-        vehicle = MavlinkVehicle(open_link(url), QUADROTOR, system=system, height=5.0, raise_limits=True, lead=True)
+        vehicle = MavlinkVehicle(QUADROTOR, FlightSettings(url, system, height=5.0, raise_limits=True, lead=True))
         try:
             flown = [vehicle.step(np.array([3.0, 0.0, 0.0])) for _ in range(20)][-1].measured
             assert flown[3:6] == pytest.approx([3.0, 0.0, 0.0], abs=0.6)

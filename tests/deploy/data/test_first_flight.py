@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.actors.mavlink.mavlink_vehicle import ControlPeriod
+from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, draw_manoeuvre, mirror_inwards
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows

@@ -1,0 +1,76 @@
+"""A vehicle in real time: one thread begins its control periods, and other threads wait for them."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+from brakeline.actors.mavlink.telemetry import Array
+from brakeline.errors import MavlinkError
+from brakeline.messaging.robot import Robot
+from brakeline.sim.vehicle import Period
+
+
+@dataclass(frozen=True)
+class ControlPeriod:
+    """One control period, at the moment when it begins.
+
+    Attributes:
+        number: its number; the first is 0.
+        input: (3,) m/s, in force from this moment on.
+        report: the outcome of the period before.
+        lost: why the measurement or our control does not count: no recent telemetry, or the autopilot does not follow
+            our setpoints. Empty if both count.
+    """
+
+    number: int
+    input: Array
+    report: Period
+    lost: str = ""
+
+
+class PeriodicVehicle:
+    """The current control period of a vehicle, and the error after which nobody flies it any more."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._changed = robot, threading.Condition()
+        self._current: ControlPeriod | None = None
+        self._failure: Exception | None = None
+
+    @property
+    def current_period(self) -> ControlPeriod:
+        """The latest control period."""
+        assert self._current is not None, "no period has begun"
+        return self._current
+
+    @property
+    def failed(self) -> bool:
+        """Whether nobody flies the vehicle any more."""
+        return self._failure is not None
+
+    def wait(self, number: int) -> ControlPeriod:
+        """Wait until period `number` has begun, and return the current period.
+
+        Raises:
+            MavlinkError: the period does not begin in time, or nobody flies the vehicle any more.
+        """
+        with self._changed:
+            patience = 2.0 + self._robot.period * max(0, number - self.current_period.number)
+            if not self._changed.wait_for(lambda: self.failed or self.current_period.number >= number, patience):
+                raise MavlinkError(f"period {number} does not begin")
+            self._check()
+            return self.current_period
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _begin(self, period: ControlPeriod) -> None:
+        with self._changed:
+            self._current = period
+            self._changed.notify_all()
+
+    def _fail(self, error: Exception) -> None:
+        with self._changed:
+            self._failure = self._failure or error
+            self._changed.notify_all()
