@@ -249,13 +249,12 @@ class ActorStats:
         return asdict(self) | {"steps_per_s": self.steps / max(seconds, 1e-9), "round_trip_ms": round_trip_ms}
 
 
-class ActorGroup:
-    """The robots whose time passes together (see `RobotGroup`), with what publishes them."""
+class ActorGroup(RobotGroup):
+    """The robots whose time passes together, with their proposers and publishers."""
 
     def __init__(self, actors: Sequence[ActorRunner], world: SharedWorld | None = None, reserving: bool = True) -> None:
-        """See `RobotGroup`."""
+        super().__init__([actor.runner for actor in actors], world, reserving)
         self.actors = list(actors)
-        self.robots = RobotGroup([actor.runner for actor in actors], world, reserving)
 
     def ready(self, stop: Stop) -> bool:
         """Wait for permission to step, and begin an episode if none is running. Return False at the end of the run."""
@@ -266,7 +265,7 @@ class ActorGroup:
             if not actor.may_step(stop):
                 return False
         if not driving:
-            for actor, message in zip(self.actors, self.robots.begin(episode), strict=True):
+            for actor, message in zip(self.actors, self.begin(episode), strict=True):
                 actor.begin(message)
         return True
 
@@ -280,7 +279,7 @@ class ActorGroup:
         settled = [None if outcome is None else actor.settle(outcome) for actor, outcome in turns]
         stats.round_trip_ms += sum(outcome.round_trip_ms for outcome in settled if outcome is not None)
         versions = [actor.proposer.version for actor in self.actors]
-        for actor, step in zip(self.actors, self.robots.execute(proposals, settled, versions), strict=True):
+        for actor, step in zip(self.actors, self.execute(proposals, settled, versions), strict=True):
             if step is not None:
                 stats.count(step)
                 actor.publish(step)
@@ -301,7 +300,7 @@ def run_period(groups: Sequence[ActorGroup], ask: Ask | None, stats: ActorStats,
     if not all(group.ready(stop) for group in groups):
         return False
     proposals = [[actor.propose() for actor in group.actors] for group in groups]
-    outcomes = decide([group.robots for group in groups], proposals, ask)
+    outcomes = decide(groups, proposals, ask)
     for group, inputs, answers in zip(groups, proposals, outcomes, strict=True):
         group.act(inputs, answers, stats)
     return True

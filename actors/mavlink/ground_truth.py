@@ -24,9 +24,7 @@ MOST_DATAGRAMS = 100  # read in one call of `poll`
 
 
 class UdpGroundTruth:
-    """The latest ground truth that a simulator on this machine sends over UDP.
-
-    `brakeline.sim.autopilot.autopilot_server` is such a simulator.
+    """The latest ground truth that `brakeline.sim.autopilot.autopilot_server` on this machine sends over UDP.
 
     Attributes:
         state: (9,) true state; None before the first datagram.
@@ -35,11 +33,7 @@ class UdpGroundTruth:
     """
 
     def __init__(self, port: int, system: int, rejected: RejectedMessages | None = None) -> None:
-        """Listen on a UDP port of the loopback interface, for the vehicle of this MAVLink system id.
-
-        Raises:
-            OSError: the port is in use.
-        """
+        """Listen on a UDP port of the loopback interface. system: the vehicle's. Raises OSError: the port is in use."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
         self._socket.setblocking(False)

@@ -138,8 +138,8 @@ class VehicleServer:
         """Take control of the vehicle and take off.
 
         Raises:
-            MavlinkError, BadLink, OSError: the vehicle does not fly; MavlinkError also if `stop` is set before it
-                flies, or if the actor hangs up or sends anything.
+            MavlinkError, BadLink, OSError: the vehicle does not fly, `stop` is set before it flies, or the actor hangs
+                up or sends anything.
         """
         self.request, self._robot, self._outbox, self._stop = request, request.robot, outbox, stop
         self._frames: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
@@ -185,11 +185,7 @@ class VehicleServer:
         raise MavlinkError("the vehicle's thread has died")
 
     def brake(self) -> None:
-        """Fly the committed plan to its end, and wait until the vehicle hovers.
-
-        Raises:
-            MavlinkError: the vehicle's thread has died.
-        """
+        """Fly the committed plan to its end, and wait until the vehicle hovers. Raises MavlinkError."""
         log.warning("without an actor: braking along the committed plan")
         vehicle, end = self._vehicle, time.monotonic() + STOPPING
         period = vehicle.wait(vehicle.current_period.number + self._robot.horizon)

@@ -79,8 +79,8 @@ class MessageSocket:
 
 def address(url: str, system: int) -> str:
     """Return the address of a vehicle's server: an abstract name, which ends with its process and is not a file."""
-    place = url.replace("//", "").replace("localhost", "127.0.0.1")
-    return f"\0brakeline/{os.getuid()}/{place[-80:]}/{system}"
+    link = url.replace("//", "").replace("localhost", "127.0.0.1")
+    return f"\0brakeline/{os.getuid()}/{link[-80:]}/{system}"
 
 
 def same_user(peer: socket.socket) -> bool:
@@ -92,11 +92,7 @@ def same_user(peer: socket.socket) -> bool:
 
 @contextmanager
 def listening(url: str, system: int) -> Iterator[socket.socket]:
-    """Listen for the actors of a vehicle.
-
-    Raises:
-        MavlinkError: another process on this machine flies the vehicle.
-    """
+    """Listen for the actors of a vehicle. Raises MavlinkError: another process here flies the vehicle."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
         try:
             server.bind(address(url, system))
@@ -107,11 +103,7 @@ def listening(url: str, system: int) -> Iterator[socket.socket]:
 
 
 def connect(url: str, system: int) -> MessageSocket | None:
-    """Connect to a vehicle's server; None if there is none.
-
-    Raises:
-        MavlinkError: the server is a process of another user.
-    """
+    """Connect to a vehicle's server; None if there is none. Raises MavlinkError: it is a process of another user."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connection.connect(address(url, system))

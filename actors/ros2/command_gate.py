@@ -38,25 +38,15 @@ def inflated(obstacle: Obstacle, margin: float) -> Obstacle:
 
 @dataclass
 class GateStats:
-    """Statistics of the periods so far.
-
-    Attributes:
-        periods: number of periods.
-        kinds: periods by the kind of their decision, or `no answer`, `late`, `blind`.
-        commands: number of commands that the gate decided about.
-        compared, outside: measured states with a prediction, and those outside of the predicted set.
-        slips: periods that began late by a period or more.
-        delays: s from the arrival of a command to the beginning of its period.
-        decide_ms: ms of each decision.
-    """
+    """Statistics of the periods so far."""
 
     periods: int = 0
-    kinds: Counter[str] = field(default_factory=Counter)
-    commands: int = 0
-    compared: int = 0
-    outside: int = 0
-    slips: int = 0
-    delays: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
+    kinds: Counter[str] = field(default_factory=Counter)  # periods by decision, or `no answer`, `late`, `blind`
+    commands: int = 0  # that the gate decided about
+    compared: int = 0  # measured states with a prediction
+    outside: int = 0  # of those, states outside of the predicted set
+    slips: int = 0  # periods that began late by a period or more
+    delays: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))  # s, command to period
     decide_ms: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
 
     def figures(self) -> dict[str, float]:
@@ -106,7 +96,6 @@ class CommandGate:
         that margin, the gate asks without it, but accepts no plan that ends nearer to an obstacle.
 
         Args:
-            state: as measured.
             obstacles: all obstacles that a scan shows; all other space is free.
             command: the newest command; None: the robot should stand.
             time: s, of the state.
@@ -115,16 +104,8 @@ class CommandGate:
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
 
         def ask(action: Array, around: Sequence[Obstacle]) -> DecisionOutcome:
-            request = request_message(
-                self.backup_plan,
-                state,
-                action,
-                around,
-                known_free=True,
-                actor=self._name,
-                step=step & 0xFFFFFFFF,
-                time=time,
-            )
+            about = {"actor": self._name, "step": step & 0xFFFFFFFF, "time": time}
+            request = request_message(self.backup_plan, state, action, around, known_free=True, **about)
             return request_decisions(self._ask, [request], self.robot)[0]
 
         outcome = ask(proposal, [inflated(obstacle, SCAN_DIFFERENCE) for obstacle in obstacles])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -26,18 +25,19 @@ from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from tests.actors.test_lockstep_quadrotor import RULES, quadrotor
 from tests.robots import QUADROTOR
+from tests.waiting import until
 
 GAP = 0.25  # s between two setpoints, at most
 
 Flying = tuple[MavlinkVehicle, Autopilot, list[CapturedFrame]]
 
 
-@pytest.fixture(params=RULES)
-def flying(request: pytest.FixtureRequest) -> Iterator[Flying]:
-    """Fly a vehicle from the floor. Yield it, its autopilot in a thread, and the frames between them."""
+@contextlib.contextmanager
+def flight_of(rules: str, floor: float | None = None) -> Iterator[Flying]:
+    """Fly a vehicle that hovers at first, or stands on a floor. Yield it, its autopilot in a thread, and the frames."""
     link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[CapturedFrame]()
     truth_port = free_udp_port()
-    autopilot = Autopilot(quadrotor(floor=0.02), request.param, parameters={TIMEOUT[request.param]: 1.0})
+    autopilot = Autopilot(quadrotor(floor=floor), rules, parameters={TIMEOUT[rules]: 1.0})
     channel = autopilot_server.TruthSender("127.0.0.1", truth_port)
     thread = threading.Thread(
         target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel)
@@ -55,6 +55,25 @@ def flying(request: pytest.FixtureRequest) -> Iterator[Flying]:
         channel.close()
 
 
+@pytest.fixture(scope="module", params=RULES)
+def shared_flight(request: pytest.FixtureRequest) -> Iterator[Flying]:
+    with flight_of(request.param) as flight:
+        yield flight
+
+
+@pytest.fixture
+def flying(shared_flight: Flying) -> Flying:
+    """Return a vehicle that hovers: the tests share one flight of each autopilot."""
+    vehicle, _, frames = shared_flight
+    until(lambda: vehicle.idle and speed(vehicle) < 0.3 and not vehicle.current_period.lost, "hovering", 20.0)
+    frames.clear()
+    return shared_flight
+
+
+def speed(vehicle: MavlinkVehicle) -> float:
+    return float(np.linalg.norm(vehicle.current_period.report.measured[3:6]))
+
+
 def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
     """Return the setpoints [m/s, ENU] without repetitions."""
     sent = [f.message for f in frames if f.name.endswith("SET_POSITION_TARGET_LOCAL_NED")]
@@ -62,32 +81,38 @@ def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
     return [u for u, before in zip(inputs, [None, *inputs[:-1]], strict=True) if u != before]
 
 
-def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], flying: Flying) -> None:
-    vehicle, autopilot, _ = flying
-    assert autopilot.flight.armed and autopilot.flight.mode is Mode.OFFBOARD
-    for _ in range(12):
-        period = vehicle.step(np.array([2.0, 1.0, 0.0]))
-    assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
-    late = 3.0 * stalled()  # m flown meanwhile: the ground truth is older, by a stall at most
-    assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
-    assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
-    assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.current_period.lost and not period.collision
-    assert vehicle.current_period.number >= 12
+@pytest.mark.parametrize("rules", RULES)
+def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float], rules: str) -> None:
+    with flight_of(rules, floor=0.02) as (vehicle, autopilot, _):
+        assert autopilot.flight.armed and autopilot.flight.mode is Mode.OFFBOARD
+        for _ in range(12):
+            period = vehicle.step(np.array([2.0, 1.0, 0.0]))
+        assert period.measured[3:6] == pytest.approx([2.0, 1.0, 0.0], abs=0.3)
+        late = 3.0 * stalled()  # m flown meanwhile: the ground truth is older, by a stall at most
+        assert period.measured[:3] == pytest.approx(period.true[:3], abs=0.3 + late)
+        assert period.subsamples[-1] == pytest.approx([0.4, 0.2, 0.0], abs=0.15)
+        assert vehicle.timing.worst_gap < GAP + stalled() and not vehicle.current_period.lost and not period.collision
+        assert vehicle.current_period.number >= 12
 
-    hovering = vehicle.wait(vehicle.current_period.number + 10)  # without a plan it brakes within its slew
-    assert not hovering.input.any()
-    assert np.linalg.norm(hovering.report.measured[3:6]) < 0.3
+        hovering = vehicle.wait(vehicle.current_period.number + 10)  # without a plan it brakes within its slew
+        assert not hovering.input.any() and speed(vehicle) < 0.3
 
-    vehicle.land()
-    deadline = time.monotonic() + 15.0
-    while autopilot.flight.armed and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not autopilot.flight.armed
+        vehicle.land()
+        until(lambda: not autopilot.flight.armed, "it disarms on the ground", 15.0)
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_the_autopilot_brakes_when_the_link_dies(rules: str) -> None:
+    with flight_of(rules) as (vehicle, autopilot, _):
+        for _ in range(8):
+            vehicle.step(np.array([2.0, 0.0, 0.0]))
+        vehicle.close()
+        assert np.linalg.norm(autopilot.vehicle.state()[3:6]) > 0.5
+        until(lambda: np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1, "it brakes", 4.0)
 
 
 def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flying) -> None:
     vehicle, _, frames = flying
-    frames.clear()
     plan = np.array([[0.5, 0.0, 0.0], [1.0, 0.2, 0.0], [0.6, 0.1, 0.0], [0.0, 0.0, 0.0]])
     number = vehicle.current_period.number + 2
     assert vehicle.commit(plan, number)
@@ -97,9 +122,9 @@ def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flyi
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
-def test_inputs_keep_to_the_robots_slew(flying: Flying) -> None:
+def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, _, _ = flying
-    vehicle._robot = replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2))
+    monkeypatch.setattr(vehicle, "_robot", replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2)))
     number = vehicle.current_period.number + 2
     assert vehicle.commit(np.tile([1.0, 0.0, 0.0], (3, 1)), number)
     inputs = [vehicle.wait(number + k).input[0] for k in range(5)]
@@ -158,22 +183,12 @@ def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:
     vehicle, autopilot, _ = flying
     autopilot.flight.change(Mode.HOLD)
     for _ in range(25):  # until a heartbeat arrives, on a machine that may stall
-        if "does not follow" in (current := vehicle.wait(vehicle.current_period.number + 1)).lost:
+        if "does not follow" in (lost := vehicle.wait(vehicle.current_period.number + 1).lost):
             break
-    assert (
-        "does not follow" in current.lost
-        and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind] in current.lost
-    )
+    assert "does not follow" in lost and {"px4": "HOLD", "ardupilot": "LOITER"}[vehicle._client.kind or ""] in lost
     assert autopilot.flight.mode is Mode.HOLD, "the pilot keeps control"
-
-
-def test_the_autopilot_brakes_when_the_link_dies(flying: Flying) -> None:
-    vehicle, autopilot, _ = flying
-    for _ in range(8):
-        vehicle.step(np.array([2.0, 0.0, 0.0]))
-    vehicle.close()
-    time.sleep(3.2)
-    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.1
+    autopilot.flight.change(Mode.OFFBOARD)
+    assert recovers(vehicle), "the pilot gives the vehicle back"
 
 
 def test_the_clock_offset_ignores_late_messages_and_follows_jumps() -> None:

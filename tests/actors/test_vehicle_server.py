@@ -30,7 +30,6 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.sim.arena import staged_arena
 from brakeline.sim.autopilot import autopilot_server as server
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
@@ -40,14 +39,15 @@ from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
 
-ARENA = staged_arena(start=(0.0, 0.0, 2.0), half_width=20.0, height=10.0)
+# The server does not know this robot's name: the request contains the whole description.
+ROBOT = replace(QUADROTOR, name="mine").in_real_time()
 
 
 @pytest.fixture
 def flown() -> Iterator[tuple[str, Autopilot]]:
-    """Run an autopilot on the floor in a thread. Yield its URL and the autopilot."""
+    """Run an autopilot in the air in a thread. Yield its URL and the autopilot."""
     link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
-    autopilot = Autopilot(quadrotor(floor=0.02), "px4")
+    autopilot = Autopilot(quadrotor(), "px4")
     thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set))
     thread.start()
     try:
@@ -59,18 +59,16 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 
 
 @contextmanager
-def actor(url: str, frames: list[pb.MavlinkFrame] | None = None, height: float = 2.0) -> Iterator[VehicleClient]:
-    request = FlightRequest(FlightSettings(url, height=height), QUADROTOR, ARENA.obstacles)
+def actor(
+    url: str,
+    frames: list[pb.MavlinkFrame] | None = None,
+    height: float = 2.0,
+    rejected: RejectedMessages | None = None,
+) -> Iterator[VehicleClient]:
+    request = FlightRequest(FlightSettings(url, height=height), ROBOT, ())
     tap: Callable[[pb.MavlinkFrame], None] = (frames if frames is not None else []).append
-    vehicle = VehicleClient(request, tap, RejectedMessages(), lambda: False)
-    try:
+    with contextlib.closing(VehicleClient(request, tap, rejected or RejectedMessages(), lambda: False)) as vehicle:
         yield vehicle
-    finally:
-        vehicle.close()
-
-
-def still_period() -> Period:
-    return Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
 
 
 def setpoints(frames: list[pb.MavlinkFrame]) -> list[Any]:
@@ -99,11 +97,11 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
 
         next_vehicle = stack.enter_context(actor(url, second))
         period = next_vehicle.current_period
-        assert period.number >= number + QUADROTOR.horizon, "the periods went on"
+        assert period.number >= number + ROBOT.horizon, "the periods went on"
         assert np.linalg.norm(period.report.measured[3:6]) < 0.3 and not period.lost, "it hovers"
         assert period.report.measured[0] > 0.5 and autopilot.flight.mode is Mode.OFFBOARD, "where the plan ended"
         next_vehicle.wait(next_vehicle.current_period.number + 6)
-        assert next_vehicle.figures()["periods"] >= number
+        assert next_vehicle.figures["periods"] >= number
     times = np.array([frame.wall_time for frame in first + second]) * 1e-9
     assert np.diff(times).max() < 0.3 + stalled(), "the next actor gets the frames from the time without an actor"
     sent = setpoints(first + second)
@@ -173,24 +171,11 @@ def test_an_invalid_link_is_an_error(flown: tuple[str, Autopilot]) -> None:
         pass
 
 
-def test_a_robot_with_a_description_of_its_own_can_fly(flown: tuple[str, Autopilot]) -> None:
-    """The request contains the whole description, since the server knows the names of the built-in robots only."""
-    robot = replace(QUADROTOR, name="mine").in_real_time()
-    request = FlightRequest(FlightSettings(flown[0], height=2.0), robot, ())
-    vehicle = VehicleClient(request, lambda _: None, RejectedMessages(), lambda: False)
-    try:
-        assert vehicle.wait(vehicle.current_period.number + 2).report.measured.shape == (9,)
-    finally:
-        vehicle.close()
-
-
 def test_an_invalid_command_is_skipped_and_the_flight_goes_on(
     flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
 ) -> None:
-    rejected, horizon, url = RejectedMessages(), QUADROTOR.horizon, flown[0]
-    request = FlightRequest(FlightSettings(url, height=2.0), QUADROTOR, ARENA.obstacles)
-    vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
-    with contextlib.closing(vehicle), caplog.at_level("INFO", "brakeline"):
+    rejected, url = RejectedMessages(), flown[0]
+    with caplog.at_level("INFO", "brakeline"), actor(url, rejected=rejected) as vehicle:
         raw = vehicle._socket._socket
         for payload in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
             raw.send(payload)
@@ -203,7 +188,7 @@ def test_an_invalid_command_is_skipped_and_the_flight_goes_on(
             vehicle.commit(np.zeros((3, 4)), number)
         with pytest.raises(BadMessage, match="too far ahead"):
             vehicle.commit(np.zeros((1, 3)), 2**63)
-        for plan in (np.zeros((0, 3)), np.zeros((horizon + 1, 3))):
+        for plan in (np.zeros((0, 3)), np.zeros((ROBOT.horizon + 1, 3))):
             with pytest.raises(BadMessage, match="a plan has"):
                 vehicle.commit(plan, number)
         misshapen = pb.VehicleCommand(commit=pb.PlanCommit(period=number, plan=[0.0] * 4))
@@ -248,7 +233,8 @@ def test_an_invalid_flight_request_gets_an_error_and_the_next_actor_is_served(fl
 def test_an_invalid_update_is_skipped_and_the_next_one_counts() -> None:
     """A server sends invalid messages and then falls silent: the actor gets an error and does not hang."""
     url, rejected = f"udpout:127.0.0.1:{os.getpid()}", RejectedMessages()
-    good = period_message(ControlPeriod(3, np.zeros(3), still_period()))
+    standing = Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
+    good = period_message(ControlPeriod(3, np.zeros(3), standing))
     bad = [pb.ControlPeriod(), pb.ControlPeriod.FromString(good.SerializeToString())]
     bad[1].measured[4] = np.nan
 
@@ -269,7 +255,7 @@ def test_an_invalid_update_is_skipped_and_the_next_one_counts() -> None:
     with listening(url, 1) as listener:
         thread = threading.Thread(target=serve, args=(listener,))
         thread.start()
-        request = FlightRequest(FlightSettings(url), QUADROTOR, ())
+        request = FlightRequest(FlightSettings(url), ROBOT, ())
         vehicle = VehicleClient(request, lambda _: None, rejected, lambda: False)
         assert vehicle.current_period.number == 3 and rejected.count == 4
         assert not vehicle.commit(np.zeros((1, 3)), 5), "without a reply the plan counts as late"
