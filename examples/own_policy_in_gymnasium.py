@@ -1,4 +1,4 @@
-"""A policy of your own in an environment of your own, kept off a wall by what the environment's own data say."""
+"""Put the filter before your own policy in your own environment, with a model set from the environment's data."""
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,7 @@ from brakeline.safety.model.model_set import ModelConfig
 
 
 class Cart(gymnasium.Env):
-    """A cart that comes to the given velocity, ±1 m/s, within some tenths of a second. The wall is at x = 1 m."""
+    """A cart that reaches a commanded velocity of up to 1 m/s within some tenths of a second; a wall is at x = 1 m."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
@@ -45,12 +45,13 @@ robot = robot_from_description(
         "body": [{"at": [0.0, 0.0], "radius": 0.2}],
     }
 )
-how = {"state": lambda env, seen, info: seen, "actions": normalised(robot)}
-data = collect(Cart(), robot, 25_000, **how)  # so many that held-out plans state a bound within the robot's limit
-model, statement = certify(data, ModelConfig())
-env = SafetyWrapper(Cart(), Filter(model), obstacles=lambda *_: [Obstacle("wall", (1.0, 0.0), yaw=np.pi)], **how)
+views = {"state": lambda env, observation, info: observation, "actions": normalised(robot)}
+data = collect(Cart(), robot, 25_000, **views)  # enough held-out plans for a bound within the robot's limit
+model, report = certify(data, ModelConfig())
+env = SafetyWrapper(Cart(), Filter(model), obstacles=lambda *_: [Obstacle("wall", (1.0, 0.0), yaw=np.pi)], **views)
 
 observation, _ = env.reset()
 for _ in range(50):
-    observation, reward, terminated, truncated, info = env.step(np.array([1.0, 0.2]))  # your policy: at the wall
-print(f"asked to drive through the wall, it stands {1.0 - observation[0]:.3f} m from it: {info['diagnostics']['kind']}")
+    observation, reward, terminated, truncated, info = env.step(np.array([1.0, 0.2]))  # your policy: drive at the wall
+distance, kind = 1.0 - observation[0], info["diagnostics"]["kind"]
+print(f"The policy wants to drive through the wall. The cart stands {distance:.3f} m before it: {kind}")

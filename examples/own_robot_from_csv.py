@@ -1,6 +1,6 @@
-"""From a log of your own robot, as CSV, to decisions about it: two commands and four lines.
+"""Get decisions about your own robot from a log of it in CSV: two commands and four lines.
 
-python examples/own_robot_from_csv.py       # makes a small log of its own first
+python examples/own_robot_from_csv.py       # writes a small log first
 """
 
 import os
@@ -18,13 +18,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         os.environ["BRAKELINE_DATA"] = str(folder / "data")
-        robot = folder / "my.toml"  # names, units, bounds, how it brakes
+        robot = folder / "my.toml"  # names, units, bounds, braking
         robot.write_text(small_log.DESCRIPTION)
         log = small_log.write_csv(folder / "drive.csv")
 
         brakeline(["import", str(log), "--robot", str(robot)])
         certify = ["certify", "--robot", str(robot), "--certificates", "residual", "--mode", "direct", "--use"]
-        brakeline([*certify, "--accept-bound", "0.05"])  # 12 minutes state more than the limit of 1 %: it is accepted
+        brakeline([*certify, "--accept-bound", "0.05"])  # from 12 minutes of data, the bound exceeds the limit of 1 %
 
         filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-direct.safetensors"))
         decide(filter, 2.0)
@@ -32,10 +32,10 @@ def main() -> None:
 
 
 def decide(filter: Filter, distance: float) -> None:
-    """Full speed ahead, at a pillar, from standing still."""
-    kept = BackupPlan(filter.robot)  # the committed plan and the input in force: what an asker keeps between questions
-    near = Shapes.of([Obstacle("cylinder", (distance, 0.0), (0.1,))], 2)
-    answer = filter.decide(Request(np.zeros(5), np.array([0.4, 0.0]), kept.input_in_force, kept.plan, near))
+    """Print the decision about driving at a pillar at full speed, for a robot that stands."""
+    backup = BackupPlan(filter.robot)  # the committed plan and the input in force: store it between two decisions
+    pillar = Shapes.of([Obstacle("cylinder", (distance, 0.0), (0.1,))], 2)
+    answer = filter.decide(Request(np.zeros(5), np.array([0.4, 0.0]), backup.input_in_force, backup.plan, pillar))
     print(f"pillar at {distance} m: {answer.kind}, {answer.plan[0][0]:.2f} m/s")
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 
@@ -114,7 +114,7 @@ def acceleration(attitude: Quaternion, force: Triple) -> Array:
     return np.array([east, north, -down - GRAVITY])
 
 
-def resampled(times: Sequence[float], positions: Array, at: Array) -> Array:
+def resampled(times: Sequence[float], positions: Array, at: ArrayLike) -> Array:
     """Return positions (S, 3) at the times `at` (S,), interpolated between `positions` (n, 3) at `times` (n,)."""
     return np.column_stack([np.interp(at, times, positions[:, axis]) for axis in range(3)])
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +105,7 @@ class CommandGate:
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
 
         def ask(action: Array, around: Sequence[Obstacle]) -> DecisionOutcome:
-            about = {"actor": self._name, "step": step & 0xFFFFFFFF, "time": time}
+            about: dict[str, Any] = {"actor": self._name, "step": step & 0xFFFFFFFF, "time": time}
             request = request_message(self.backup_plan, state, action, around, known_free=True, **about)
             return request_decisions(self._ask, [request], self.robot)[0]
 

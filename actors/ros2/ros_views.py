@@ -17,11 +17,7 @@ OBSTACLE_HEIGHT = 0.2  # m
 THICKNESS = 0.01  # m, of lines and of the tube's boxes
 LIFETIME = ros.Duration(sec=1, nanosec=0)  # of a marker that is not replaced
 OBSTACLE = ros.ColorRGBA(r=0.47, g=0.5, b=0.55, a=0.6)
-COLORS = {
-    ALLOWED: (0.2, 0.66, 0.39),
-    ADJUSTED: (0.94, 0.59, 0.12),
-    FAILSAFE: (0.84, 0.19, 0.24),
-}
+COLORS = {ALLOWED: (0.2, 0.66, 0.39), ADJUSTED: (0.94, 0.59, 0.12), FAILSAFE: (0.84, 0.19, 0.24)}
 OTHER = (0.5, 0.3, 0.7)
 NO_DATA = np.zeros(0, dtype=np.uint8)
 CLEAR = ros.Marker(  # deletes all earlier markers

@@ -1,4 +1,4 @@
-"""Records a robot where nothing costs. python collect.py car OUT.safetensors 20000"""
+"""Record a data set of a robot where nothing costs. python collect.py car OUT.safetensors 20000"""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from brakeline.deploy.data.environment_episodes import collect
-from examples.foreign.robots import adapter_of
+from examples.foreign.adapter import load_adapter
 
 
 def main(robot: str, out: str, periods: str = "20000") -> None:
-    adapter = adapter_of(robot)
-    env, how = adapter.make(free=True), {"held": adapter.held, "actions": adapter.actions()}
-    data = collect(env, adapter.robot, int(periods), **how)
+    adapter = load_adapter(robot)
+    env = adapter.make(free=True)
+    data = collect(env, adapter.robot, int(periods), held=adapter.held, actions=adapter.actions())
     data.save(Path(out))
     print(
         f"{out}: {data.periods} periods in {len(data.trajectories)} trajectories, "

@@ -1,9 +1,9 @@
-"""Drives episodes of another author's environment behind the safety service, and says what they cost.
+"""Drive episodes of another author's environment behind the safety service, and report their cost.
 
 python run.py car adversarial --seeds 0 20 --out car.jsonl    (--connect none: without the filter)
 
-Every episode is a line of JSON, written when it ends: what was killed goes on from its first missing seed, and
-`python table.py *.jsonl` adds up any pieces.
+The script writes a line of JSON at the end of each episode. After an interruption it goes on from the first missing
+seed, and `python table.py *.jsonl` adds up the lines of any number of files.
 """
 
 from __future__ import annotations
@@ -24,11 +24,10 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.service.client import SafetyClient
-from examples.foreign.adapter import Adapter
+from examples.foreign.adapter import FOLDERS, Adapter, load_adapter
 from examples.foreign.policies import POLICIES
-from examples.foreign.robots import FOLDERS, adapter_of
 
-DEADLINE = 1.0  # s: the environment waits, a busy machine must not count
+DEADLINE = 1.0  # s for an answer: the environment waits, so a busy machine must not count
 
 
 def main() -> None:
@@ -36,47 +35,52 @@ def main() -> None:
     parser.add_argument("robot", choices=tuple(FOLDERS))
     parser.add_argument("policy", choices=tuple(POLICIES))
     parser.add_argument(
-        "--seeds", type=int, nargs=2, default=(0, 5), metavar=("FIRST", "BEYOND"), help="an episode each"
+        "--seeds", type=int, nargs=2, default=(0, 5), metavar=("FIRST", "BEYOND"), help="seeds, one for each episode"
     )
-    parser.add_argument("--steps", type=int, default=1000, help="of an episode, at most")
+    parser.add_argument("--steps", type=int, default=1000, help="largest number of steps of an episode")
     parser.add_argument("--connect", default="tcp/127.0.0.1:7450", help="the service; none: without the filter")
-    parser.add_argument("--out", type=Path, help="to which the episodes' lines are added")
-    given = parser.parse_args()
-    adapter = adapter_of(given.robot)
+    parser.add_argument("--out", type=Path, help="file to append the lines to")
+    options = parser.parse_args()
+    adapter = load_adapter(options.robot)
     client = None
-    if given.connect != "none":
-        client = SafetyClient.open(given.connect, adapter.robot, DEADLINE, name="client.episodes")
-    env = behind(adapter, client)
+    if options.connect != "none":
+        client = SafetyClient.open(options.connect, adapter.robot, DEADLINE, name="client.episodes")
+    env = filtered_task(adapter, client)
     with client or nullcontext():
-        for seed in missing(given, client is not None):
-            told = {"robot": given.robot, "policy": given.policy, "filter": client is not None, "seed": seed}
-            line = json.dumps(told | episode(env, adapter, given.policy, seed, given.steps))
-            print(line, flush=True)
-            if given.out is not None:
-                with given.out.open("a") as file:
-                    file.write(line + "\n")
+        for seed in missing_seeds(options, client is not None):
+            about = {"robot": options.robot, "policy": options.policy, "filter": client is not None, "seed": seed}
+            report(about | episode(env, adapter, options.policy, seed, options.steps), options.out)
 
 
-def missing(given: argparse.Namespace, filtered: bool) -> list[int]:
-    """The seeds that the file does not have yet."""
-    told = given.out.read_text().splitlines() if given.out is not None and given.out.exists() else []
-    lines = [json.loads(line) for line in told]
-    asked = given.robot, given.policy, filtered
-    have = {line["seed"] for line in lines if (line["robot"], line["policy"], line["filter"]) == asked}
-    return [seed for seed in range(*given.seeds) if seed not in have]
+def report(figures: dict[str, Any], out: Path | None) -> None:
+    """Print a line of JSON, and append it to a file."""
+    line = json.dumps(figures)
+    print(line, flush=True)
+    if out is not None:
+        with out.open("a") as file:
+            file.write(line + "\n")
 
 
-def behind(adapter: Adapter, client: SafetyClient | None, penalty: float = 0.0) -> Any:
-    """The adapter's task, behind the filter where there is one; penalty: of leaning on it, taken off the reward."""
+def missing_seeds(options: argparse.Namespace, filtered: bool) -> list[int]:
+    """Return the seeds that the file does not have yet."""
+    written = options.out.read_text().splitlines() if options.out is not None and options.out.exists() else []
+    lines = [json.loads(line) for line in written]
+    wanted = options.robot, options.policy, filtered
+    present = {line["seed"] for line in lines if (line["robot"], line["policy"], line["filter"]) == wanted}
+    return [seed for seed in range(*options.seeds) if seed not in present]
+
+
+def filtered_task(adapter: Adapter, client: SafetyClient | None, penalty: float = 0.0) -> Any:
+    """Return the adapter's task behind the filter, if there is one. penalty: for a correction, off the reward."""
     env = adapter.make()
     if client is None:
         return env
-    return SafetyWrapper(env, client, penalty, obstacles=adapter.near, actions=adapter.actions())
+    return SafetyWrapper(env, client, penalty, obstacles=adapter.visible_obstacles, actions=adapter.actions())
 
 
 @dataclass
-class Tally:
-    """The environment's own figures of one episode, and what was decided in it."""
+class EpisodeFigures:
+    """The environment's own figures of one episode, and the filter's decisions in it."""
 
     started: float = field(default_factory=time.perf_counter)
     steps: int = 0
@@ -87,31 +91,31 @@ class Tally:
     decisions: Counter[str] = field(default_factory=Counter)
 
     def add(self, reward: float, info: dict[str, Any]) -> None:
-        """A step."""
+        """Add a step."""
         self.steps, self.cost, self.reward = self.steps + 1, self.cost + info["cost"], self.reward + reward
-        if "diagnostics" in info:
-            told = info["diagnostics"]
-            self.decisions[told["kind"]] += 1
-            self.unverified += not told["verified"]
-            self.outside += not told["contained"]
+        if (decision := info.get("diagnostics")) is not None:
+            self.decisions[decision["kind"]] += 1
+            self.unverified += not decision["verified"]
+            self.outside += not decision["contained"]
 
-    def told(self) -> dict[str, Any]:
-        """As a line of JSON has it."""
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures for a line of JSON."""
         figures = {"steps": self.steps, "cost": self.cost, "reward": round(float(self.reward), 2)}
         decided = {"decisions": self.decisions, "unverified": self.unverified, "outside": self.outside}
         return figures | decided | {"seconds": round(time.perf_counter() - self.started, 1)}
 
 
 def episode(env: Any, adapter: Adapter, policy: str, seed: int, steps: int) -> dict[str, Any]:
-    tally = Tally()
+    """Drive one episode, and return its figures."""
+    figures = EpisodeFigures()
     observation, _ = env.reset(seed=seed)
     choose = POLICIES[policy](env, adapter, np.random.default_rng(seed))
     for _ in range(steps):
-        observation, paid, terminated, truncated, info = env.step(choose(observation))
-        tally.add(paid, info)
+        observation, reward, terminated, truncated, info = env.step(choose(observation))
+        figures.add(reward, info)
         if terminated or truncated:
             break
-    return tally.told()
+    return figures.as_json()
 
 
 if __name__ == "__main__":

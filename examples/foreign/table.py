@@ -1,4 +1,4 @@
-"""Adds up the lines that `run.py` wrote, as the table of docs/environments.md. python table.py *.jsonl"""
+"""Add up the lines that `run.py` wrote, as the table of docs/environments.md. python table.py *.jsonl"""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-COUNTED = ("episodes", "cost an episode", "worst", "reward", "unverified", "outside", "decisions")
-HEAD = ("robot", "policy", "filter", *COUNTED)
+FIGURES = ("episodes", "cost an episode", "worst", "reward", "unverified", "outside", "decisions")
+HEAD = ("robot", "policy", "filter", *FIGURES)
 
 
 def main(*paths: str) -> None:
@@ -19,22 +19,22 @@ def main(*paths: str) -> None:
         groups.setdefault((line["robot"], line["policy"], line["filter"]), {})[line["seed"]] = line
     print(row(HEAD), row(["---"] * len(HEAD)), sep="\n")
     for (robot, policy, filtered), episodes in sorted(groups.items()):
-        print(row([robot, policy, "yes" if filtered else "no", *summed(list(episodes.values()))]))
+        print(row([robot, policy, "yes" if filtered else "no", *figures(list(episodes.values()))]))
 
 
-def summed(episodes: list[dict[str, Any]]) -> list[object]:
-    """Everything from the number of episodes on; a seed counts once."""
-    steps = sum(e["steps"] for e in episodes)
+def figures(episodes: list[dict[str, Any]]) -> list[object]:
+    """Return the cells of `FIGURES` for episodes of different seeds."""
+    steps, count = sum(e["steps"] for e in episodes), len(episodes)
     kinds = sum((Counter(e["decisions"]) for e in episodes), Counter[str]())
     unverified, outside = (sum(e[name] for e in episodes) for name in ("unverified", "outside"))
     return [
-        len(episodes),
-        f"{sum(e['cost'] for e in episodes) / len(episodes):.1f}",
+        count,
+        f"{sum(e['cost'] for e in episodes) / count:.1f}",
         f"{max(e['cost'] for e in episodes):.0f}",
-        f"{sum(e['reward'] for e in episodes) / len(episodes):.1f}",
+        f"{sum(e['reward'] for e in episodes) / count:.1f}",
         f"{unverified} of {steps}" if kinds else "–",
         f"{outside} of {steps} ({outside / steps:.1%})" if kinds else "–",
-        ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "–",
+        ", ".join(f"{number} {kind}" for kind, number in kinds.most_common()) or "–",
     ]
 
 

@@ -1,4 +1,4 @@
-"""A policy as it is stored: safetensors, and beside it what it came from as JSON."""
+"""Store and load a trained policy: weights as safetensors, and their origin beside them as JSON."""
 
 from __future__ import annotations
 
@@ -14,20 +14,17 @@ from brakeline.messaging.robot import Robot
 from examples.foreign.adapter import Array
 
 Vector = NDArray[np.float32]
-FARTHEST = 5.0  # of a normalised observation
+LARGEST = 5.0  # of a normalised observation
+LEAST_SPREAD = 0.05  # so that an observation that hardly changes at first is not amplified
 
-LEAST_SPREAD = 0.05  # an observation that hardly changed at first is not blown up
 
+class TrainedPolicy:
+    """ReLU layers (weight, bias) of a normalised observation, then tanh over the range of the robot's inputs."""
 
-class Trained:
-    """ReLU layers (weight, bias) of a normalised observation, then tanh over the range of the robot's inputs.
-
-    middle, spread (n,): (observation - middle) / spread is what the layers see.
-    """
-
-    def __init__(self, robot: Robot, layers: list[tuple[Vector, Vector]], middle: Vector, spread: Vector) -> None:
-        self.layers, self.middle, self.spread = layers, middle, spread
-        self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
+    def __init__(self, robot: Robot, layers: list[tuple[Vector, Vector]], mean: Vector, spread: Vector) -> None:
+        """mean, spread: (n,), see `normalised`."""
+        self.layers, self.mean, self.spread = layers, mean, spread
+        self._center, self._half_range = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     @classmethod
     def load(cls, path: Path, robot: Robot) -> Self:
@@ -37,31 +34,31 @@ class Trained:
         return cls(robot, layers, tensors["middle"], tensors["spread"])
 
     def save(self, path: Path, about: dict[str, Any]) -> None:
-        tensors = {"middle": self.middle, "spread": self.spread}
+        tensors = {"middle": self.mean, "spread": self.spread}
         for k, (weight, bias) in enumerate(self.layers):
             tensors |= {f"layers.{k}.weight": weight, f"layers.{k}.bias": bias}
         safetensors.numpy.save_file(tensors, path)
         path.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n")
 
-    def normalised(self, observation: Array) -> Vector:
-        """In [-1, 1]."""
-        value = seen(observation, self.middle, self.spread)
+    def action(self, observation: Array) -> Vector:
+        """Return the action in [-1, 1]."""
+        value = normalised(observation, self.mean, self.spread)
         for weight, bias in self.layers[:-1]:
             value = np.maximum(weight @ value + bias, 0.0)
         weight, bias = self.layers[-1]
         return np.tanh(weight @ value + bias)
 
     def __call__(self, observation: Array) -> Array:
-        """The robot's input."""
-        return np.asarray(self._centre + self._half * self.normalised(observation))
+        """Return the robot's input."""
+        return np.asarray(self._center + self._half_range * self.action(observation))
 
 
-def seen(observation: NDArray[Any], middle: Vector, spread: Vector) -> Vector:
-    """Observations (..., n) as the layers see them."""
-    return np.clip((observation - middle) / spread, -FARTHEST, FARTHEST).astype(np.float32)
+def normalised(observations: NDArray[Any], mean: Vector, spread: Vector) -> Vector:
+    """Return observations (..., n) as the layers take them."""
+    return np.clip((observations - mean) / spread, -LARGEST, LARGEST).astype(np.float32)
 
 
-def scale(observations: NDArray[Any]) -> tuple[Vector, Vector]:
-    """Middle and spread of observations (count, n)."""
+def mean_and_spread(observations: NDArray[Any]) -> tuple[Vector, Vector]:
+    """Return the mean and the spread (n,) of observations (count, n)."""
     spread = np.maximum(observations.std(axis=0), LEAST_SPREAD)
     return observations.mean(axis=0).astype(np.float32), spread.astype(np.float32)

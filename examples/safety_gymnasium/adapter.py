@@ -1,4 +1,4 @@
-"""Safety-Gymnasium's Goal tasks as the filter sees them."""
+"""Describe Safety-Gymnasium's Goal tasks to the filter."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from brakeline.messaging.obstacle import Obstacle
 from examples.foreign.adapter import Adapter, Array
 
 STEP = {"car": 0.04, "point": 0.02}  # s, of the environment
-FORWARD = {"car": np.array([0.0, -1.0]), "point": np.array([1.0, 0.0])}  # of the agent's body
-LEFT = np.array([1.0, -1.0])  # torques (left, right) of the Car that turn it to the left; seen from the front they swap
-TORQUE = 0.02  # N m, all that the Car's motors give
+FORWARD = {"car": np.array([0.0, -1.0]), "point": np.array([1.0, 0.0])}  # in the frame of the agent's body
+LEFT = np.array([1.0, -1.0])  # torques (left, right) that turn the Car to the left; seen from the front they swap
+TORQUE = 0.02  # N m, the largest of the Car's motors
 
 
 def adapter_of(robot: str) -> Adapter:
@@ -25,16 +25,16 @@ def adapter_of(robot: str) -> Adapter:
 
 
 class Goal(Adapter):
-    """`SafetyCarGoal1-v0` and the like. Recorded in level 0, where there is nothing but the goal."""
+    """`SafetyCarGoal1-v0` and `SafetyPointGoal1-v0`. Data come from level 0, which has nothing but the goal."""
 
-    held, room = 25, 2.5
+    held, half_width = 25, 2.5
 
     def __init__(self, robot: str) -> None:
         super().__init__(Path(__file__).with_name(f"{robot}.toml"))
         self.task, self.step, self.front = f"Safety{robot.title()}Goal1-v0", STEP[robot], FORWARD[robot]
         self.rolls = robot == "car"
 
-    def built(self, free: bool) -> gymnasium.Env[Any, Any]:
+    def make_task(self, free: bool) -> gymnasium.Env[Any, Any]:
         _allow_arrays_as_defaults()
         import safety_gymnasium  # noqa: F401 - registers the environments
 
@@ -44,7 +44,7 @@ class Goal(Adapter):
         return gymnasium.make(name.replace("Goal1", "Goal0") if free else name, disable_env_checker=True)
 
     def state(self, env: Any, observation: Any, info: dict[str, Any]) -> Array:
-        """(x, y, heading, forward, leftward, turn rate)."""
+        """Return (x, y, heading, forward speed, leftward speed, turn rate)."""
         agent = env.unwrapped.task.agent
         front = agent.mat[:2, :2] @ self.front
         vx, vy = agent.vel[:2]
@@ -54,12 +54,15 @@ class Goal(Adapter):
         return np.array([*agent.pos[:2], heading, cos * vx + sin * vy, cos * vy - sin * vx, turning])
 
     def obstacles(self, env: Any, observation: Any, info: dict[str, Any]) -> list[Obstacle]:
-        """Hazards cost where the agent's centre is within: its body's radius does not count. The vase costs nothing in
-        this task, but it is a body that would push back."""
+        """Return hazards and vases.
+
+        A hazard costs if the agent's center is within it: the body's radius does not count. A vase costs nothing in
+        this task, but it is a body that would push back.
+        """
         task, radius = env.unwrapped.task, self.robot.footprint
-        hazards = [Obstacle("cylinder", tuple(at[:2]), (task.hazards.size,), margin=-radius) for at in task.hazards.pos]
-        across = math.sqrt(2.0) * task.vases.size
-        return hazards + [Obstacle("cylinder", tuple(at[:2]), (across,)) for at in task.vases.pos]
+        hazards = [Obstacle("cylinder", tuple(p[:2]), (task.hazards.size,), margin=-radius) for p in task.hazards.pos]
+        diagonal = math.sqrt(2.0) * task.vases.size
+        return hazards + [Obstacle("cylinder", tuple(p[:2]), (diagonal,)) for p in task.vases.pos]
 
     def hazards(self, env: Any) -> list[Array]:
         return list(env.unwrapped.task.hazards.pos)
@@ -67,7 +70,7 @@ class Goal(Adapter):
     def goal(self, env: Any) -> Array:
         return np.asarray(env.unwrapped.task.goal.pos)
 
-    def steered(self, bearing: float) -> Array:
+    def steering_action(self, bearing: float) -> Array:
         if self.rolls:  # torques on its wheels
             turn = max(-1.0, min(2.0 * bearing, 1.0))
             return np.asarray(np.clip(TORQUE * (np.array([1.0, 1.0]) + 2.0 * turn * LEFT), -TORQUE, TORQUE))
@@ -75,7 +78,7 @@ class Goal(Adapter):
 
 
 def _without_sky() -> None:
-    """Every reset reads six large pictures of stars, twice, for seconds. Here nothing is drawn."""
+    """Remove six large pictures of stars, which every reset would read twice, for seconds. Nothing is drawn here."""
     import safety_gymnasium.world as world
     import xmltodict
 

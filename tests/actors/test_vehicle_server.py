@@ -60,10 +60,7 @@ def flown() -> Iterator[tuple[str, Autopilot]]:
 
 @contextmanager
 def actor(
-    url: str,
-    frames: list[pb.MavlinkFrame] | None = None,
-    height: float = 2.0,
-    rejected: RejectedMessages | None = None,
+    url: str, frames: list[pb.MavlinkFrame] | None = None, height: float = 2.0, rejected: RejectedMessages | None = None
 ) -> Iterator[VehicleClient]:
     request = FlightRequest(FlightSettings(url, height=height), ROBOT, ())
     tap: Callable[[pb.MavlinkFrame], None] = (frames if frames is not None else []).append

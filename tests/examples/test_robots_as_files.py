@@ -1,9 +1,10 @@
-"""Robots that are nothing but files beside a simulator: what `docs/your_robot.md` says of them."""
+"""Robots that consist of files only: the statements of `docs/your_robot.md` about them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import mujoco
@@ -25,7 +26,8 @@ from brakeline.messaging.task import RobotWithTask, address, robot_with_task
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.sim.arena import staged_arena
+from brakeline.safety.model.validation import ValidationReport
+from brakeline.sim.arena import Arena, staged_arena
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.sim_conditions import Conditions
@@ -34,7 +36,7 @@ from tests.accepting import BOUND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")
-TRAJECTORIES = 24  # a few seconds of recording each; enough for windows in both parts
+TRAJECTORIES = 24  # enough windows in both parts of the data
 
 
 def robot(name: str) -> RobotWithTask:
@@ -52,46 +54,45 @@ def recorded(kind: RobotWithTask) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def model(recorded: Dataset) -> ModelSet:
-    return certify(recorded, ModelConfig())[0]
+def certified(recorded: Dataset) -> tuple[ModelSet, ValidationReport]:
+    return certify(recorded, ModelConfig())
 
 
-def exact(name: str) -> Vehicle:
-    """Its vehicle, heading east, far from everything, without measurement errors."""
-    made = robot(name).task.code(robot(name).task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
-    return made(staged_arena(), np.random.default_rng(0))
+def exact(name: str, arena: Arena | None = None) -> Vehicle:
+    """Return the robot's vehicle without measurement errors, in an arena or far from everything, heading east."""
+    task = robot(name).task
+    make = task.code(task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+    return make(arena or staged_arena(), np.random.default_rng(0))
 
 
 def drive(vehicle: Vehicle, *inputs: list[float]) -> np.ndarray:
-    for wanted in inputs:
-        vehicle.step(np.array(wanted))
+    """Carry out inputs, and return the true state."""
+    for values in inputs:
+        vehicle.step(np.array(values))
     return vehicle.true
 
 
-def test_a_task_observes_what_its_file_names(kind: RobotWithTask) -> None:
+def test_a_task_observes_the_quantities_in_its_file(kind: RobotWithTask) -> None:
     env = environment(kind, "default", 0)
     observation, info = env.reset(seed=0)
     assert observation.shape == (kind.task.observation_dim,) == env.observation_space.shape
-    assert np.allclose(observation[kind.task.rays.directions.shape[0] + 1 :][:2].sum(), sum(_to_goal(info)), atol=0.1)
+    x, y, heading = info["true_state"][:3]
+    angle = math.atan2(info["goal"][1] - y, info["goal"][0] - x) - heading
+    to_goal = observation[kind.task.rays.directions.shape[0] + 1 :][:2]
+    assert np.allclose(to_goal.sum(), math.sin(angle) + math.cos(angle), atol=0.1)
     assert info["speed"] == pytest.approx(0.0, abs=0.01)
 
 
-def _to_goal(info: dict) -> tuple[float, float]:
-    x, y, heading = info["true_state"][:3]
-    angle = math.atan2(info["goal"][1] - y, info["goal"][0] - x) - heading
-    return math.sin(angle), math.cos(angle)
-
-
-def test_the_car_drives_round_the_circle_of_its_steering() -> None:
-    """Ackermann: the rear axle's middle turns about a point wheelbase / tan(steering) aside."""
+def test_the_car_drives_on_the_circle_of_its_steering() -> None:
+    """Ackermann: the middle of the rear axle turns about a point at the distance wheelbase / tan(steering)."""
     car = exact("car")
     drive(car, [0.0, 0.3], [0.0, 0.5], [0.0, 0.5], [0.4, 0.5], [0.4, 0.5])
     before = car.true.copy()
     after = drive(car, *[[0.4, 0.5]] * 5)
-    turned, way = after[2] - before[2], 0.4 * 5 * 0.2
-    assert turned == pytest.approx(way * math.tan(0.5) / 0.26, rel=0.03)
+    turned, distance = after[2] - before[2], 0.4 * 5 * 0.2
+    assert turned == pytest.approx(distance * math.tan(0.5) / 0.26, rel=0.03)
     backwards = drive(exact("car"), *[[-0.4, 0.3]] * 5)
-    assert backwards[0] < -0.25 and backwards[2] < -0.1  # steered left, it turns right when it backs
+    assert backwards[0] < -0.25 and backwards[2] < -0.1  # steered left, it turns right when it drives backwards
 
 
 def test_the_car_keeps_its_steering_while_it_brakes() -> None:
@@ -102,7 +103,7 @@ def test_the_car_keeps_its_steering_while_it_brakes() -> None:
     assert vehicle.true[3] == pytest.approx(0.0, abs=0.005) and vehicle.true[4] == pytest.approx(0.5, abs=0.01)
 
 
-def test_the_base_goes_aside_while_it_turns() -> None:
+def test_the_base_moves_sideways_while_it_turns() -> None:
     omni = exact("omni")
     after = drive(omni, *[[0.0, 0.4, 0.8]] * 6)
     assert after[3:] == pytest.approx([0.0, 0.4, 0.8], abs=0.03)
@@ -112,22 +113,23 @@ def test_the_base_goes_aside_while_it_turns() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_geom_lies_in_the_discs_of_the_description(name: str) -> None:
-    """Corner by corner, as MuJoCo has placed them, with the car's wheels turned to the stop."""
+    """Compare the corners in MuJoCo, with the car's wheels turned to the stop."""
     vehicle, body = exact(name), robot(name).body
     if name == "car":
         drive(vehicle, [0.0, 0.3], [0.0, 0.5], [0.0, 0.5])
     model, data = vehicle.model, vehicle.data
     frame = data.body("base")
-    turn = frame.xmat.reshape(3, 3)
+    rotation = frame.xmat.reshape(3, 3)
     for i in range(model.ngeom):
         if model.geom_conaffinity[i] & 2:
-            points = (_surface(model, i) @ data.geom_xmat[i].reshape(3, 3).T + data.geom_xpos[i] - frame.xpos) @ turn
-            reach = [np.linalg.norm(points[:, :2] - np.array(disc.at), axis=1) - disc.radius for disc in body]
-            assert np.min(reach, axis=0).max() <= 0.0, model.geom(i).name
+            points = _surface(model, i) @ data.geom_xmat[i].reshape(3, 3).T + data.geom_xpos[i]
+            points = (points - frame.xpos) @ rotation
+            outside = [np.linalg.norm(points[:, :2] - np.array(disc.at), axis=1) - disc.radius for disc in body]
+            assert np.min(outside, axis=0).max() <= 0.0, model.geom(i).name
 
 
 def _surface(model: mujoco.MjModel, i: int) -> np.ndarray:
-    """Points on a geom, in its frame."""
+    """Return points on a geom, in its frame."""
     size, kind = model.geom_size[i], model.geom_type[i]
     around = np.linspace(0.0, 2.0 * np.pi, 60)
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
@@ -141,23 +143,20 @@ def _surface(model: mujoco.MjModel, i: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_driving_into_something_is_a_collision(name: str) -> None:
-    """The physics' own contacts judge: the robot stops at a box in its way, with its nose there."""
-    made = robot(name).task.code(robot(name).task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
-    vehicle = made(staged_arena(Obstacle(BOX, (0.6, 0.0), (0.2, 1.0))), np.random.default_rng(0))
+    """The contacts of the physics count: the robot stops with its nose at a box."""
+    vehicle = exact(name, staged_arena(Obstacle(BOX, (0.6, 0.0), (0.2, 1.0))))
     ahead = np.zeros(robot(name).action_dim)
     ahead[0] = 0.4
-    periods = [vehicle.step(ahead) for _ in range(12)]
-    touched = [period.collision for period in periods]
+    touched = [vehicle.step(ahead).collision for _ in range(12)]
     assert any(touched) and not touched[0]
     assert 0.5 - vehicle.true[0] < 0.2
 
 
 @pytest.mark.parametrize("heading, nose", [(0.0, 0.0), (0.5 * math.pi, 0.11), (-0.5 * math.pi, 0.11)])
-def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float, nose: float) -> None:
-    """A long car beside a wall is farther from it than one whose nose or tail points there."""
-    made = robot("car").task.code(robot("car").task.simulator)(Conditions(NoiseLevels(scale=0.0)), None)
+def test_clearance_is_measured_from_the_discs_of_the_body(heading: float, nose: float) -> None:
+    """A car parallel to a wall is farther from it than one whose nose or tail points at the wall."""
     wall = Obstacle(BOX, (0.0, 0.35), (4.0, 0.1))
-    vehicle = made(staged_arena(wall, start=(0.0, 0.0, heading)), np.random.default_rng(0))
+    vehicle = exact("car", staged_arena(wall, start=(0.0, 0.0, heading)))
     for period in (vehicle.initial_period(), vehicle.step(np.zeros(2))):
         assert period.closest == pytest.approx(0.3 - nose - 0.155, abs=1e-3)
         assert period.clearance == pytest.approx(period.closest, abs=1e-3) and not period.collision
@@ -166,43 +165,42 @@ def test_clearance_is_measured_from_the_discs_that_hold_the_body(heading: float,
 def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
     car = robot("car")
     (part,) = collect.record(car, 1, 3, Conditions())
-    stands = car.is_stop_input(part.inputs)
-    assert stands.any() and (np.abs(np.diff(part.inputs[:, 1])) <= 0.3 + 1e-9).all()
-    assert np.abs(part.inputs[stands, 1]).max() > 0.05
+    stopped = car.is_stop_input(part.inputs)
+    assert stopped.any() and (np.abs(np.diff(part.inputs[:, 1])) <= 0.3 + 1e-9).all()
+    assert np.abs(part.inputs[stopped, 1]).max() > 0.05
 
 
-def test_what_was_not_fitted_keeps_to_the_tubes(recorded: Dataset) -> None:
-    """The share of held-out plans that leave their tubes is what the statement says it can be; narrower tubes fail."""
-    model, statement = certify(recorded, ModelConfig())
-    assert statement.windows > 50 and statement.violations <= 0.05 * statement.windows
-    assert statement.bound_plan < 0.2
+def test_held_out_plans_stay_in_their_tubes(certified: tuple[ModelSet, ValidationReport], recorded: Dataset) -> None:
+    model, report = certified
+    assert report.windows > 50 and report.violations <= 0.05 * report.windows
+    assert report.bound_plan < 0.2
     assert model.robot == recorded.robot
 
 
-def test_nothing_is_touched_in_adversarial_episodes(kind: RobotWithTask, model: ModelSet) -> None:
-    """Behind the filter; the same drive without it does collide."""
+def test_adversarial_episodes_collide_only_without_the_filter(
+    kind: RobotWithTask, certified: tuple[ModelSet, ValidationReport]
+) -> None:
+    model, _ = certified
     assert _collisions(kind, in_process(model, BOUND)) == (0, 0)
     assert _collisions(kind, None)[0] > 0
 
 
 def _collisions(kind: RobotWithTask, question: object) -> tuple[int, int]:
-    """Collisions and steps outside of the predicted sets, in some periods of two adversarial episodes."""
+    """Return the collisions and the steps outside of the predicted sets, in 51 periods of two adversarial episodes."""
     env = environment(kind, "default", FRESH)
-    driver = EpisodeRunner(kind, env, ActorIdentity("test", 0, 0), filtered=question is not None)
+    runner = EpisodeRunner(kind, env, ActorIdentity("test", 0, 0), filtered=question is not None)
     policy = scripted("adversary", kind, np.random.default_rng(0))
-    touched = left = 0
+    collisions = outside = 0
     for number in range(2):
-        for count, step in enumerate(episode(driver, policy, question, number)):
-            touched, left = touched + step.collision, left + (step.compared and not step.contained)
-            if count == 50:
-                break
-    return touched, left
+        for step in islice(episode(runner, policy, question, number), 51):
+            collisions, outside = collisions + step.collision, outside + (step.compared and not step.contained)
+    return collisions, outside
 
 
-def test_a_description_that_changed_makes_the_model_set_again(
+def test_a_changed_description_leads_to_a_new_model_set(
     kind: RobotWithTask, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A model set of a narrower body is never used for a wider one; the recording is, and not for another clock."""
+    """A wider body needs a new model set from the same recording; another period needs a new recording."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     recorded.save(data_paths.record_path(kind))
     before = model_store.model_for(kind, ModelConfig(), BOUND)
@@ -213,14 +211,14 @@ def test_a_description_that_changed_makes_the_model_set_again(
         simulated_recording.data_for(replace(kind, period=0.1))
 
 
-def test_what_was_not_recorded_here_is_never_recorded_over(
+def test_an_imported_data_set_is_never_overwritten_by_a_recording(
     kind: RobotWithTask,
     recorded: Dataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Whether the description changes, or somebody asks for a recording outright."""
+    """Neither a changed description nor `brakeline collect` overwrites it."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     path = data_paths.record_path(kind)
     replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
@@ -232,9 +230,9 @@ def test_what_was_not_recorded_here_is_never_recorded_over(
     assert path.read_bytes() == before
 
 
-def test_a_run_names_its_processes_by_the_robot_and_not_by_its_path() -> None:
+def test_a_process_has_the_name_of_the_robot_and_not_of_its_file() -> None:
     config = RunConfig(robots=tuple(address(str(EXAMPLES / name / f"{name}.toml")) for name in NAMES))
-    names = {place.name for place in process_specs(config) if place.kind == "learner"}
+    names = {spec.name for spec in process_specs(config) if spec.kind == "learner"}
     assert names == {"learner-car", "learner-omni"}
 
 

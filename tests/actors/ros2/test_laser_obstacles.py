@@ -90,10 +90,7 @@ def test_a_room_is_few_obstacles_and_its_middle_is_free():
     assert Shapes.of(found, dim=2).distance(np.zeros((1, 2))).min() > 0.7
 
 
-@given(
-    st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=40),
-    st.floats(1e-3, 0.1),
-)
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=40), st.floats(1e-3, 0.1))
 @settings(deadline=None)
 def test_the_boxes_contain_all_discs_that_they_replace(points, radius):
     points = np.array(points)

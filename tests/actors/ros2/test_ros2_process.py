@@ -117,12 +117,7 @@ def steered(simulated=False, stamped=False, ask=allow):
 
 @pytest.mark.parametrize(
     ("what", "because"),
-    [
-        ("odometry", "odometry is"),
-        ("scan", "the scan is"),
-        ("command", "no command"),
-        ("numbers", "holds NaN"),
-    ],
+    [("odometry", "odometry is"), ("scan", "the scan is"), ("command", "no command"), ("numbers", "holds NaN")],
 )
 def test_a_missing_input_stops_the_robot_until_it_comes_again(what, because):
     with steered() as (robot, _):

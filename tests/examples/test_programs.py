@@ -1,0 +1,82 @@
+"""The example programs and the notebook run as they stand, and print what their texts say."""
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from brakeline import BusError, SafetyClient
+from brakeline.messaging.free_ports import free_endpoint
+from tests.system.runs import BRAKELINE
+from tests.waiting import until
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run_program(name: str) -> str:
+    """Run a program as a person starts it, and return its output."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    words = [sys.executable, str(EXAMPLES / name)]
+    result = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_a_csv_log_leads_to_decisions():
+    output = run_program("own_robot_from_csv.py")
+    assert "pillar at 2.0 m: allowed, 0.40 m/s" in output and "pillar at 0.4 m: allowed" not in output, output
+    assert "next: brakeline certify" in output and "free" in output
+
+
+def test_a_ros2_bag_leads_to_a_model_set():
+    output = run_program("own_robot_from_bag.py")
+    assert re.search(r"known to \d+ cm", output), output
+    assert "next: brakeline certify" in output and "free" in output
+
+
+def test_the_cart_stops_before_the_wall(capsys):
+    runpy.run_path(str(EXAMPLES / "own_policy_in_gymnasium.py"))
+    distance = float(re.search(r"stands (\S+) m before it", capsys.readouterr().out)[1])
+    assert 0.2 < distance < 0.4  # the radius of its body is 0.2 m
+
+
+def test_the_notebook_runs_from_top_to_bottom(data_folder, capsys):
+    matplotlib.use("Agg")
+    names: dict[str, object] = {}
+    for cell in json.loads((EXAMPLES / "a_decision.ipynb").read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    output = capsys.readouterr().out
+    assert all(line in output for line in ("0.60 m: allowed", "0.25 m: adjusted", "0.21 m: failsafe"))
+    assert len(names["axes"]) == 3
+
+
+@pytest.fixture
+def service(data_folder):
+    endpoint = free_endpoint()
+    with subprocess.Popen([*BRAKELINE, "safety", "ground", "--listen", endpoint], stderr=subprocess.DEVNULL) as process:
+        yield endpoint
+        process.terminate()
+
+
+def test_a_robot_that_asks_a_service_stops_before_the_cylinder(service, capsys):
+    def answers():
+        try:
+            with SafetyClient.open(service, "ground", 1.0) as safety:
+                return safety.decide([0.0] * 5, [0.1, 0.0], known_free=True)
+        except BusError:
+            return None
+
+    until(answers, "the service answers")
+    runpy.run_path(str(EXAMPLES / "ask_from_python.py"))["main"](service, 5.0)  # a deadline for a busy machine
+    output = capsys.readouterr().out
+    assert output.count("allowed") >= 5 and "fallback" not in output
+    assert "adjusted" in output or "failsafe" in output
+    positions = [float(x) for x in re.findall(r"x = (\S+) m", output)]
+    assert len(positions) == 15 and 0.3 < max(positions) < 0.6 - 0.1 - 0.105
