@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,10 +102,12 @@ class CommandGate:
             step: number of the period.
         """
         proposal = np.zeros(self.robot.action_dim) if command is None else command.action
+        number = step & 0xFFFFFFFF
 
         def ask(action: Array, around: Sequence[Obstacle]) -> DecisionOutcome:
-            about: dict[str, Any] = {"actor": self._name, "step": step & 0xFFFFFFFF, "time": time}
-            request = request_message(self.backup_plan, state, action, around, known_free=True, **about)
+            request = request_message(
+                self.backup_plan, state, action, around, known_free=True, actor=self._name, step=number, time=time
+            )
             return request_decisions(self._ask, [request], self.robot)[0]
 
         outcome = ask(proposal, [inflated(obstacle, SCAN_DIFFERENCE) for obstacle in obstacles])

@@ -1,11 +1,17 @@
-"""A learner's bus and an actor's."""
+"""The buses of a learner and an actor, and the filter of the ground robot in this process."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from brakeline.actors.decision_guard import Ask
+from brakeline.deploy.data.model_store import model_for
+from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
+from brakeline.safety.model.model_set import ModelConfig
+from tests.robots import GROUND
 
 
 @pytest.fixture
@@ -16,3 +22,8 @@ def buses() -> Iterator[tuple[Bus, Bus]]:
         Bus(BusSettings(connect=(endpoint,)), "actor-0") as actor,
     ):
         yield learner, actor
+
+
+@pytest.fixture(scope="module")
+def ask(data_folder: Path) -> Ask:
+    return in_process(model_for(GROUND, ModelConfig()))

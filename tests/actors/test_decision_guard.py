@@ -1,4 +1,4 @@
-"""Whatever happens to a question, the robot brakes along its committed plan, stands, and later drives on."""
+"""Without a valid answer, the robot brakes along its committed plan and stands; with the next answer it drives on."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from brakeline.errors import BusError, Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import request_message
+from tests.actors.no_answer import no_answer
 from tests.robots import GROUND
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])
@@ -107,5 +108,5 @@ def test_an_invalid_reply_about_one_robot_does_not_affect_the_others():
     replies = [decision(), FAILURES["error"], decision()]
     outcomes = request_decisions(lambda requests: replies, [REQUEST] * 3, GROUND)
     assert [outcome.answer is not None for outcome in outcomes] == [True, False, True]
-    lost = request_decisions(lambda requests: (_ for _ in ()).throw(NoReply("gone")), [REQUEST] * 3, GROUND)
+    lost = request_decisions(no_answer, [REQUEST] * 3, GROUND)
     assert [outcome.failure for outcome in lost] == ["NoReply: gone"] * 3

@@ -1,4 +1,4 @@
-"""One robot through its episodes, without a bus."""
+"""One robot in its episodes, without a bus; with SAILR's training, an intervention ends the episode for the learner."""
 
 import numpy as np
 import pytest
@@ -7,26 +7,31 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.errors import NoReply
 from brakeline.learner.transition_reader import StepReader
+from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.request import NOT_FINITE
-from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.wire import KIND_NUMBERS
+from tests.actors.no_answer import no_answer
 from tests.robots import GROUND
+from tests.safety.rivals.test_sailr import known
 
-FAST = np.array([0.25, 0.1])
+SLOW, FAST = np.array([0.05, 0.1]), np.array([0.25, 0.1])
 
 
 def make_runner(number: int = 0, seed: int = 0, **more) -> EpisodeRunner:
     return EpisodeRunner(GROUND, environment(GROUND, "default", seed), ActorIdentity("actor-0", number, seed), **more)
 
 
-@pytest.fixture(scope="module")
-def ask(data_folder):
-    from brakeline.deploy.data.model_store import model_for
+def make_cutting_runner() -> EpisodeRunner:
+    """Return a runner in its first episode, which an intervention ends."""
+    runner = make_runner(penalty=5.0, ends_on_intervention=True)
+    runner.begin(0)
+    return runner
 
-    return in_process(model_for(GROUND, ModelConfig()))
+
+def step(runner: EpisodeRunner, proposal, ask) -> pb.Step:
+    return runner.execute(proposal, runner.decide(proposal, ask))
 
 
 def test_a_step_records_the_proposal_the_decision_and_the_result(ask):
@@ -60,40 +65,34 @@ def test_the_state_after_a_step_is_compared_with_the_prediction_unless_there_was
         outcome = robot.decide(FAST, ask)
         if falsified:  # a prediction that cannot come true
             outcome.answer.predicted.center[0] += 1.0
-        step = robot.execute(FAST, outcome)
-        assert step.compared and step.contained is not falsified
-    missing = robot.decide(FAST, lambda requests: (_ for _ in ()).throw(NoReply("gone")))
+        compared = robot.execute(FAST, outcome)
+        assert compared.compared and compared.contained is not falsified
     plan = robot.backup_plan.plan.copy()
-    step = robot.execute(FAST, missing)
-    assert step.fallback and step.decision == pb.FAILSAFE and not step.compared
-    assert np.allclose(step.action, plan[0])
+    fallback = step(robot, FAST, no_answer)
+    assert fallback.fallback and fallback.decision == pb.FAILSAFE and not fallback.compared
+    assert np.allclose(fallback.action, plan[0])
 
 
-def test_without_a_filter_the_proposal_is_clipped_to_bounds():
+@pytest.mark.parametrize(("proposal", "action"), [([9.0, -9.0], [0.25, -0.5]), ([np.nan, 0.3], [0.0, 0.0])])
+def test_without_a_filter_the_proposal_is_clipped_to_bounds_and_nan_becomes_zero(proposal, action):
     robot = make_runner(filtered=False)
     robot.begin(0)
-    step = robot.execute(np.array([9.0, -9.0]), None)
-    assert np.allclose(step.action, [0.25, -0.5])
-    assert (step.decision, step.penalty, step.compared) == (pb.UNKNOWN, 0.0, False)
+    step_taken = robot.execute(np.array(proposal), None)
+    assert np.allclose(step_taken.action, action)
+    assert (step_taken.decision, step_taken.penalty, step_taken.compared) == (pb.UNKNOWN, 0.0, False)
 
 
 @pytest.mark.parametrize("proposal", [[np.nan, 0.1], [np.inf, 0.0]])
 def test_a_proposal_of_nan_is_a_failsafe_and_a_step_that_the_learner_accepts(ask, proposal):
     robot = make_runner(penalty=2.0)
     robot.begin(0)
-    robot.execute(FAST, robot.decide(FAST, ask))
+    step(robot, FAST, ask)
     outcome = robot.decide(np.array(proposal), ask)
     assert np.array_equal(outcome.exchange(0.2).request.action, proposal, equal_nan=True)
     assert (outcome.answer.kind, outcome.answer.reason) == ("failsafe", NOT_FINITE)
-    step = robot.execute(np.array(proposal), outcome)
-    assert step.decision == pb.FAILSAFE and step.proposed == step.action == [0.0, 0.0]
-    StepReader(GROUND).move(step)
-
-
-def test_without_a_filter_a_proposal_of_nan_becomes_zero():
-    robot = make_runner(filtered=False)
-    robot.begin(0)
-    assert robot.execute(np.array([np.nan, 0.3]), None).action == [0.0, 0.0]
+    failsafe = robot.execute(np.array(proposal), outcome)
+    assert failsafe.decision == pb.FAILSAFE and failsafe.proposed == failsafe.action == [0.0, 0.0]
+    StepReader(GROUND).move(failsafe)
 
 
 def test_all_robots_of_a_run_have_different_episodes():
@@ -130,3 +129,43 @@ def test_a_step_has_the_number_of_its_request_even_if_periods_are_skipped(ask, m
         asked = robot.request(FAST)
         monkeypatch.setattr(robot.env, "step", skip_a_period if number == 1 else drive)
         assert robot.execute(FAST, request_decisions(ask, [asked], GROUND)[0]).step == asked.step == number
+
+
+def test_an_intervention_is_a_terminal_step_for_the_learner_alone():
+    runner = make_cutting_runner()
+    ask = in_process(known(threshold=0.3))
+    allowed, cut = (step(runner, proposal, ask) for proposal in (SLOW, FAST))
+    assert not allowed.cut and allowed.penalty == 0.0 and allowed.decision == pb.ALLOWED
+    assert cut.cut and cut.decision == pb.FAILSAFE and not any(cut.action) and list(cut.proposed) == pytest.approx(FAST)
+    assert cut.reward - cut.penalty == pytest.approx(GROUND.task.reward.cut) and cut.reward > -5
+    assert not cut.terminated and not cut.goal and not cut.collision, "the environment's episode has not ended"
+    assert cut.truncated and not runner.running, "the robot's episode has ended"
+    stats = EpisodeStats()
+    for step_taken in (allowed, cut):
+        stats.step(step_taken)
+    assert (stats.timeouts, stats.collisions, stats.goals, len(stats.returns)) == (0, 0, 0, 1)
+
+
+def test_outside_of_training_an_intervention_does_not_end_the_episode():
+    runner = make_runner()
+    runner.begin(0)
+    ask = in_process(known(threshold=0.3))
+    for number, proposal in enumerate((FAST, FAST, SLOW)):
+        step_taken = step(runner, proposal, ask)
+        assert runner.running and not step_taken.cut and step_taken.step == number
+        assert (step_taken.decision == pb.FAILSAFE) == (proposal is FAST)
+
+
+def test_a_collision_while_braking_keeps_its_reward():
+    runner = make_cutting_runner()
+    step_taken = pb.Step(reward=-100.0, terminated=True, collision=True, decision=pb.FAILSAFE)
+    runner.running = False
+    runner._end_on_intervention(step_taken)
+    assert step_taken.cut and step_taken.penalty == 0.0 and step_taken.terminated and not step_taken.truncated
+
+
+def test_a_missing_answer_is_not_an_intervention():
+    runner = make_cutting_runner()
+    step(runner, SLOW, in_process(known(threshold=0.3)))
+    fallback = step(runner, SLOW, no_answer)
+    assert fallback.fallback and not fallback.cut and fallback.penalty >= 0.0

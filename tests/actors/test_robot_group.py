@@ -7,24 +7,16 @@ import pytest
 
 from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, decide
-from brakeline.deploy.data.model_store import model_for
-from brakeline.deploy.experiments.evaluate import in_process
-from brakeline.errors import NoReply
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reservation import OtherReservations
-from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
+from tests.actors.no_answer import no_answer
 from tests.robots import GROUND
 
 SIZE = 4
 ROUNDING = 1e-6  # m
-
-
-@pytest.fixture(scope="module")
-def ask(data_folder):
-    return in_process(model_for(GROUND, ModelConfig()))
 
 
 def fleet_of(size=SIZE, arena="crossing", reserving=True):
@@ -63,17 +55,11 @@ def least_distance(fleet):
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):
     """Return the least distance of reservations [m] and the decisions; lost: probability that answers begin to fail."""
     rng, proposers, least, kinds = np.random.default_rng(seed), policies(policy, len(fleet.runners), seed), np.inf, []
-    gone = 0
+    silent = 0  # periods that the service is silent for
     for _ in range(periods):
-        proposals = [p(d.observation, d.info) for p, d in zip(proposers, fleet.runners, strict=True)]
-        gone = gone - 1 if gone else int(rng.integers(1, 4)) * (rng.random() < lost)
-
-        def answer(requests, gone=gone):
-            if gone:
-                raise NoReply("out of order")
-            return ask(requests)
-
-        (outcomes,) = decide([fleet], [proposals], answer)
+        proposals = [policy(r.observation, r.info) for policy, r in zip(proposers, fleet.runners, strict=True)]
+        silent = silent - 1 if silent else int(rng.integers(1, 4)) * (rng.random() < lost)
+        (outcomes,) = decide([fleet], [proposals], no_answer if silent else ask)
         steps = fleet.execute(proposals, outcomes)
         kinds += [step.decision for step in steps if step is not None]
         least = min(least, least_distance(fleet))
@@ -99,9 +85,8 @@ def test_without_reservations_the_same_robots_touch(ask):
     assert fleet.world.touches > 0
 
 
-def test_a_filter_that_ignores_reservations_lets_robots_touch(data_folder, monkeypatch):
+def test_a_filter_that_ignores_reservations_lets_robots_touch(ask, monkeypatch):
     """A mutant of the filter: robots make reservations, and no plan avoids them."""
-    ask = in_process(model_for(GROUND, ModelConfig()))
     monkeypatch.setattr(OtherReservations, "nearest", lambda self, point: np.full(len(self), np.inf))
     fleet = fleet_of()
     begin_close_together(fleet)
@@ -114,11 +99,9 @@ def test_without_answers_all_robots_stop_within_their_reservations(ask):
     begin_close_together(fleet)
     drive(fleet, ask, "random", 15)
     reservations = [runner.backup_plan.reservation for runner in fleet.runners]
-    silent = request_decisions(
-        lambda requests: (_ for _ in ()).throw(NoReply("gone")), fleet.requests([np.zeros(2)] * SIZE), GROUND
-    )
+    outcomes = request_decisions(no_answer, fleet.requests([np.zeros(2)] * SIZE), GROUND)
     for k in range(6):
-        fleet.execute([np.zeros(2)] * SIZE, silent)
+        fleet.execute([np.zeros(2)] * SIZE, outcomes)
         for reservation, robot in zip(reservations, fleet.world.world.robots, strict=True):
             at = min(k, len(reservation.center) - 1)
             body = reservation.radius[at] - GROUND.footprint
@@ -126,28 +109,23 @@ def test_without_answers_all_robots_stop_within_their_reservations(ask):
     assert all(abs(robot.true[3]) < 0.01 for robot in fleet.world.world.robots) and fleet.world.touches == 0
 
 
-def test_the_filter_decides_about_the_robots_in_turn(ask):
-    asked = []
-    original = Filter.decide
+def test_the_filter_decides_about_the_robots_in_turn(ask, monkeypatch):
+    order, decide_one = [], Filter.decide
 
-    class RecordingFilter(Filter):
-        def decide(self, request):
-            asked.append(tuple(request.state[:2]))
-            return original(self, request)
+    def record(self, request):
+        order.append(tuple(request.state[:2]))
+        return decide_one(self, request)
 
-    Filter.decide = RecordingFilter.decide
-    try:
-        fleet = fleet_of(3)
-        fleet.begin(0)
-        for turn in range(4):
-            asked.clear()
-            requests = fleet.requests([np.zeros(2)] * 3)
-            ask(requests)
-            states = [tuple(request.state[:2]) for request in requests]
-            assert asked == states[turn % 3 :] + states[: turn % 3]
-            fleet.execute([np.zeros(2)] * 3, request_decisions(ask, requests, GROUND))
-    finally:
-        Filter.decide = original
+    monkeypatch.setattr(Filter, "decide", record)
+    fleet = fleet_of(3)
+    fleet.begin(0)
+    for turn in range(4):
+        order.clear()
+        requests = fleet.requests([np.zeros(2)] * 3)
+        ask(requests)
+        states = [tuple(request.state[:2]) for request in requests]
+        assert order == states[turn % 3 :] + states[: turn % 3]
+        fleet.execute([np.zeros(2)] * 3, request_decisions(ask, requests, GROUND))
 
 
 def replies(ask, requests):

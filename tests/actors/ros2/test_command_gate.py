@@ -7,12 +7,13 @@ from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFF
 from brakeline.actors.ros2.ros2_process import Ros2Settings, driven
 from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
-from brakeline.errors import Mismatch, NoReply
+from brakeline.errors import Mismatch
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2.cdr_messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.service.wire import decision_of
+from tests.actors.no_answer import no_answer
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()
@@ -36,10 +37,6 @@ def allow(requests):
     return replies
 
 
-def refuse(requests):
-    raise NoReply("nobody")
-
-
 def command(speed, turn=0.0, at=0.0, number=1):
     return RawCommand(np.array([speed, turn]), at, number)
 
@@ -56,12 +53,12 @@ def test_without_an_answer_the_gate_brakes_along_the_plan():
     gate = CommandGate(ROBOT, allow)
     gate.decide(STATE, (), command(0.25), 0.0, 0)
     gate.begin(0.2)
-    gate._ask = refuse
+    gate._ask = no_answer
     inputs = []
     for k in range(4):
         gate.decide(STATE, (), command(0.25), 0.2, 1 + k)
         inputs.append(gate.begin(0.4 + 0.2 * k)[0])
-        assert gate.kind == NO_ANSWER and "nobody" in gate.reason
+        assert gate.kind == NO_ANSWER and "gone" in gate.reason
     assert inputs == [0.0] * 4 and not gate.backup_plan.plan.any()
 
 
@@ -99,9 +96,8 @@ def test_a_robot_that_a_twist_cannot_drive_is_refused():
 
 
 def test_markers_and_diagnostics_survive_encoding():
-    decision = allow([pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0], plan=[0.0] * 2 * ROBOT.horizon)])[
-        0
-    ].decision
+    request = pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0], plan=[0.0] * 2 * ROBOT.horizon)
+    decision = allow([request])[0].decision
     obstacles = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
     shown = decode(MarkerArray, encode(markers(3.0, "odom", decision_of(decision, ROBOT), obstacles)))
     groups = [marker.ns for marker in shown.markers]
