@@ -84,15 +84,12 @@ class StopPractice:
 
     Such a stop is safe, since the plan was verified. It is the only way to go on recording real stops, which
     `brakeline certify LOG` needs.
-
-    Attributes:
-        running: whether the last proposal was part of a stop.
     """
 
     def __init__(self, probability: float) -> None:
         """probability: of beginning a stop, at each step."""
         self.probability, self._left = probability, 0
-        self.running = False
+        self.running = False  # whether the last proposal was part of a stop
 
     def proposal(self, runner: EpisodeRunner, proposal: Array) -> Array:
         """Return the committed plan's next input during a stop, otherwise the proposal."""

@@ -18,20 +18,13 @@ Ask = Callable[[Sequence[pb.Request]], list[pb.Reply]]  # raises BusError if the
 
 @dataclass(frozen=True)
 class DecisionOutcome:
-    """The outcome of one request.
-
-    Attributes:
-        request, reply: the messages; reply is None if none arrived.
-        answer: the valid answer; None: there is none.
-        failure: why there is no answer; empty: there is one.
-        round_trip_ms: the time that the question took.
-    """
+    """The outcome of one request."""
 
     request: pb.Request
-    reply: pb.Reply | None
-    answer: Answer | None
-    failure: str
-    round_trip_ms: float
+    reply: pb.Reply | None  # None: none arrived
+    answer: Answer | None  # None: there is no valid answer
+    failure: str  # why there is no answer; empty: there is one
+    round_trip_ms: float  # of the question
 
     def exchange(self, time: float) -> pb.Exchange:
         """Return the message for the log; time: s, of the request."""

@@ -99,17 +99,13 @@ class RealTimeVehicle:
     """A flying vehicle as the environment sees it: `step` waits for the end of the period.
 
     The true state is unknown here. The estimate takes its place, also for the rays of a virtual scan.
-
-    Attributes:
-        current_period: the latest period that the environment observed.
-        skipped: number of periods that passed without an observation.
     """
 
     def __init__(self, vehicle: VehicleClient, skip: Callable[[], object]) -> None:
         """skip: called for each period that passed without an observation."""
         self.vehicle, self._skip = vehicle, skip
-        self.current_period: ControlPeriod = vehicle.current_period
-        self.skipped = 0
+        self.current_period: ControlPeriod = vehicle.current_period  # the latest that the environment observed
+        self.skipped = 0  # periods that passed without an observation
 
     @property
     def true(self) -> Array:
@@ -146,11 +142,7 @@ class RealTimeVehicle:
 
 
 class FlightRunner(ActorRunner):
-    """The robot of a flight: its world does not wait.
-
-    Attributes:
-        answers: number of answers by what became of them: in time, late, none, lost, or not needed.
-    """
+    """The robot of a flight: its world does not wait."""
 
     waits = False
 
@@ -166,7 +158,7 @@ class FlightRunner(ActorRunner):
         """stages: the arenas of the flight's episodes, one after the other; they differ in the goal."""
         super().__init__(process, settings, 0, self._environment(stages, conditions), propose, continuous=True)
         self._vehicle: RealTimeVehicle | None = None
-        self.answers: Counter[str] = Counter()
+        self.answers: Counter[str] = Counter()  # "in time", "late", "none", "lost" or "not needed"
         self.steps, self.episodes, self.exchanges = map(publisher.wrap, (self.steps, self.episodes, self.exchanges))
         self.frames.publisher = publisher.wrap(self.frames.publisher)
 

@@ -24,18 +24,13 @@ LOG_INTERVAL = 10.0  # s between two log lines while there is no learner
 
 
 class LearnerClient:
-    """The link of one actor to the learner.
-
-    Attributes:
-        policy: the newest policy; None before the first join.
-        flow: the learner's latest message about permissions.
-    """
+    """The link of one actor to the learner."""
 
     def __init__(self, bus: Bus, robot: RobotWithTask, actor: str, lockstep: bool = False) -> None:
         """lockstep: whether each step needs the very weights that the learner names."""
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
-        self.policy: MLP | None = None
-        self.flow = pb.Flow()
+        self.policy: MLP | None = None  # the newest; None before the first join
+        self.flow = pb.Flow()  # the learner's latest message about permissions
         self._incarnation = 0  # of the learner that accepted this actor; 0: none
         self._index = 0  # of the latest step that this actor waited for
         self._doubtful = False  # whether a message contradicts our learner, so that we have to join again

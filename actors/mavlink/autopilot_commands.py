@@ -36,25 +36,16 @@ Wait = Callable[[Callable[[], bool], float], bool]  # (condition, timeout in s) 
 
 
 class AutopilotClient(MavlinkDecoder):
-    """Commands to an autopilot, on top of the values that it sends (see `MavlinkDecoder`).
+    """Commands to an autopilot, on top of the values that it sends (see `MavlinkDecoder`)."""
 
-    Attributes:
-        lookahead: computes a position from each velocity setpoint; None: velocities are sent.
-    """
-
-    lookahead: PositionLookahead | None = None
+    lookahead: PositionLookahead | None = None  # computes positions from setpoints; None: the client sends velocities
 
     def choose(self, what: str, interval: float, wait: Wait) -> str:
         """Choose the message that carries a quantity, and request it at an interval [s].
 
         The client requests one message after the other, the best one first. A message counts once it arrives at the
-        requested rate; a grant alone does not count.
-
-        Returns:
-            A line about the choice for the log.
-
-        Raises:
-            TelemetryMissing: with the result of each request.
+        requested rate; a grant alone does not count. Returns a line about the choice for the log. Raises
+        TelemetryMissing: with the result of each request.
         """
         kind, tried, rates = self.identify(wait), [], dict[str, float]()
         for source in SOURCES[what]:
@@ -153,11 +144,7 @@ class AutopilotClient(MavlinkDecoder):
             raise MavlinkError(f"the autopilot cannot be flown by positions: {error}") from error
 
     def command(self, number: int, *params: float, wait: Wait) -> None:
-        """Send COMMAND_LONG until the autopilot accepts it.
-
-        Raises:
-            CommandRefused: with the result and the autopilot's latest texts.
-        """
+        """Send COMMAND_LONG until the autopilot accepts it. Raises CommandRefused: with its result and latest texts."""
         filled = (*params, *[0.0] * (7 - len(params)))
         result = None
         for attempt in range(COMMAND_ATTEMPTS):

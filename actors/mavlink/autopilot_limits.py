@@ -33,20 +33,13 @@ def demand(robot: Robot) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class AutopilotLimit:
-    """A parameter that limits the vehicle.
-
-    Attributes:
-        demand: the demand that it limits.
-        what: the limited quantity with the parameter's unit, for people.
-        unit: the parameter's unit in the unit of the demand.
-        top: the largest value that the parameter takes, in its own unit.
-    """
+    """A parameter that limits the vehicle."""
 
     parameter: str
-    demand: str
-    what: str
-    unit: float
-    top: float
+    demand: str  # that it limits
+    what: str  # the limited quantity with the parameter's unit, for people
+    unit: float  # the parameter's unit in the unit of the demand
+    top: float  # the largest value that the parameter takes, in its own unit
 
     def sufficient(self, demands: dict[str, float]) -> float:
         """Return the smallest sufficient value in the parameter's own unit, or `top` if that is smaller."""

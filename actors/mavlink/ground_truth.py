@@ -24,13 +24,7 @@ MOST_DATAGRAMS = 100  # read in one call of `poll`
 
 
 class UdpGroundTruth:
-    """The latest ground truth that `brakeline.sim.autopilot.autopilot_server` on this machine sends over UDP.
-
-    Attributes:
-        state: (9,) true state; None before the first datagram.
-        collisions: number of times that the vehicle began to touch an obstacle.
-        clearance: m from the body to the nearest obstacle; inf if the simulator sends none.
-    """
+    """The latest ground truth that `brakeline.sim.autopilot.autopilot_server` on this machine sends over UDP."""
 
     def __init__(self, port: int, system: int, rejected: RejectedMessages | None = None) -> None:
         """Listen on a UDP port of the loopback interface. system: the vehicle's. Raises OSError: the port is in use."""
@@ -38,9 +32,9 @@ class UdpGroundTruth:
         self._socket.bind(("127.0.0.1", port))
         self._socket.setblocking(False)
         self._system, self._rejected = system, rejected or RejectedMessages()
-        self.state: Array | None = None
-        self.collisions = 0
-        self.clearance = math.inf
+        self.state: Array | None = None  # (9,); None before the first datagram
+        self.collisions = 0  # number of times that the vehicle began to touch an obstacle
+        self.clearance = math.inf  # m from the body to the nearest obstacle; inf if the simulator sends none
 
     def poll(self) -> None:
         """Read the datagrams that have arrived, `MOST_DATAGRAMS` at most: a flood must not hold up the flight."""
@@ -75,22 +69,14 @@ class MavlinkGroundTruth:
 
     The first message lays the map so that truth and estimate agree. From then on the drift of the estimate counts
     against the flight.
-
-    Attributes:
-        clearance_of: the clearance [m] of a position (3,) from the nearest obstacle; below 0 the body touches it.
-        state: (9,) true state; its acceleration is unknown and 0. None before the first message.
-        collisions: number of times that the vehicle began to touch an obstacle.
-        clearance: m, the latest.
-        least: m, the smallest clearance so far.
-        worst: m, the largest horizontal distance so far from the estimate to the truth.
     """
 
-    clearance_of: Callable[[Array], float]
-    state: Array | None = None
-    collisions: int = 0
-    clearance: float = math.inf
-    least: float = math.inf
-    worst: float = 0.0
+    clearance_of: Callable[[Array], float]  # clearance [m] of a position (3,); below 0 the body touches an obstacle
+    state: Array | None = None  # (9,), with an unknown acceleration of 0; None before the first message
+    collisions: int = 0  # number of times that the vehicle began to touch an obstacle
+    clearance: float = math.inf  # m, the latest
+    least: float = math.inf  # m, the smallest clearance so far
+    worst: float = 0.0  # m, the largest horizontal distance so far from the estimate to the truth
     _start: tuple[GeoPosition, Array] | None = None
     _touching: bool = False
 

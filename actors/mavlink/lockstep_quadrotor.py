@@ -33,15 +33,11 @@ class LockstepVehicle(ABC):
     """A simulated quadrotor that an autopilot flies over MAVLink: time passes only in `step`.
 
     The measured state comes from the autopilot; the true state and the contacts come from the simulator.
-
-    Attributes:
-        input: the input in force (3,) [m/s].
-        measured, true: the state (9,).
     """
 
     def __init__(self, robot: Robot, vehicle: Quadrotor) -> None:
         self._robot, self._vehicle = robot, vehicle
-        self.input = np.zeros(robot.action_dim)
+        self.input = np.zeros(robot.action_dim)  # in force
         self.true = self.measured = vehicle.state()
 
     @abstractmethod

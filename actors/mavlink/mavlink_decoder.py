@@ -31,13 +31,6 @@ class MavlinkDecoder:
     """The latest values from one autopilot's messages.
 
     Until `choose` has selected a message for a quantity, the decoder uses the best one that arrives.
-
-    Attributes:
-        path: (time [s since its boot], position (3,)) of each position since the caller last emptied the list.
-        position, velocity: (3,) m and m/s; the position is None before the first message.
-        acceleration: (3,) m/s², the accelerometer's reading in the world frame without gravity: few autopilots send it.
-        message_counts: messages by the quantity that they carry (a key of `SOURCES`); heartbeats count as "mode".
-        received, missed: number of the autopilot's frames, by their sequence numbers.
     """
 
     def __init__(
@@ -54,11 +47,11 @@ class MavlinkDecoder:
         self.custom_mode = 0
         self.emergency = False
         self.airborne: bool | None = None  # None: unknown
-        self.message_counts: Counter[str] = Counter()
+        self.message_counts: Counter[str] = Counter()  # by their quantity, a key of SOURCES; heartbeats are "mode"
         self.time = 0.0  # s since its boot, of the latest position
-        self.position: Array | None = None
-        self.velocity = np.zeros(3)
-        self.path: list[tuple[float, Array]] = []
+        self.position: Array | None = None  # (3,) m
+        self.velocity = np.zeros(3)  # m/s
+        self.path: list[tuple[float, Array]] = []  # times and positions since the caller last emptied the list
         self.truth: GeoPosition | None = None  # ground truth of the autopilot's simulator
         self.texts: list[str] = []
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
@@ -66,7 +59,7 @@ class MavlinkDecoder:
         self.outside = ""  # the side of its geofence that it has crossed; empty: none
         self.answers: list[tuple[int, int]] = []  # ns, from TIMESYNC: our clock when we asked, the autopilot's then
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
-        self.received = self.missed = 0
+        self.received = self.missed = 0  # frames, by their sequence numbers
         self._sequence: int | None = None
         self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
         self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
@@ -82,7 +75,7 @@ class MavlinkDecoder:
 
     @property
     def acceleration(self) -> Array:
-        """(3,) m/s², ENU."""
+        """The accelerometer's reading (3,) [m/s², ENU] without gravity; few autopilots send an acceleration."""
         count = len(self._forces)
         x, y, z = (sum(force[axis] for force in self._forces) / count for axis in range(3))
         return telemetry.acceleration(self._attitude, (x, y, z))

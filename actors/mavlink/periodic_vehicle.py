@@ -13,20 +13,12 @@ from brakeline.sim.vehicle import Period
 
 @dataclass(frozen=True)
 class ControlPeriod:
-    """One control period, at the moment when it begins.
+    """One control period, at the moment when it begins."""
 
-    Attributes:
-        number: its number; the first is 0.
-        input: (3,) m/s, in force from this moment on.
-        report: the outcome of the period before.
-        lost: why the measurement or our control does not count: no recent telemetry, or the autopilot does not follow
-            our setpoints. Empty if both count.
-    """
-
-    number: int
-    input: Array
-    report: Period
-    lost: str = ""
+    number: int  # the first is 0
+    input: Array  # (3,) m/s, in force from this moment on
+    report: Period  # the outcome of the period before
+    lost: str = ""  # why telemetry does not count, or the autopilot does not follow our setpoints; empty: all is well
 
 
 class PeriodicVehicle:

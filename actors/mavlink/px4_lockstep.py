@@ -57,10 +57,6 @@ class Px4Flight:
 
     `enter` puts another simulated vehicle in the place of the one that flies. For PX4 all arenas lie in one large
     field.
-
-    Attributes:
-        setpoint: the velocity (3,) [m/s] that is sent.
-        starts: number of starts of PX4.
     """
 
     def __init__(
@@ -71,8 +67,8 @@ class Px4Flight:
         self._px4: Px4Process | None = None
         self._count = 0
         self._times = dict.fromkeys(INTERVALS, 0.0)  # s, of the newest message of each kind
-        self.setpoint = np.zeros(3)
-        self.starts = 0
+        self.setpoint = np.zeros(3)  # m/s
+        self.starts = 0  # of PX4
 
     @property
     def flies(self) -> bool:

@@ -34,11 +34,7 @@ SHORTEST_TIMEOUT = 0.5  # s: a busy machine's setpoints do not trip a timeout of
 
 
 class Takeoff:
-    """One takeoff, from the first heartbeat on.
-
-    Attributes:
-        notes: lines about the messages that are used, and the parameters that are too low.
-    """
+    """One takeoff, from the first heartbeat on."""
 
     def __init__(
         self,
@@ -55,7 +51,7 @@ class Takeoff:
             hold: called with a setpoint (3,) [m/s] to repeat from now on; None: send none.
         """
         self._client, self._robot, self._flight, self._wait, self._hold = client, robot, flight, wait, hold
-        self.notes: list[str] = []
+        self.notes: list[str] = []  # about the messages that are used, and the parameters that are too low
 
     def fly(self) -> None:
         """Climb to the height above the ground unless the vehicle flies already, and come to rest.

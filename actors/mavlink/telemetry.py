@@ -45,18 +45,12 @@ class MotionSample:
 
 @dataclass(frozen=True)
 class GeoPosition:
-    """A position on the Earth.
+    """A position on the Earth."""
 
-    Attributes:
-        latitude, longitude: in units of 1e-7 degrees.
-        altitude: m; None: the message has none.
-        metres: m of latitude in one unit.
-    """
-
-    latitude: int
-    longitude: int
-    altitude: float | None
-    metres: float
+    latitude: int  # 1e-7 degrees
+    longitude: int  # 1e-7 degrees
+    altitude: float | None  # m; None: the message has none
+    metres: float  # m of latitude in 1e-7 degrees
 
     def since(self, first: GeoPosition) -> Array:
         """Return the displacement (3,) [m, ENU] from `first`. Its height is 0 if an altitude is unknown."""
@@ -68,17 +62,11 @@ class GeoPosition:
 
 @dataclass(frozen=True)
 class TelemetrySource:
-    """A message that carries a quantity.
-
-    Attributes:
-        message: its name.
-        read: returns the quantity; None if this message does not contain it.
-        kinds: the autopilots whose message has this meaning.
-    """
+    """A message that carries a quantity."""
 
     message: str
-    read: Callable[[Message], Any]
-    kinds: tuple[str, ...] = ("px4", "ardupilot")
+    read: Callable[[Message], Any]  # returns the quantity; None if this message does not contain it
+    kinds: tuple[str, ...] = ("px4", "ardupilot")  # the autopilots whose message has this meaning
 
 
 def read_source(source: TelemetrySource, message: Message) -> Any:

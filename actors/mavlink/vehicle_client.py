@@ -35,11 +35,7 @@ SERVER = "brakeline.actors.mavlink.vehicle_server"
 
 
 class VehicleClient(PeriodicVehicle):
-    """A vehicle in flight, used like a `MavlinkVehicle`. It flies its plan to the end even if this process dies.
-
-    Attributes:
-        figures: the latest figures for Health: lateness, and the ground truth of a simulated flight.
-    """
+    """A vehicle in flight, used like a `MavlinkVehicle`. It flies its plan to the end even if this process dies."""
 
     def __init__(
         self,
@@ -116,7 +112,7 @@ class VehicleClient(PeriodicVehicle):
         """Connect to the vehicle's server, start one if there is none, and send the flight request."""
         self._current: ControlPeriod | None = None
         self._failure: Exception | None = None
-        self.figures: dict[str, float] = {}
+        self.figures: dict[str, float] = {}  # for Health: lateness, and the ground truth of a simulated flight
         self._replies: SimpleQueue[pb.CommitReply | None] = SimpleQueue()
         self._received, self._received_at = False, time.monotonic()
         command = pb.VehicleCommand(fly=request_message(request))

@@ -57,16 +57,11 @@ MOST_QUEUED = 20  # messages, from which on the actor gets no new updates
 
 
 class ActorOutbox:
-    """Sends messages to the current actor in its own thread, so that an actor that does not read holds up nobody.
-
-    Attributes:
-        actor: the current actor; None: there is none.
-        unsent: frames that could not be sent; the next update contains them.
-    """
+    """Sends messages to the current actor in its own thread, so that an actor that does not read delays nobody."""
 
     def __init__(self) -> None:
-        self.actor: MessageSocket | None = None
-        self.unsent: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)
+        self.actor: MessageSocket | None = None  # the current one
+        self.unsent: deque[pb.MavlinkFrame] = deque(maxlen=MOST_FRAMES)  # the next update contains them
         self._queue: SimpleQueue[tuple[MessageSocket | None, pb.VehicleMessage | None] | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()

@@ -67,21 +67,15 @@ class GateStats:
 
 
 class CommandGate:
-    """The committed plan of one robot, and the decision about its next input.
-
-    Attributes:
-        input: the input in force (m,).
-        kind, reason: the decision about it, and why the input is not the command; empty if it is.
-        outcome: the outcome of this period's question; None before `decide`.
-    """
+    """The committed plan of one robot, and the decision about its next input."""
 
     def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
         """robot: in real time (`Robot.late`); name: of the robot, in the requests."""
         assert robot.late, "in real time a decision is about the next period"
         self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot), GateStats()
-        self.input = np.zeros(robot.action_dim)
-        self.kind, self.reason = BLIND, "not begun"
-        self.outcome: DecisionOutcome | None = None
+        self.input = np.zeros(robot.action_dim)  # in force
+        self.kind, self.reason = BLIND, "not begun"  # the decision about it, and why it is not the command
+        self.outcome: DecisionOutcome | None = None  # of this period's question
         self._ask, self._name = ask, name
         self._command: RawCommand | None = None  # the one that the outcome is about
         self._counted = 0  # number of the last command whose delay has been counted

@@ -51,30 +51,19 @@ class HitErrors:
 
 @dataclass(frozen=True)
 class LaserBeams:
-    """The n beams of a scan, with one for each direction that the scan leaves out.
+    """The n beams of a scan, with one for each direction that the scan leaves out."""
 
-    Attributes:
-        times: (n,) s.
-        angles: (n,) rad, in the sensor's frame.
-        ranges: (n,) m of free space: up to the hit or the sensor's range; NaN for a blind beam.
-        blind: (n,) whether the beam has no information.
-        gap: rad between two neighbours.
-    """
-
-    times: Array
-    angles: Array
-    ranges: Array
-    blind: NDArray[np.bool_]
-    gap: float
+    times: Array  # (n,) s
+    angles: Array  # (n,) rad, in the sensor's frame
+    ranges: Array  # (n,) m of free space: up to the hit or the sensor's range; NaN for a blind beam
+    blind: NDArray[np.bool_]  # (n,) whether the beam has no information
+    gap: float  # rad between two neighbours
 
 
 def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
-    """Return the beams of a scan.
+    """Return the beams of a scan. Raises BadLaserScan: its angles or ranges are not valid.
 
     zero_is_free: the driver reports 0 where nothing is within range, as some do (REP 117 demands inf).
-
-    Raises:
-        BadScan: the scan's angles or ranges are not valid.
     """
     ranges = np.asarray(scan.ranges, dtype=float)
     n, gap = len(ranges), float(scan.angle_increment)
@@ -93,13 +82,7 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     unseen = _unseen(float(scan.angle_min), gap, n)
     lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
     times = np.concatenate([times, np.full(len(unseen), times[-1])])
-    return LaserBeams(
-        np.asarray(times, float),
-        np.concatenate([angles, unseen]),
-        np.asarray(lengths, float),
-        np.isnan(lengths),
-        abs(gap),
-    )
+    return LaserBeams(times, np.concatenate([angles, unseen]), lengths, np.isnan(lengths), abs(gap))
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:
@@ -118,8 +101,6 @@ def obstacles(
         beams: the n beams of a scan.
         poses: (n, ≥ 3) x, y [m], heading [rad] of the robot at the beams' times.
         mount: the sensor's pose on the robot.
-        robot: its footprint and sight count.
-        errors: the largest errors.
         around: (2,) m, the position, in the frame of the poses. At a blind beam, an obstacle touches the body there.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -36,21 +36,13 @@ class AgeLimits:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """How to interpret a robot's sensors.
+    """How to interpret a robot's sensors."""
 
-    Attributes:
-        range_error: m, the largest of the lidar.
-        zero_is_free: the lidar reports 0 where nothing is within its range.
-        mount: the lidar's pose on the robot; None: the transforms contain it.
-        odometry_frame: the frame of the state.
-        base_frame: the robot's frame in the transforms, which then replace the odometry; empty: they do not.
-    """
-
-    range_error: float = 0.02
-    zero_is_free: bool = False
-    mount: PlanarPose | None = None
-    odometry_frame: str = "odom"
-    base_frame: str = ""
+    range_error: float = 0.02  # m, the largest of the lidar
+    zero_is_free: bool = False  # the lidar reports 0 where nothing is within its range
+    mount: PlanarPose | None = None  # the lidar's pose on the robot; None: the transforms contain it
+    odometry_frame: str = "odom"  # the frame of the state
+    base_frame: str = ""  # the robot's frame in the transforms, which then replace the odometry; empty: they do not
 
 
 @dataclass(frozen=True)
@@ -63,15 +55,11 @@ class RawCommand:
 
 
 class RosInputs:
-    """The latest input of each kind. The node's threads call the handlers `on_…`; one other thread calls the rest.
-
-    Attributes:
-        frame: the frame of the state.
-    """
+    """The latest input of each kind. The node's threads call the handlers `on_…`; one other thread calls the rest."""
 
     def __init__(self, robot: Robot, settings: SensorSettings, limits: AgeLimits) -> None:
         self.robot, self.settings, self.limits = robot, settings, limits
-        self.frame = settings.odometry_frame
+        self.frame = settings.odometry_frame  # of the state
         self._errors = HitErrors.of(robot, settings.range_error)
         self._lock = threading.Lock()
         self._odometry, self._transforms = OdometryHistory(limits.odometry), TransformTree()
