@@ -8,7 +8,7 @@ from tests.robots import GROUND
 
 
 class ScriptedLearner:
-    """The bus side of a learner: it accepts every actor of the right layout, and publishes what the test says."""
+    """The bus side of a learner: it accepts every actor of the right layout, and publishes permissions and weights."""
 
     def __init__(self, bus: Bus) -> None:
         self.flow = pb.Flow(robot="ground", incarnation=1)

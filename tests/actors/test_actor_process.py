@@ -84,15 +84,15 @@ def test_a_practised_stop_follows_its_plan_as_long_as_the_plan_holds():
     runner = SimpleNamespace(robot=GROUND, backup_plan=BackupPlan(GROUND), rng=np.random.default_rng(0))
     runner.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, True)
     answers = {kind: SimpleNamespace(kind=kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
-    asked = {kind: DecisionOutcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
+    outcomes = {kind: DecisionOutcome(pb.Request(), pb.Reply(), answer, "", 1.0) for kind, answer in answers.items()}
     practice, never = StopPractice(1.0), StopPractice(0.0)
     for one in (practice, never):
         one.proposal(runner, np.zeros(2))
-    assert [kind for kind, outcome in asked.items() if practice.outcome(runner, outcome).answer] == ["allowed"]
-    assert practice.outcome(runner, asked["adjusted"]).failure == STOP_PRACTICE
-    assert all(never.outcome(runner, outcome) is outcome for outcome in asked.values())
+    assert [kind for kind, outcome in outcomes.items() if practice.outcome(runner, outcome).answer] == ["allowed"]
+    assert practice.outcome(runner, outcomes["adjusted"]).failure == STOP_PRACTICE
+    assert all(never.outcome(runner, outcome) is outcome for outcome in outcomes.values())
     runner.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
-    assert all(practice.outcome(runner, outcome) is outcome for outcome in asked.values())
+    assert all(practice.outcome(runner, outcome) is outcome for outcome in outcomes.values())
 
 
 def test_one_question_is_about_all_robots_of_a_process(scene):
@@ -118,10 +118,10 @@ def test_without_the_service_a_robot_brakes_along_its_plan_waits_and_drives_on(s
     until(lambda: service.failing)
     quiet = -1
     while quiet != len(steps):  # the robot stands, and its episode does not go on
-        quiet, asked = len(steps), len(service.proposals)
-        time.sleep(1.0)
-    again = service.proposals[asked:]
-    assert len(again) > 3 and again == [again[0]] * len(again), "a waiting robot keeps its proposal"
+        quiet, questions = len(steps), len(service.proposals)
+        time.sleep(0.5)
+    repeated = service.proposals[questions:]
+    assert len(repeated) > 3 and repeated == [repeated[0]] * len(repeated), "a waiting robot keeps its proposal"
     lost = [step for step in steps if step.fallback]
     assert lost and lost[-1] is steps[-1] and not any(steps[-1].action)
     first = steps.index(lost[0])
@@ -145,7 +145,7 @@ def test_a_fleet_without_the_service_stops_together_and_drives_on_together(scene
     quiet = -1
     while quiet != len(steps):  # time passes for all robots or for none
         quiet = len(steps)
-        time.sleep(1.0)
+        time.sleep(0.5)
     last = {name: [step for step in steps if step.actor == name][-1] for name in names}
     assert len({step.step for step in last.values()}) == 1
     assert all(step.fallback and not any(step.action) for step in last.values())
@@ -154,5 +154,5 @@ def test_a_fleet_without_the_service_stops_together_and_drives_on_together(scene
     assert not any(step.contact_robot or step.collision for step in steps)
     assert {step.fleet for step in steps} == {3} and not any(step.fallback for step in steps[quiet:])
     assert all(batch == names for batch in service.batches)
-    asked = [e.request for e in list(exchanges) if e.request.step and not e.failure]
-    assert asked and all(list(request.fleet) == names and request.HasField("reservation") for request in asked)
+    requests = [e.request for e in list(exchanges) if e.request.step and not e.failure]
+    assert requests and all(list(r.fleet) == names and r.HasField("reservation") for r in requests)

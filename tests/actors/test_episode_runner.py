@@ -126,9 +126,9 @@ def test_a_step_has_the_number_of_its_request_even_if_periods_are_skipped(ask, m
         return drive(action)
 
     for number in (0, 1, 3):
-        asked = robot.request(FAST)
+        request = robot.request(FAST)
         monkeypatch.setattr(robot.env, "step", skip_a_period if number == 1 else drive)
-        assert robot.execute(FAST, request_decisions(ask, [asked], GROUND)[0]).step == asked.step == number
+        assert robot.execute(FAST, request_decisions(ask, [request], GROUND)[0]).step == request.step == number
 
 
 def test_an_intervention_is_a_terminal_step_for_the_learner_alone():

@@ -38,9 +38,7 @@ def test_no_takeoff_where_hovering_cannot_be_verified() -> None:
     assert takeoff_verified(question, robot, stage(2.0), True, lambda: False)
     with pytest.raises(TakeoffNotVerified, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
         takeoff_verified(question, robot, stage(0.02), True, lambda: False)
-    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), (
-        "a rival method does not verify hovering"
-    )
+    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), "a rival method cannot verify hovering"
 
 
 @pytest.mark.usefixtures("flight_folder")
@@ -56,9 +54,7 @@ def test_in_real_time_recovery_continues_period_after_period() -> None:
     runner.begin(0)
     kinds = []
     for _ in range(25):
-        runner.info["obstacles"] = (
-            Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),
-        )  # a virtual one, which it is inside of
+        runner.info["obstacles"] = (Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),)  # a virtual one around the vehicle
         outcome = runner.decide(np.zeros(3), question)
         assert outcome is not None and outcome.answer is not None
         kinds.append(outcome.answer.kind)

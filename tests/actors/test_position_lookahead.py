@@ -42,8 +42,8 @@ def test_the_position_lies_in_the_direction_of_the_velocity(
     target = PositionLookahead.of(kind, VALUES[kind]).target(position, velocity, np.array(wanted))
     ahead = target - position - LATENCY * velocity
     level = math.hypot(*wanted[:2])
-    asked = controller_speed(math.hypot(*ahead[:2]), 2.0, brakes[0])
-    assert asked == pytest.approx(level, abs=1e-6)
+    speed = controller_speed(math.hypot(*ahead[:2]), 2.0, brakes[0])
+    assert speed == pytest.approx(level, abs=1e-6)
     assert ahead[:2] * level == pytest.approx(np.array(wanted[:2]) * math.hypot(*ahead[:2]), abs=1e-6)
     assert controller_speed(ahead[2], 1.0, brakes[1]) == pytest.approx(wanted[2], abs=1e-6)
 

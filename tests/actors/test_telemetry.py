@@ -30,7 +30,7 @@ from brakeline.sim.autopilot import ned_frames
 from tests.robots import QUADROTOR
 
 ROLL, PITCH, YAW = 0.2, -0.3, 1.1  # rad
-DOWN = -1.02  # g, what an accelerometer that hovers feels downwards
+DOWN = -1.02  # g, the reading along the vertical axis of a vehicle that hovers
 KINDS = {"px4": mavlink.MAV_AUTOPILOT_PX4, "ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA}
 
 
@@ -190,17 +190,11 @@ def test_a_message_that_is_granted_but_never_arrives_is_not_used() -> None:
     """PX4 does this before it knows its heading."""
     autopilot = ScriptedAutopilot("px4", {"ATTITUDE_QUATERNION": 0.0, "ODOMETRY": 50.0, "HIGHRES_IMU": 50.0})
     line = autopilot.client.choose(ATTITUDE, 0.02, autopilot.wait)
-    assert (
-        line.startswith("attitude from ODOMETRY at 5") and "ATTITUDE_QUATERNION is granted, but never arrives" in line
-    )
+    assert line.startswith("attitude from ODOMETRY at 5") and "QUATERNION is granted, but never arrives" in line
     assert autopilot.switched_off == ["ATTITUDE_QUATERNION"]
     autopilot.client.choose(FORCE, 0.02, autopilot.wait)
-    hovering = times(quaternion(), times((0.0, *[0.1, 0.2, 9.80665 * DOWN]), conjugate(quaternion())))
-    assert autopilot.client.acceleration == pytest.approx([hovering[2], hovering[1], -hovering[3] - 9.81], abs=1e-4)
-
-
-def conjugate(q: Any) -> tuple[float, float, float, float]:
-    return (q[0], -q[1], -q[2], -q[3])
+    north, east, down = rotate(quaternion(), (0.1, 0.2, 9.80665 * DOWN))
+    assert autopilot.client.acceleration == pytest.approx([east, north, -down - 9.81], abs=1e-4)
 
 
 def test_a_refused_message_is_replaced_as_arducopter_needs_it() -> None:
@@ -247,25 +241,20 @@ def test_missing_frames_are_counted() -> None:
 def test_parameters_below_the_robots_bounds_are_found() -> None:
     autopilot = ScriptedAutopilot("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
     autopilot.client.identify(autopilot.wait)
-    values = {
-        c.parameter: autopilot.client.parameter(c.parameter, autopilot.wait) for c in AUTOPILOT_LIMITS["ardupilot"]
-    }
-    known = {name: value for name, value in values.items() if value is not None}
+    names = [limit.parameter for limit in AUTOPILOT_LIMITS["ardupilot"]]
+    known = {n: value for n in names if (value := autopilot.client.parameter(n, autopilot.wait)) is not None}
     assert known == {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0}
     below = limits_below_demand("ardupilot", known, QUADROTOR)
     assert [(limit.parameter, value) for limit, value, _ in below] == [("WPNAV_ACCEL", 100.0)]
-    asked = demand(QUADROTOR)
-    assert (asked["speed"], asked["climb"], asked["acceleration"]) == pytest.approx((50**0.5, 5.0, 32**0.5))
+    demands = demand(QUADROTOR)
+    assert (demands["speed"], demands["climb"], demands["acceleration"]) == pytest.approx((50**0.5, 5.0, 32**0.5))
     assert below[0][2] == 500.0, "the largest value that the parameter takes"
 
 
 def test_missing_quantities_of_the_estimator_have_names() -> None:
     assert missing(sum({1, 2, 4, 16, 32})) == [] and missing(sum({1, 2, 4, 8, 32})) == []
-    assert missing(165) == [
-        "horizontal velocity",
-        "horizontal position",
-        "anything except that the vehicle stands still",
-    ]
+    still = "anything except that the vehicle stands still"
+    assert missing(165) == ["horizontal velocity", "horizontal position", still]
     assert missing(0) == list(ESTIMATED)
 
 

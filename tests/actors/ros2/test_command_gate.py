@@ -115,11 +115,11 @@ class CautiousFilter:
     """Verifies nothing if obstacles are larger than `largest` [m]; its plans end `advance` m nearer to them."""
 
     def __init__(self, largest, advance=0.0):
-        self.largest, self.advance, self.asked = largest, advance, []
+        self.largest, self.advance, self.requests = largest, advance, []
 
     def __call__(self, requests):
         (request,) = requests
-        self.asked.append(request)
+        self.requests.append(request)
         (reply,) = allow(requests)
         size = max((obstacle.size[0] for obstacle in request.obstacles), default=0.0)
         if size > self.largest:
@@ -135,8 +135,8 @@ def test_if_the_inflated_obstacles_leave_room_the_gate_asks_once():
     cautious = CautiousFilter(largest=1.0)
     gate = CommandGate(ROBOT, cautious)
     gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
-    (asked,) = cautious.asked
-    assert asked.obstacles[0].size[0] == pytest.approx(0.1 + SCAN_DIFFERENCE)
+    (request,) = cautious.requests
+    assert request.obstacles[0].size[0] == pytest.approx(0.1 + SCAN_DIFFERENCE)
 
 
 def test_if_only_the_inflation_forbids_a_plan_the_robot_may_leave_and_turn_but_not_approach():
@@ -145,7 +145,7 @@ def test_if_only_the_inflation_forbids_a_plan_the_robot_may_leave_and_turn_but_n
         gate = CommandGate(ROBOT, cautious)
         gate.decide(STATE, DISC, command(0.2, 0.1), 0.0, 0)
         assert gate.begin(0.2).tolist() == pytest.approx([speed, 0.1]) and gate.kind == "allowed"
-        assert cautious.asked[-1].obstacles[0].size[0] == pytest.approx(0.1)
+        assert cautious.requests[-1].obstacles[0].size[0] == pytest.approx(0.1)
 
 
 def test_without_any_verified_plan_the_robot_brakes():

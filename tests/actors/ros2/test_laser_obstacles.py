@@ -42,7 +42,7 @@ def scan_of(beam_ranges, **more):
     return LaserScan(**fields | more)
 
 
-def seen(scan, pose=(0.0, 0.0, 0.0), mount=MOUNT, **more):
+def obstacles_of(scan, pose=(0.0, 0.0, 0.0), mount=MOUNT, **more):
     """Return the obstacles of a scan that a robot makes while it stands."""
     beams = read(scan, **more)
     poses = np.tile(pose, (len(beams.times), 1))
@@ -51,10 +51,10 @@ def seen(scan, pose=(0.0, 0.0, 0.0), mount=MOUNT, **more):
 
 def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
     """Compare exact dense beams with a scan whose ranges and pose have the largest errors."""
-    rng, looked = np.random.default_rng(0), 0
+    rng, positions = np.random.default_rng(0), 0
     angles = np.linspace(0.0, 2.0 * math.pi, 3600, endpoint=False)
     dense = LidarRays(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3.5)
-    while looked < 40:
+    while positions < 40:
         arena = draw_arena("dense", rng, GROUND)
         close = Lidar(arena, dense)
         lidar = SpinningLidar(arena, rng, 0.0, nearest=0.0)
@@ -63,14 +63,14 @@ def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
             clear = float(arena.shapes.distance(place).min()) - GROUND.footprint
             if not 0.02 < clear < 0.3:
                 continue
-            looked += 1
+            positions += 1
             true = np.array([*place, rng.uniform(-math.pi, math.pi), 0.0, 0.0])
             ranges = None
             while ranges is None:
                 ranges = lidar.measure_sector(true)
             ranges = np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 0.0)
             wrong = true[:3] + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3]
-            found = Shapes.of(seen(scan_of(ranges, range_min=0.0), wrong), dim=2)
+            shapes = Shapes.of(obstacles_of(scan_of(ranges, range_min=0.0), wrong), dim=2)
             sensor = place + MOUNT.x * np.array([math.cos(true[2]), math.sin(true[2])])
             true_ranges = close.cast(sensor, float(true[2]))
             turned = true[2] + angles
@@ -79,15 +79,15 @@ def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
             beside = jumps < EDGE  # a beam and the next one hit one surface
             points = points[(true_ranges < NEAR) & np.repeat(beside, 10)]
             assert len(points) > 0
-            assert found.distance(points).min(axis=0).max() <= 1e-9
+            assert shapes.distance(points).min(axis=0).max() <= 1e-9
 
 
 def test_a_room_is_few_obstacles_and_its_middle_is_free():
     angles = 2.0 * math.pi * np.arange(BEAMS) / BEAMS
     square = 0.8 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
-    found = seen(scan_of(square), mount=PlanarPose())
-    assert 4 <= len(found) <= 12
-    assert Shapes.of(found, dim=2).distance(np.zeros((1, 2))).min() > 0.7
+    boxes = obstacles_of(scan_of(square), mount=PlanarPose())
+    assert 4 <= len(boxes) <= 12
+    assert Shapes.of(boxes, dim=2).distance(np.zeros((1, 2))).min() > 0.7
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=40), st.floats(1e-3, 0.1))
@@ -111,27 +111,27 @@ def test_a_gap_that_the_body_cannot_pass_is_occupied():
 @pytest.mark.parametrize("blind", [math.nan, 0.0, 0.05, -math.inf, -1.0])
 def test_a_blind_beam_makes_an_obstacle_at_the_body(blind):
     ranges = np.full(BEAMS, math.inf)
-    assert seen(scan_of(ranges)) == ()
+    assert obstacles_of(scan_of(ranges)) == ()
     ranges[90] = blind
-    shapes = Shapes.of(seen(scan_of(ranges)), dim=2)
+    shapes = Shapes.of(obstacles_of(scan_of(ranges)), dim=2)
     assert shapes.distance(np.array([[0.0, GROUND.footprint + 0.005]])).min() == 0.0
     assert shapes.distance(np.zeros((1, 2))).min() >= GROUND.footprint - 1e-9
 
 
 def test_zero_is_free_only_if_the_settings_say_so():
-    assert seen(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
-    assert seen(scan_of(np.zeros(BEAMS))) != ()
+    assert obstacles_of(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
+    assert obstacles_of(scan_of(np.zeros(BEAMS))) != ()
 
 
 def test_a_direction_without_a_beam_is_occupied():
     fan = scan_of(np.full(180, math.inf), angle_min=-0.5 * math.pi, angle_increment=math.pi / 179)
-    shapes = Shapes.of(seen(fan), dim=2)
+    shapes = Shapes.of(obstacles_of(fan), dim=2)
     assert shapes.distance(np.array([[-0.12, 0.0]])).min() == 0.0
     assert shapes.distance(np.array([[0.3, 0.0]])).min() > 0.1
 
 
 def test_space_beyond_a_short_range_sensor_is_occupied():
-    shapes = Shapes.of(seen(scan_of(np.full(BEAMS, math.inf), range_max=0.5)), dim=2)
+    shapes = Shapes.of(obstacles_of(scan_of(np.full(BEAMS, math.inf), range_max=0.5)), dim=2)
     assert shapes.distance(np.array([[0.47, 0.0]])).min() == 0.0
 
 
@@ -141,8 +141,8 @@ def test_each_beam_starts_where_the_robot_was_at_its_time():
     beams = read(scan_of(ranges, time_increment=0.2 / BEAMS))
     poses = np.zeros((BEAMS, 3))
     poses[:, 0] = 0.25 * (beams.times - 10.0)  # driving at 0.25 m/s
-    found = obstacles(beams, poses, PlanarPose(), GROUND, ERRORS, poses[-1, :2])
-    assert sorted(o.position[0] for o in found) == pytest.approx([-0.475, 0.5])
+    hits = obstacles(beams, poses, PlanarPose(), GROUND, ERRORS, poses[-1, :2])
+    assert sorted(o.position[0] for o in hits) == pytest.approx([-0.475, 0.5])
 
 
 @pytest.mark.parametrize(

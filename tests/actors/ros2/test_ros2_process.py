@@ -71,7 +71,7 @@ class Robot:
         until(lambda: self.speeds and self.speeds[-1] == 0.0, f"a stop: {because}", 30.0)
         until(lambda: any(because in reason for reason in self.reasons), f"{because}, not {self.reasons[-3:]}", 30.0)
         del self.speeds[:]
-        until(lambda: len(self.speeds) > 2, "more of what is sent", 30.0)
+        until(lambda: len(self.speeds) > 2, "more commands", 30.0)
         assert set(self.speeds) == {0.0}
         del self.reasons[:]
 
