@@ -80,15 +80,7 @@ class ActorIdentity:
 class EpisodeRunner:
     """One robot in its environment, with its committed plan; it knows neither the bus nor the policy.
 
-    Attributes:
-        backup_plan: the committed plan.
-        observation, info: the latest ones of the environment.
-        running: whether an episode is running.
-        episode, step: number of the episode, and of the current period in it.
-        index: steps recorded so far, over all episodes.
-        rng: the episode's random generator.
-        fleet_size: number of robots in the shared world; 0: the robot is alone.
-        fleet: names of the robots that reserve space for each other; empty: none do.
+    `observation` and `info` are the latest ones of the environment, `step` is the number of the current period.
     """
 
     def __init__(
@@ -115,10 +107,10 @@ class EpisodeRunner:
         self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
         self.backup_plan = BackupPlan(robot)
         self._memory = memory_of(robot)
-        self.index = 0
-        self.running = False
-        self.fleet_size = 0
-        self.fleet: tuple[str, ...] = ()
+        self.index = 0  # steps recorded so far, over all episodes
+        self.running = False  # whether an episode is running
+        self.fleet_size = 0  # robots in the shared world; 0: the robot is alone
+        self.fleet: tuple[str, ...] = ()  # names of the robots that reserve space for each other
 
     def begin(self, episode: int) -> pb.Episode:
         """Reset the environment to the episode of this number, and return the message that describes it."""
@@ -283,13 +275,10 @@ class RobotGroup:
     def __init__(
         self, runners: Sequence[EpisodeRunner], world: SharedWorld | None = None, reserving: bool = True
     ) -> None:
-        """Group the robots that step together.
+        """Group the robots of a shared world, or one robot without a shared world.
 
-        Args:
-            runners: the robots. Without a world, exactly one.
-            world: the world that the robots share.
-            reserving: whether the robots of a world reserve space for each other. Without reservations the filter
-                does not know about the other robots.
+        reserving: whether the robots reserve space for each other. Without reservations the filter of each robot does
+        not know about the others.
         """
         assert world is not None or len(runners) == 1, "robots without a shared world have groups of their own"
         self.runners, self.world = list(runners), world

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 
@@ -102,7 +102,7 @@ def acceleration(attitude: Quaternion, force: Triple) -> Array:
     return np.array([east, north, -down - GRAVITY])
 
 
-def resampled(times: Sequence[float], positions: Array, at: ArrayLike) -> Array:
+def resampled(times: Sequence[float], positions: Array, at: NDArray[np.floating[Any]]) -> Array:
     """Return positions (S, 3) at the times `at` (S,), interpolated between `positions` (n, 3) at `times` (n,)."""
     return np.column_stack([np.interp(at, times, positions[:, axis]) for axis in range(3)])
 

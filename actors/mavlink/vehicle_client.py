@@ -74,13 +74,11 @@ class VehicleClient(PeriodicVehicle):
                 log.info("taking control of it anew: %s", error)
 
     def commit(self, plan: Array, number: int) -> bool:
-        """Carry out a plan, see `MavlinkVehicle.commit`.
-
-        Returns:
-            False also if the server does not reply in time.
+        """Carry out a plan, see `MavlinkVehicle.commit`. Return False also if the server does not reply in time.
 
         Raises:
-            BadInput, BadMessage: the plan is not valid; MavlinkError: nobody flies the vehicle any more.
+            BadInput, BadMessage: the plan is not valid.
+            MavlinkError: nobody flies the vehicle any more.
         """
         rows = np.asarray(plan, float)
         if rows.ndim != 2 or rows.shape[1] != self._robot.action_dim:

@@ -82,6 +82,7 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     unseen = _unseen(float(scan.angle_min), gap, n)
     lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
     times = np.concatenate([times, np.full(len(unseen), times[-1])])
+    times, lengths = np.asarray(times, float), np.asarray(lengths, float)
     return LaserBeams(times, np.concatenate([angles, unseen]), lengths, np.isnan(lengths), abs(gap))
 
 

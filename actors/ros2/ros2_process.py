@@ -99,11 +99,7 @@ class FilterNode:
     """The node of one robot, and the loop over its periods."""
 
     def __init__(self, settings: Ros2Settings, ask: Ask, stop: threading.Event, tap: MessageTap | None = None) -> None:
-        """Set up the gate, the clock and the inputs.
-
-        Args:
-            ask: sends requests to the filter.
-            tap: called with every message.
+        """Set up the gate, the clock and the inputs. tap: called with every message.
 
         Raises:
             Unreachable, BadRosName, UnknownRobot, Mismatch: with what to do.
