@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 from queue import SimpleQueue
 from threading import Thread
 
@@ -156,7 +157,8 @@ class FlightRunner(ActorRunner):
         conditions: Conditions,
     ) -> None:
         """stages: the arenas of the flight's episodes, one after the other; they differ in the goal."""
-        super().__init__(process, settings, 0, self._environment(stages, conditions), propose, continuous=True)
+        self._stages, self._next_stages = stages, cycle(stages)
+        super().__init__(process, settings, 0, self._environment(conditions), propose, continuous=True)
         self._vehicle: RealTimeVehicle | None = None
         self.answers: Counter[str] = Counter()  # "in time", "late", "none", "lost" or "not needed"
         self.steps, self.episodes, self.exchanges = map(publisher.wrap, (self.steps, self.episodes, self.exchanges))
@@ -174,7 +176,7 @@ class FlightRunner(ActorRunner):
         observation, info = self.runner.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)
-        self._stage = -1
+        self._next_stages = cycle(self._stages)
         self._vehicle.catch_up()
 
     def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
@@ -206,20 +208,19 @@ class FlightRunner(ActorRunner):
         shares = {"answers in time share": self.answers["in time"] / needed, "periods skipped": self._vehicle.skipped}
         return counts | shares | self._vehicle.vehicle.figures
 
-    def _environment(self, stages: Sequence[Arena], conditions: Conditions) -> EnvironmentFactory:
+    def _environment(self, conditions: Conditions) -> EnvironmentFactory:
         """Make the environment: obstacles are virtual, and a scan is computed from the estimated pose."""
         noise = conditions.lidar_noise(flies=True) if conditions.perception.kind == "scan" else 0.0
 
-        def draw(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:
-            self._stage += 1
-            return stages[self._stage % len(stages)]
-
-        self._stage = -1
-
         def make(robot: RobotWithTask, arena: str, seed: int, *, tap: FrameTap | None = None) -> NavigationEnv:
-            vehicle = lambda arena, rng: self.vehicle  # noqa: E731
             return NavigationEnv(
-                robot, arena, vehicle, conditions=conditions, lidar_noise=noise, seed_key=seed, draw=draw
+                robot,
+                arena,
+                lambda arena, rng: self.vehicle,
+                conditions=conditions,
+                lidar_noise=noise,
+                seed_key=seed,
+                draw=lambda *_: next(self._next_stages),
             )
 
         return make
