@@ -82,8 +82,13 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     unseen = _unseen(float(scan.angle_min), gap, n)
     lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
     times = np.concatenate([times, np.full(len(unseen), times[-1])])
-    times, lengths = np.asarray(times, float), np.asarray(lengths, float)
-    return LaserBeams(times, np.concatenate([angles, unseen]), lengths, np.isnan(lengths), abs(gap))
+    return LaserBeams(
+        np.asarray(times, float),
+        np.concatenate([angles, unseen]),
+        np.asarray(lengths, float),
+        np.isnan(lengths),
+        abs(gap),
+    )
 
 
 def _unseen(first: float, gap: float, count: int) -> Array:
