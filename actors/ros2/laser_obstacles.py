@@ -61,7 +61,7 @@ class LaserBeams:
 
 
 def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
-    """Return the beams of a scan. Raises BadLaserScan: its angles or ranges are not valid.
+    """Return the beams of a scan. Raises BadScan: its angles or ranges are not valid.
 
     zero_is_free: the driver reports 0 where nothing is within range, as some do (REP 117 demands inf).
     """
