@@ -1,4 +1,4 @@
-"""A `brakeline autopilot` in real time, for clients that were written by others."""
+"""Run `brakeline autopilot` in real time, for clients of other authors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.system.runs import BRAKELINE
 
 @contextmanager
 def autopilot(*options: object) -> Iterator[int]:
-    """Runs it until the end of the block; yields the UDP port that it sends to."""
+    """Run an autopilot until the end of the block. Yields the UDP port that it sends to."""
     port = free_udp_port()
     words = [*BRAKELINE, "autopilot", "--url", f"udpout:127.0.0.1:{port}", "--truth", "", *options]
     process = subprocess.Popen([str(word) for word in words], stderr=subprocess.DEVNULL)

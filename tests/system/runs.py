@@ -1,4 +1,4 @@
-"""Whole runs through the real command line, and what the tests do to them."""
+"""Start whole runs by the command line, watch them, and kill their processes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.waiting import PATIENCE, until
 
 BRAKELINE = (*PYTHON, "-m", "brakeline.deploy.cli")
 OF_ITS_OWN = ("train", "safety", "learner")  # commands that are a process, or that start some
-STRIDE = 200  # steps of a run that take no longer
+STRIDE = 200  # steps that a run takes within PATIENCE
 
 
 def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
@@ -41,8 +41,10 @@ def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.Compl
 
 
 class Run:
-    """`brakeline train` in progress, in a folder, with the `debug` experiment (or another command that starts a run);
-    killed, with all it started, at the end of the block."""
+    """A run in progress: `brakeline train` with the `debug` experiment, or another command that starts a run.
+
+    At the end of the block the run and all its processes are killed.
+    """
 
     def __init__(
         self,
@@ -73,7 +75,7 @@ class Run:
         self.popen.wait()
 
     def children(self) -> dict[str, psutil.Process]:
-        """The living processes of the run, the launcher aside, by name."""
+        """Return the living processes of the run by name, without the launcher."""
         found = {}
         for process in psutil.process_iter(["cmdline"]):
             words = process.info["cmdline"] or []
@@ -82,7 +84,7 @@ class Run:
         return found
 
     def watch(self) -> Metrics:
-        """Figures of what is on the bus from now on."""
+        """Return the figures of all messages on the bus from now on."""
 
         def settings() -> BusSettings | None:
             try:
@@ -102,21 +104,21 @@ class Run:
 
     @property
     def there(self) -> tuple[object, ...]:
-        """Options of a command that joins in."""
+        """The options with which a command joins the bus of the run."""
         (endpoint,) = client_settings(self.folder).connect
         return "--connect", endpoint, "--keys", self.folder / "keys"
 
     def steps(self) -> int:
-        """Taken since `watch`."""
+        """Return the steps since `watch`."""
         return sum(tally.steps for tally in self.metrics.actors.copy().values())
 
     def learned(self) -> int:
-        """Steps, as the learner last said."""
+        """Return the steps of the learner's last message."""
         known = self.metrics.learners.get("ground")
         return 0 if known is None else int(known.steps)
 
     def until_steps(self, count: int) -> None:
-        """Wait for so many more steps, for as long as it gets on."""
+        """Wait for `count` more steps, as long as the run makes progress."""
         self.watch()
         target = self.steps() + count
         while (done := self.steps()) < target:
@@ -125,7 +127,7 @@ class Run:
             assert self.popen.poll() is None, self.errors.read_text()
 
     def kill(self, name: str) -> None:
-        """kill -9 of a process, and wait until another one has taken its place."""
+        """Kill a process (SIGKILL), and wait until the launcher has started it again."""
         victim = until(lambda: self.children().get(name), f"{name} lives")
         victim.kill()
         until(lambda: self.children().get(name, victim).pid != victim.pid, f"{name} is started again")
@@ -133,7 +135,7 @@ class Run:
         assert psutil.STATUS_ZOMBIE not in states
 
     def end(self, number: signal.Signals | None = None) -> dict[str, Any]:
-        """Wait for the end, after a signal if one is given; the figures that were printed. Nothing may be left."""
+        """Wait for the end of the run, after a signal if you give one. Returns the printed figures."""
         if number is not None:
             self.popen.send_signal(number)
         self.popen.wait(PATIENCE)
@@ -145,6 +147,7 @@ class Run:
 
 
 def alive(pid: int) -> bool:
+    """Return whether a process has this id."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

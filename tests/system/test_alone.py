@@ -1,4 +1,4 @@
-"""Each process started alone, by its command, as on machines of their own."""
+"""Test each process when it is started alone by its command, as on a machine of its own."""
 
 import signal
 

@@ -1,4 +1,4 @@
-"""The log of a whole run: what `analyse` says of it, against a count from its raw messages by another reader."""
+"""Compare the figures of `analyse` with a count of the raw messages by another reader."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""A robot that changes in mid-run: violations are seen and counted; a new model set from its own steps ends them."""
+"""Test a robot that changes in mid-run: violations are counted, and a new model set from its own steps ends them."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""`--deterministic`: the seed alone decides about the weights, however fast the machine is and often it is stopped."""
+"""Test `--deterministic`: the weights depend on the seed alone, however fast the run is and however often it stops."""
 
 import signal
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is killed in mid-run is started again, nothing is hit meanwhile, and what was lost is counted and said."""
+"""Test that a killed process is started again, that no robot collides meanwhile, and that losses are reported."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A newcomer's first minute, as the README's first screen and the program itself tell it: each step names the next."""
+"""Test the first minute with the program: the README's first screen, and the next commands that the program names."""
 
 import shlex
 import subprocess
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 def said(folder: Path, *words: object) -> str:
-    """What a command prints, started in a folder as a person would; it must succeed."""
+    """Return what a command prints in a folder. The command must succeed."""
     done = subprocess.run(
         [*BRAKELINE, *map(str, words)], check=False, capture_output=True, text=True, timeout=2 * PATIENCE, cwd=folder
     )

@@ -1,7 +1,6 @@
-"""`brakeline fly`: a quadrotor in real time over UDP, while its processes are killed, too.
+"""Test `brakeline fly`: a quadrotor in real time over UDP, also while its processes are killed.
 
-How many answers come in time depends on the machine, which others use too; docs/flying.md has the figure of a calmer
-one.
+The share of answers in time depends on other load on the machine. docs/flying.md has the share without other load.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from tests.system.runs import Run, until
 
 pytestmark = pytest.mark.usefixtures("flight_folder")
 
-# Of the answers, less the share of the time for which this machine lets nobody act. By a range image a decision takes
-# ten times as long.
+# Share of the answers, less the share of the time for which the machine stalls. With a range image a decision takes ten
+# times as long.
 IN_TIME = {"map": 0.9, "scan": 0.5}
 TIMEOUT = 1.0  # s without a setpoint until the autopilot brakes and holds, for good: a stall is shorter
 OFTEN = 0.06  # s between two setpoints, as a rule
@@ -44,8 +43,10 @@ class Flight(Run):
 
 
 def follows_the_plan(records: list[Record]) -> int:
-    """Checks that every step executed what was decided, and without a decision the next input of the plan of the step
-    before; returns how many of these there are. A plan's first row is what is in force while it is asked for."""
+    """Check that every step executed its decision, or without one the next input of the plan before.
+
+    The first row of a plan is the input in force during the request. Returns the number of steps without a decision.
+    """
     m = QUADROTOR.action_dim
     exchanges = [record.message for record in records if record.topic == "exchange" and not record.message.failure]
     decided = {(e.header.run, e.request.episode, e.request.step): e.reply.decision.plan for e in exchanges}
@@ -67,7 +68,7 @@ def follows_the_plan(records: list[Record]) -> int:
 
 
 def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
-    """(s, message) of all that was sent to the autopilot."""
+    """Yield the time [s] and the content of each message to the autopilot."""
     for record in records:
         if record.topic == "frames":
             for frame in record.message.frames:
@@ -124,7 +125,7 @@ def test_two_at_once_ask_one_service(tmp_path: Path) -> None:
 
 
 def _read_by_mavutil(tlog: Path, frames: list[pb.MavlinkFrame]) -> None:
-    """pymavlink reads the frames that were logged, each at its time."""
+    """Check that pymavlink reads the logged frames, each with its time."""
     connection = mavutil.mavlink_connection(str(tlog))
     for frame in frames:
         message = connection.recv_match()
@@ -142,7 +143,7 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
         run.kill("actor-0")
         run.until_steps(25)
         actor = run.children()["actor-0"]
-        keeper(run).kill()
+        vehicle_server(run).kill()
         until(lambda: not actor.is_running(), "its actor ends")
         run.until_steps(25)
         figures = run.end()
@@ -156,16 +157,18 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
     speeds = [float(np.linalg.norm(step.state[3:6])) for step in first_lives if step.fallback]
     assert min(speeds) < 0.3, "it came to a stop without the service"
     second, third = _takeovers(records)
-    assert second["HEARTBEAT"].custom_mode == PX4_OFFBOARD, "its keeper flew it until it hovered"
+    assert second["HEARTBEAT"].custom_mode == PX4_OFFBOARD, "its vehicle server flew it until it hovered"
     assert _speed(second["LOCAL_POSITION_NED"]) < 0.3
-    assert third["HEARTBEAT"].custom_mode == PX4_POSITION, "without a keeper the autopilot braked by itself, and held"
+    assert third["HEARTBEAT"].custom_mode == PX4_POSITION, (
+        "without one the autopilot braked by itself, and held"
+    )
     assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
     said = (run.folder / "logs" / "actor-0.log").read_text()
     assert "braking along the committed plan" in said and "it hovers at" in said
 
 
-def keeper(run: Run) -> psutil.Process:
-    """The process that keeps the vehicle of a run."""
+def vehicle_server(run: Run) -> psutil.Process:
+    """Return the vehicle server of a run."""
     url = load(run.folder / CONFIG).flights[0].url
     words = {process: process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])}  # none: a zombie's
     (found,) = (
@@ -175,7 +178,7 @@ def keeper(run: Run) -> psutil.Process:
 
 
 def _takeovers(records: list[Record]) -> list[dict[str, Any]]:
-    """What the autopilot said first to each actor but the first, by its type."""
+    """Return the autopilot's first message of each type to each actor but the first."""
     batches = [record.message for record in records if record.topic == "frames"]
     lives = dict.fromkeys(batch.header.run for batch in batches)
     found: dict[int, dict[str, Any]] = {life: {} for life in lives}

@@ -1,4 +1,4 @@
-"""A robot that nobody compiled in, from a CSV of somebody driving it about to answered questions, by commands alone."""
+"""Test your own robot by commands alone, from a CSV file of a drive to decisions of the service."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ EPISODES = 12  # in `make test`; 200 behind `long`
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory):
-    """The folder of data after import and certify, and what these said."""
+    """Return the data folder after import and certify, and the output of both."""
     folder = tmp_path_factory.mktemp("porter")
     log = write_csv(folder / "drive.csv", *drive())
     with pytest.MonkeyPatch.context() as patch:
@@ -70,8 +70,11 @@ def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):
 
 
 def episode(ready, seed):
-    """An adversary drives at whatever is nearest, as fast as it can: (least distance of bodies [m], steps, steps that
-    were outside of what was predicted, share of the way that it was let)."""
+    """Drive at the nearest obstacle as fast as possible.
+
+    Returns:
+        The least distance of the bodies [m], the steps, the steps outside their predicted sets, and the way [m].
+    """
     rng = np.random.default_rng((7, seed))
     robot, body = porter(), porter().footprint
     discs = []

@@ -1,4 +1,4 @@
-"""A run's log asked again, learned from without a robot, and in place of a checkpoint that was lost."""
+"""Test a log that is replayed, that a learner learns from without a robot, and that replaces a lost checkpoint."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ STEPS = EXPERIMENTS["debug"].steps
 
 @pytest.fixture(scope="module")
 def logged(logged_run: Path) -> dict[str, int]:
-    """How many steps and exchanges its log has."""
+    """Return the numbers of steps and exchanges in the log."""
     topics = [record.topic for record in read(logged_run)]
     return {name: topics.count(name) for name in ("step", "exchange")}
 

@@ -1,4 +1,4 @@
-"""Keys made by the command, carried in parts, and used by processes that are started alone."""
+"""Test the keys that the command makes and divides, in processes that are started alone."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Clients that we did not write, unmodified, fly the autopilot over UDP: MAVSDK, and pymavlink's mavutil."""
+"""Test the autopilot with unmodified clients of other authors over UDP: MAVSDK, and pymavlink's mavutil."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_two_vehicles_on_one_port_by_system_id() -> None:
 
 
 def ask(vehicle: Any, command: int, *params: float) -> None:
-    """A command that must be accepted, if need be at the second time."""
+    """Send a command until the autopilot accepts it."""
     for _ in range(5):
         vehicle.mav.command_long_send(
             vehicle.target_system, vehicle.target_component, command, 0, *params, *[0] * (7 - len(params))
@@ -149,7 +149,7 @@ def ask(vehicle: Any, command: int, *params: float) -> None:
 
 
 def stream(vehicle: Any, vx: float, vy: float, vz: float, seconds: float) -> Any:
-    """Setpoints in NED at 10 Hz; returns the last LOCAL_POSITION_NED."""
+    """Stream setpoints (NED) at 10 Hz. Returns the last LOCAL_POSITION_NED."""
     position = None
     for _ in range(round(seconds / 0.1)):
         vehicle.mav.set_position_target_local_ned_send(

@@ -1,4 +1,4 @@
-"""Both robots in one run, two of each: all learn, and nobody is hurt when the one safety service dies."""
+"""Test two robots of each kind in one run: all learn, and none collides when the only safety service dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does a policy that was learned from a log alone do better than chance? Half an hour on two cores."""
+"""Test that a policy from a log alone does better than chance. Takes half an hour on two cores."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ HOUR = 3600.0
 
 
 def returns(policy: str, episodes: int = EPISODES) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The rewards of fresh episodes through the filter."""
+    """Return the rewards of fresh episodes behind the filter."""
     found: list[float] = []
 
     def each(tally: EpisodeStats) -> None:

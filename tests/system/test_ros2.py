@@ -1,7 +1,6 @@
-"""The simulated ground robot as a ROS 2 robot, rammed into whatever it sees by a node of another implementation.
+"""Test a simulated ROS 2 robot that a node of another implementation drives at obstacles.
 
-Time is the simulation's, and each of its periods waits for its command: however busy the machine is, what is asserted
-is about the filter.
+Time is simulated and each period waits for its command, so the results do not depend on other load on the machine.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def late_folder(data_folder: Path) -> Path:
 
 
 class Bench:
-    """A simulated robot, the filter before it, and who rams; all of them processes, killed at the end of the block."""
+    """Processes of a simulated robot, the filter before it, and the driver. They are killed at the end of the block."""
 
     def __init__(self, folder: Path, *bridge: object, filtered: bool = True, node: tuple[object, ...] = ()) -> None:
         self.folder, self._endpoint = folder, free_endpoint()
@@ -84,7 +83,7 @@ class Bench:
         return process
 
     def said(self, name: str) -> dict[str, Any]:
-        """The last JSON object that a process printed; empty: none yet."""
+        """Return the last JSON object that a process printed; empty before the first one."""
         lines = (self.folder / f"{name}.out").read_text().splitlines()
         return json.loads(lines[-1]) if lines else {}
 
@@ -92,7 +91,7 @@ class Bench:
         return (self.folder / f"{name}.err").read_text()[-3000:]
 
     def end(self, patience: float) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Wait until the robot's time is over, end the filter; what robot, filter and driver said."""
+        """Wait for the end of the robot, and end the filter. Returns the last output of robot, filter and driver."""
         self.robot.wait(patience)
         self.filter.send_signal(signal.SIGINT)
         assert self.filter.wait(PATIENCE) == 0, self.errors("filter")
@@ -100,7 +99,7 @@ class Bench:
 
 
 def rammed(folder: Path, arena: str, seed: int, seconds: float, *node: object) -> tuple[dict[str, Any], ...]:
-    """What robot, filter and driver said of so many simulated seconds."""
+    """Return the last output of robot, filter and driver after `seconds` of simulated time."""
     bridge = ("--arena", arena, "--seed", seed, "--seconds", seconds)
     with Bench(folder, *SIMULATED, *bridge, node=("--sim-time", *node)) as bench:
         said = bench.end(PATIENCE + 2.0 * seconds)

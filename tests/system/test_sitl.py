@@ -1,4 +1,4 @@
-"""Which instance of a real autopilot starts."""
+"""Test which instance of a real autopilot starts."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,7 +10,7 @@ from benchmarks import sitl
 
 @pytest.fixture(autouse=True)
 def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever runs on this machine meanwhile."""
+    """Hide the autopilots that run on this machine."""
     monkeypatch.setattr(sitl, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(sitl, "_taken", lambda kind, instance: instance == 5)
 

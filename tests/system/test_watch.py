@@ -1,4 +1,4 @@
-"""A run in progress, looked at: by a browser that asks nobody else, and by a client of Foxglove's protocol."""
+"""Test the live page in a browser that asks no other server, and the live view with a client of Foxglove's protocol."""
 
 import json
 import signal
@@ -20,7 +20,7 @@ needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="the live page in a
 
 @pytest.fixture(scope="module")
 def run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """A run that lasts longer than the looking."""
+    """Start a run that lasts longer than the tests."""
     with Run(tmp_path_factory.mktemp("watched") / "run", "--steps", 100_000) as run:
         run.until_steps(100)
         yield run
@@ -29,7 +29,7 @@ def run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 @pytest.fixture(scope="module")
 def watched(run: Run) -> Iterator[dict[str, str]]:
-    """Where `brakeline watch` says one can look at it."""
+    """Return the addresses that `brakeline watch` prints."""
     words = [*BRAKELINE, "watch", *map(str, run.there), "--port", "0", "--foxglove-port", "0", "--json"]
     watcher = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:

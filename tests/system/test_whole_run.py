@@ -1,4 +1,4 @@
-"""A run without faults, from the command line to the figures of its log."""
+"""Test a run without faults, from the command line to the figures of its log."""
 
 import json
 from collections import Counter
@@ -14,7 +14,7 @@ from brakeline.messaging.policy_weights import MLP
 from tests.robots import GROUND
 from tests.system.runs import brakeline
 
-# What they say after the recorder has stopped is in no log.
+# The log lacks what these publish after the recorder has stopped.
 OUTLIVE_THE_LOG = {f"{topic}/{process}" for topic in ("health", "log") for process in ("launcher", "recorder")}
 CLOSED_LOOP = (
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "fallbacks", "mean_speed"),
