@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.logs.decision_explanation import Explanation, explain, fits
 from brakeline.logs.episode_stats import Figures
+from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import OUTLINE, DisplayedMap, map_for_display
@@ -120,8 +120,3 @@ def boxes_from_above(reservations: Array) -> list[list[float]]:
 def body_discs(robot: Robot) -> list[list[float]]:
     """Return x, y in the body frame and the radius of each disc of the robot's body, m."""
     return [[*disc.at[:2], disc.radius] for disc in robot.body]
-
-
-def rounded(values: Iterable[float]) -> list[float]:
-    """Round to 4 digits, for JSON; a value that is not finite becomes 0."""
-    return [round(float(value), 4) if math.isfinite(value) else 0.0 for value in values]

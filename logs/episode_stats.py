@@ -30,6 +30,7 @@ KINDS: dict[int, str] = {
     pb.FAILSAFE: "failsafe",
     pb.RECOVERING: "recovering",
 }
+INTERVENTIONS = (pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING)
 _UNKNOWN, _ADJUSTED, _FAILSAFE = int(pb.UNKNOWN), int(pb.ADJUSTED), int(pb.FAILSAFE)
 _RECOVERING = int(pb.RECOVERING)
 

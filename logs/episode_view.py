@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from brakeline.logs.decision_explanation import bound_in, explain, fell_back, fits
-from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view, rounded
-from brakeline.logs.episode_stats import KINDS, Figures
+from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures
+from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import reserved_boxes
@@ -22,7 +23,6 @@ NEAR = 8  # steps before and after the closest approach for which the picture ha
 
 # One letter for each step's decision: n (none), a(l)lowed, a(d)justed, f(a)ilsafe, r(e)covering.
 LETTERS: dict[int, str] = {int(pb.UNKNOWN): "n", **{kind: name[1] for kind, name in KINDS.items()}}
-INTERVENTIONS = (pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING)
 
 
 def picture(episode: EpisodeRecord, robot: Robot | None) -> Figures:

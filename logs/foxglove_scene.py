@@ -33,6 +33,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from brakeline.logs.decision_explanation import Explanation, fell_back
 from brakeline.logs.decision_view import DecisionView, decision_view
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import LidarRays
@@ -55,13 +56,12 @@ PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192,
 FREE, HIT, RESERVED = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
 MOVER, SWEPT = _color(170, 90, 40), _color(170, 90, 40, 0.15)
 BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
-KINDS: dict[int, tuple[int, int, int]] = {
+COLORS: dict[int, tuple[int, int, int]] = {
     pb.ALLOWED: (52, 168, 100),
     pb.ADJUSTED: (240, 150, 30),
     pb.FAILSAFE: (214, 48, 60),
     pb.RECOVERING: (142, 68, 173),
 }
-WORDS = {pb.ADJUSTED: "adjusted", pb.FAILSAFE: "failsafe", pb.RECOVERING: "recovering"}
 
 
 def body_frame(actor: str) -> str:
@@ -85,23 +85,13 @@ def arena(robot: Robot, episode: pb.Episode, time: int) -> SceneUpdate:
     """Draw obstacles, walls, goal and the robot's body. Sent once, at the start of an episode."""
     half = half_width(episode)
     room = SceneEntity(timestamp=stamp(time), frame_id=episode.actor, id="arena")
-    height = _ceiling(episode, half)
+    ceilings = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if _closes(o, half)]
+    height = max(ceilings, default=0.0) or HEIGHT
     for obstacle in episode.obstacles:
-        _draw_obstacle(room, obstacle, half, height)
-    radius = 2.0 * episode.goal_radius
-    if robot.position_dim == 3:
-        room.spheres.append(SpherePrimitive(pose=_pose(episode.goal), size=_vector(radius, radius, radius), color=GOAL))
-    else:
-        disc = CylinderPrimitive(pose=_pose(episode.goal), size=_vector(radius, radius, FLAT), color=GOAL)
-        disc.bottom_scale = disc.top_scale = 1.0
-        room.cylinders.append(disc)
+        if not _closes(obstacle, half):  # a floor or a ceiling would hide the room
+            _draw_obstacle(room, obstacle, half, height)
+    _round(room, episode.goal[: robot.position_dim], episode.goal_radius, FLAT, GOAL)
     return SceneUpdate(entities=[room, _body(robot, episode.actor, time)])
-
-
-def _ceiling(episode: pb.Episode, half: float) -> float:
-    """Return the drawn height of the walls, m: up to the ceiling, if the arena has one."""
-    lids = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if _closes(o, half)]
-    return max(lids, default=0.0) or HEIGHT
 
 
 def _closes(obstacle: pb.Obstacle, half: float) -> bool:
@@ -110,26 +100,18 @@ def _closes(obstacle: pb.Obstacle, half: float) -> bool:
 
 
 def _draw_obstacle(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) -> None:
-    """Add an obstacle, except a floor or a ceiling, which would hide the room."""
-    if _closes(obstacle, half):
-        return
+    """Add an obstacle; walls and obstacles in the plane get this height."""
     flat = len(obstacle.position) == 2
     position = (*obstacle.position, 0.5 * height) if flat else tuple(obstacle.position)
     if obstacle.kind == WALL:
         x, y = (at - FLAT * turn(obstacle.yaw) for at, turn in zip(position, (math.cos, math.sin), strict=False))
-        size = _vector(2.0 * FLAT, 2.0 * half, height)
-        room.cubes.append(CubePrimitive(pose=_pose((x, y, 0.5 * height), obstacle.yaw), size=size, color=WALLS))
+        _cube(room, _pose((x, y, 0.5 * height), obstacle.yaw), (2.0 * FLAT, 2.0 * half, height), WALLS)
     elif obstacle.kind == BOX:
-        size = _vector(*obstacle.size, *([height] if flat else []))
-        room.cubes.append(CubePrimitive(pose=_pose(position, obstacle.yaw), size=size, color=SOLID))
+        _cube(room, _pose(position, obstacle.yaw), (*obstacle.size, *([height] if flat else [])), SOLID)
     elif obstacle.kind == CYLINDER or flat:
-        radius = 2.0 * obstacle.size[0]
-        size = _vector(radius, radius, height if flat else obstacle.size[1])
-        shape = CylinderPrimitive(pose=_pose(position), size=size, color=SOLID, bottom_scale=1.0, top_scale=1.0)
-        room.cylinders.append(shape)
+        _cylinder(room, position, obstacle.size[0], height if flat else obstacle.size[1], SOLID)
     elif obstacle.kind == SPHERE:
-        radius = 2.0 * obstacle.size[0]
-        room.spheres.append(SpherePrimitive(pose=_pose(position), size=_vector(radius, radius, radius), color=SOLID))
+        _round(room, position, obstacle.size[0], height, SOLID)
 
 
 def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
@@ -137,18 +119,9 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
     body = SceneEntity(timestamp=stamp(time), frame_id=body_frame(actor), id="body", frame_locked=True)
     tall = 0.5 * HEIGHT
     for disc in robot.body:
-        edge = 2.0 * disc.radius
-        if robot.position_dim == 3:
-            body.spheres.append(SpherePrimitive(pose=_pose(disc.at), size=_vector(edge, edge, edge), color=BODY))
-            continue
-        place = _pose((*disc.at, 0.5 * tall))
-        drum = CylinderPrimitive(
-            pose=place, size=_vector(edge, edge, tall), color=BODY, bottom_scale=1.0, top_scale=1.0
-        )
-        body.cylinders.append(drum)
+        _round(body, disc.at, disc.radius, tall, BODY, lift=0.5 * tall)
     if robot.position_dim == 2:
-        nose = _pose((0.5 * robot.front_extent, 0.0, tall))
-        body.cubes.append(CubePrimitive(pose=nose, size=_vector(robot.front_extent, 2.0 * FLAT, FLAT), color=NOSE))
+        _cube(body, _pose((0.5 * robot.front_extent, 0.0, tall)), (robot.front_extent, 2.0 * FLAT, FLAT), NOSE)
     body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), _color(60, 60, 60)))
     return body
 
@@ -171,18 +144,18 @@ def decision(
     """
     kind = pb.FAILSAFE if step.fallback else step.decision
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
-    color, words = KINDS.get(kind, (120, 120, 120)), WORDS.get(kind, "")
+    color, words = COLORS.get(kind, (120, 120, 120)), KINDS.get(kind, "")
     if exchange is not None:
         view = decision_view(robot, exchange, reservations)
         start = exchange.request.state[: robot.position_dim]
         if exchange.reply.HasField("decision"):
             _draw_tube(entity, view, start, robot.footprint, color)
-        if view.explanation is not None and kind in WORDS and not step.fallback:
-            words = f"{WORDS[kind]}: {view.explanation.said}"
+        if view.explanation is not None and kind in INTERVENTIONS and not step.fallback:
+            words = f"{KINDS[kind]}: {view.explanation.said}"
             _draw_explanation(entity, start, view.explanation, robot.footprint)
         if view.perceived is not None:
             _draw_perceived(entity, view.perceived, view.reservations)
-    if kind in WORDS:
+    if kind in INTERVENTIONS:
         above = HEIGHT + 3.0 * robot.footprint
         text = fell_back() if step.fallback else words
         entity.texts.append(_text(text, step.state[: robot.position_dim], _color(*color), above))
@@ -194,15 +167,11 @@ def _draw_tube(
 ) -> None:
     """Add the boxes of the tube, the area where the robot stops, and the plan from the robot through the centers."""
     for center, half in zip(view.centers, view.half_widths, strict=True):
-        edges = [*(2.0 * half), *[FLAT] * (3 - len(half))]
-        entity.cubes.append(CubePrimitive(pose=_pose(center), size=_vector(*edges), color=_color(*color, 0.6)))
-    if len(view.centers):
-        across = 2.0 * (math.hypot(*view.half_widths[-1]) + footprint)
-        _draw_stop(entity, view.centers[-1], across, _color(*color, 0.2))
-    plan = LinePrimitive(type=LinePrimitive.LINE_STRIP, pose=_pose(()), thickness=3.0, scale_invariant=True)
-    plan.points.extend([_point(at) for at in (start, *view.centers)])
-    plan.color.CopyFrom(_color(*color))
-    entity.lines.append(plan)
+        _cube(entity, _pose(center), _edges(half), _color(*color, 0.6))
+    if len(view.centers):  # the body is in this disc or sphere, wherever in the last box the robot stops
+        stop = math.hypot(*view.half_widths[-1]) + footprint
+        _round(entity, view.centers[-1], stop, FLAT, _color(*color, 0.2))
+    _line(entity, LinePrimitive.LINE_STRIP, (start, *view.centers), 3.0, _color(*color))
 
 
 def _draw_explanation(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:
@@ -216,37 +185,22 @@ def _draw_explanation(entity: SceneEntity, start: Sequence[float], about: Explan
             shape.shaft_diameter, shape.head_diameter = thick, 2.0 * thick
             entity.arrows.append(shape)
     if len(about.at):
-        edge = CubePrimitive(pose=_along(about.at, about.normal), color=EDGE)
         across = 5.0 * size
-        edge.size.CopyFrom(_vector(FLAT, across, across if len(about.at) == 3 else FLAT))
-        entity.cubes.append(edge)
+        _cube(entity, _along(about.at, about.normal), (FLAT, across, across if len(about.at) == 3 else FLAT), EDGE)
 
 
 def _draw_perceived(entity: SceneEntity, about: DisplayedMap, reservations: np.ndarray) -> None:
     """Add scan hits, the outline of free space, moving obstacles with their reachable sets, and the reservations."""
     if len(about.free):
-        free = LinePrimitive(type=LinePrimitive.LINE_LOOP, pose=_pose(()), thickness=2.0, scale_invariant=True)
-        free.points.extend(map(_point, about.free))
-        free.color.CopyFrom(FREE)
-        hits = LinePrimitive(type=LinePrimitive.LINE_LIST, pose=_pose(()), thickness=4.0, scale_invariant=True)
-        hits.points.extend(map(_point, _hit_marks(about.hits)))
-        hits.color.CopyFrom(HIT)
-        entity.lines.extend([free, hits])
+        _line(entity, LinePrimitive.LINE_LOOP, about.free, 2.0, FREE)
+        _line(entity, LinePrimitive.LINE_LIST, _hit_marks(about.hits), 4.0, HIT)
     swept = about.swept.reshape(-1, about.swept.shape[-1])
     for discs, color, tall in ((about.movers, MOVER, HEIGHT), (swept, SWEPT, FLAT)):
         for *at, radius in discs:
-            if len(at) == 3:
-                ball = _vector(*[2.0 * radius] * 3)
-                entity.spheres.append(SpherePrimitive(pose=_pose(at), size=ball, color=color))
-                continue
-            size, place = _vector(2.0 * radius, 2.0 * radius, tall), _pose((*at, 0.5 * tall))
-            entity.cylinders.append(
-                CylinderPrimitive(pose=place, size=size, color=color, bottom_scale=1.0, top_scale=1.0)
-            )
+            _round(entity, at, radius, tall, color, lift=0.5 * tall)
     for box in reservations:
         d = len(box) // 2
-        edges = [2.0 * (half + box[-1]) for half in box[d:-1]] + [FLAT] * (3 - d)
-        entity.cubes.append(CubePrimitive(pose=_pose(box[:d]), size=_vector(*edges), color=RESERVED))
+        _cube(entity, _pose(box[:d]), _edges(box[d:-1] + box[-1]), RESERVED)
 
 
 def _hit_marks(hits: np.ndarray) -> list[list[float]]:
@@ -268,27 +222,21 @@ def _along(at: Iterable[float], way: Sequence[float] | np.ndarray) -> Pose:
     return pose
 
 
-def _draw_stop(entity: SceneEntity, center: Sequence[float] | np.ndarray, across: float, color: Color) -> None:
-    """Add the disc or sphere that holds the body wherever in the tube's last box the robot stops."""
-    if len(center) == 3:
-        entity.spheres.append(SpherePrimitive(pose=_pose(center), size=_vector(across, across, across), color=color))
-        return
-    disc = CylinderPrimitive(pose=_pose(center), size=_vector(across, across, FLAT), color=color)
-    disc.bottom_scale = disc.top_scale = 1.0
-    entity.cylinders.append(disc)
-
-
 def frames(robot: Robot, actor: str, site: tuple[float, float], state: Sequence[float], time: int) -> FrameTransforms:
     """Return the transforms from the world to the actor's arena and from the arena to the robot's body."""
-    at, d = stamp(time), robot.position_dim
-    yaw = 0.0 if robot.heading is None else state[robot.heading]
-    place = FrameTransform(timestamp=at, parent_frame_id=WORLD, child_frame_id=actor)
-    place.translation.CopyFrom(_vector(*site, 0.0))
-    place.rotation.CopyFrom(_turn(0.0))
-    body = FrameTransform(timestamp=at, parent_frame_id=actor, child_frame_id=body_frame(actor))
-    body.translation.CopyFrom(_vector(*state[:d], *[0.0] * (3 - d)))
-    body.rotation.CopyFrom(_turn(yaw))
-    return FrameTransforms(transforms=[place, body])
+    d, yaw = robot.position_dim, 0.0 if robot.heading is None else state[robot.heading]
+
+    def frame(parent: str, child: str, position: Iterable[float], turn: float) -> FrameTransform:
+        pose = _pose(position, turn)
+        return FrameTransform(
+            timestamp=stamp(time),
+            parent_frame_id=parent,
+            child_frame_id=child,
+            translation=pose.position,
+            rotation=pose.orientation,
+        )
+
+    return FrameTransforms(transforms=[frame(WORLD, actor, site, 0.0), frame(actor, body_frame(actor), state[:d], yaw)])
 
 
 def lidar(rays: LidarRays, actor: str, observation: Sequence[float], time: int) -> LaserScan | PointCloud:
@@ -315,12 +263,42 @@ def log_line(line: pb.LogLine, time: int) -> Log:
     return Log(timestamp=stamp(time), level=LEVELS.get(line.level, Log.UNKNOWN), message=line.text, name=line.process)
 
 
+def _cube(entity: SceneEntity, pose: Pose, edges: Iterable[float], color: Color) -> None:
+    entity.cubes.append(CubePrimitive(pose=pose, size=_vector(*edges), color=color))
+
+
+def _cylinder(entity: SceneEntity, at: Iterable[float], radius: float, height: float, color: Color) -> None:
+    size = _vector(2.0 * radius, 2.0 * radius, height)
+    entity.cylinders.append(CylinderPrimitive(pose=_pose(at), size=size, color=color, bottom_scale=1.0, top_scale=1.0))
+
+
+def _round(
+    entity: SceneEntity, at: Sequence[float], radius: float, height: float, color: Color, lift: float = 0.0
+) -> None:
+    """Add a sphere in space; in the plane, a cylinder whose middle is at `lift` above the floor, m."""
+    if len(at) == 3:
+        size = _vector(*[2.0 * radius] * 3)
+        entity.spheres.append(SpherePrimitive(pose=_pose(at), size=size, color=color))
+    else:
+        _cylinder(entity, (*at, lift), radius, height, color)
+
+
+def _line(
+    entity: SceneEntity, kind: LinePrimitive.Type, points: Iterable[Iterable[float]], thickness: float, color: Color
+) -> None:
+    """Add a line whose thickness does not depend on the distance."""
+    line = LinePrimitive(type=kind, pose=_pose(()), thickness=thickness, scale_invariant=True, color=color)
+    line.points.extend(Point3(**dict(zip("xyz", point, strict=False))) for point in points)
+    entity.lines.append(line)
+
+
+def _edges(half_widths: np.ndarray) -> list[float]:
+    """Return the edges of a box; in the plane, it is flat."""
+    return [*(2.0 * half_widths), *[FLAT] * (3 - len(half_widths))]
+
+
 def _vector(x: float, y: float, z: float) -> Vector3:
     return Vector3(x=x, y=y, z=z)
-
-
-def _point(values: Iterable[float]) -> Point3:
-    return Point3(**dict(zip("xyz", values, strict=False)))
 
 
 def _pose(position: Iterable[float], yaw: float = 0.0) -> Pose:

@@ -21,6 +21,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from brakeline.logs.decision_stats import PARTS
 from brakeline.logs.episode_stats import Figures
+from brakeline.logs.json_values import finite
 from brakeline.logs.log_analysis import SETUP
 from brakeline.logs.tube_stats import stated
 
@@ -116,15 +117,6 @@ def embedded(data: Any) -> str:
 def hashed(text: str) -> str:
     """Return the hash by which a content security policy allows a script or a style."""
     return f"sha256-{b64encode(sha256(text.encode()).digest()).decode()}"
-
-
-def finite(value: Any) -> Any:
-    """Replace each number that is not finite by None."""
-    if isinstance(value, dict):
-        return {key: finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def number(value: float | None, digits: int = 3) -> str:

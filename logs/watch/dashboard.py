@@ -5,12 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Any
 
 from brakeline.errors import Implausible
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
-from brakeline.logs.episode_stats import KINDS
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS
 from brakeline.logs.foxglove_scene import half_width
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -32,57 +31,48 @@ LAUNCHER = "launcher"  # the process that knows the run from its beginning
 SETUP = ("run", "method", "arena", "seed", "steps")  # the launcher's notes about the run
 
 
-@dataclass
+NO_DECISION: dict[str, Any] = {
+    "tube": [], "margin": None, "at_least": False, "said": "", "trust": "", "inputs": [], "arrows": [], "edge": []
+}  # fmt: skip
+
+
 class RobotPanel:
     """One robot in its running episode. Positions are x and y in m, in the arena's frame.
 
     Attributes:
-        arena: half of the arena's edge, obstacles, goal; empty before the first Episode message.
-        pose: x, y, heading; the heading is 0 for a robot without one.
-        height: z, for a robot in space.
-        tube: for each period of the plan: center x, y and half-width x, y.
-        margin: of the tube to the edge of free space; `at_least` if it is a lower bound.
-        said: why the filter changed the proposal; trust: what the verification of the plan is worth.
-        inputs: name, unit, proposed and executed value of each input; arrows: where both would take the robot.
-        edge: point and normal of the half-space that blocks the proposal.
-        around: scan and moving obstacles, as `DisplayedMap.flat`.
-        fleet: the actors of the robot's world; reservation: the boxes that this robot reserves.
-        trail: positions of the episode; marks: its interventions (x, y, kind).
-        ended: outcome of the previous episode.
+        fleet: the actors of the robot's world.
+        reservation: the boxes that this robot reserves, from above.
+        reward: sum over the episode.
     """
 
-    robot: Robot
-    actor: str
-    number: int = 0
-    arena: dict[str, Any] = field(default_factory=dict)
-    pose: list[float] = field(default_factory=list)
-    height: float | None = None
-    kind: str = ""
-    tube: list[list[float]] = field(default_factory=list)
-    margin: float | None = None
-    at_least: bool = False
-    said: str = ""
-    trust: str = ""
-    inputs: list[list[Any]] = field(default_factory=list)
-    arrows: list[list[float]] = field(default_factory=list)
-    edge: list[float] = field(default_factory=list)
-    around: dict[str, list[Any]] = field(default_factory=dict)
-    fleet: list[str] = field(default_factory=list)
-    reservation: list[list[float]] = field(default_factory=list)
-    trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL))
-    marks: deque[tuple[float, float, str]] = field(default_factory=lambda: deque(maxlen=TRAIL))
-    reward: float = 0.0
-    ended: str = ""
+    def __init__(self, robot: Robot, actor: str) -> None:
+        self.robot, self.fleet, self.reward = robot, list[str](), 0.0
+        self.reservation: list[list[float]] = []
+        self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)  # positions of the episode
+        self._marks: deque[tuple[float, float, str]] = deque(maxlen=TRAIL)  # its interventions: x, y, kind
+        self._shown: dict[str, Any] = NO_DECISION | {
+            "actor": actor,
+            "robot": robot.name,
+            "footprint": robot.footprint,
+            "discs": body_discs(robot),
+            "number": 0,  # of the episode
+            "arena": {},
+            "pose": [],
+            "height": None,
+            "kind": "",
+            "around": {},
+            "ended": "",  # outcome of the previous episode
+        }
 
     def begin(self, episode: pb.Episode) -> None:
         """Start an episode."""
-        self.number, self.reward = episode.episode, 0.0
-        self.trail.clear()
-        self.marks.clear()
+        self.reward = 0.0
+        self._trail.clear()
+        self._marks.clear()
         half = half_width(episode)
         # A floor or a ceiling would cover the map; the walls are the edges of the square.
         inside = [o for o in episode.obstacles if o.kind != WALL and max(o.size) < 2.0 * half]
-        self.arena = {
+        arena = {
             "half": half,
             "obstacles": [
                 {"kind": o.kind, "at": list(o.position[:2]), "size": list(o.size), "yaw": o.yaw} for o in inside
@@ -90,53 +80,51 @@ class RobotPanel:
             "goal": list(episode.goal[:2]),
             "goal_radius": episode.goal_radius,
         }
+        self._shown |= {"number": episode.episode, "arena": arena}
         self._move_to(list(episode.start))
 
     def decide(self, exchange: pb.Exchange) -> None:
         """Show a decision; an exchange without a decision clears the panel's tube and explanation."""
-        self.tube, self.margin, self.at_least = [], None, False
-        self.said, self.trust, self.inputs, self.arrows, self.edge = "", "", [], [], []
+        self._shown |= NO_DECISION
         if not exchange.reply.HasField("decision"):
             return
         decision, view = exchange.reply.decision, decision_view(self.robot, exchange)
-        self.tube, self.margin, self.at_least = view.boxes_json(), decision.margin, decision.at_least
-        self.around = view.perceived_json()
+        about = view.explanation_json()
+        if about:
+            about |= {"said": "" if decision.kind == pb.ALLOWED else about["said"], "edge": about["edge"] or []}
+        self._shown |= about | {
+            "tube": view.boxes_json(),
+            "margin": decision.margin,
+            "at_least": decision.at_least,
+            "around": view.perceived_json(),
+        }
         self.fleet = list(exchange.request.fleet)
         self.reservation = boxes_from_above(reserved_boxes(self.robot, exchange))
-        if about := view.explanation_json():
-            self.said = "" if decision.kind == pb.ALLOWED else about["said"]
-            self.trust, self.inputs, self.arrows = about["trust"], about["inputs"], about["arrows"]
-            self.edge = about["edge"] or []
 
     def step(self, step: pb.Step) -> None:
         """Move the robot to its next state."""
-        self._move_to(list(step.state))
-        self.kind = "failsafe" if step.fallback else KINDS.get(step.decision, "")
+        x, y = self._move_to(list(step.state))
+        kind = pb.FAILSAFE if step.fallback else step.decision
+        self._shown["kind"] = KINDS.get(kind, "")
         self.reward += step.reward
-        x, y, _ = self.pose
-        self.trail.append((x, y))
-        if self.kind in ("adjusted", "failsafe", "recovering"):
-            self.marks.append((x, y, self.kind))
+        self._trail.append((x, y))
+        if kind in INTERVENTIONS:
+            self._marks.append((x, y, KINDS[kind]))
         if step.terminated or step.truncated:
-            self.ended = "collision" if step.collision else "goal" if step.goal else "time limit"
+            self._shown["ended"] = "collision" if step.collision else "goal" if step.goal else "time limit"
 
-    def _move_to(self, state: list[float]) -> None:
-        if len(state) != self.robot.state_dim:
-            raise ValueError(f"a state has {len(state)} numbers, not the {self.robot.state_dim} of {self.robot.name}")
-        heading = 0.0 if self.robot.heading is None else state[self.robot.heading]
-        self.pose = [state[0], state[1], heading]
-        self.height = state[2] if self.robot.position_dim == 3 else None
+    def _move_to(self, state: list[float]) -> tuple[float, float]:
+        robot = self.robot
+        if len(state) != robot.state_dim:
+            raise ValueError(f"a state has {len(state)} numbers, not the {robot.state_dim} of {robot.name}")
+        heading = 0.0 if robot.heading is None else state[robot.heading]
+        height = state[2] if robot.position_dim == 3 else None
+        self._shown |= {"pose": [state[0], state[1], heading], "height": height}
+        return state[0], state[1]
 
     def view(self) -> dict[str, Any]:
         """Return the panel for JSON."""
-        names = (
-            *("actor", "number", "arena", "pose", "height", "kind", "tube", "margin", "at_least", "reward", "ended"),
-            *("said", "trust", "inputs", "arrows", "edge", "around"),
-        )
-        about = {name: getattr(self, name) for name in names}
-        lists = {"trail": list(self.trail), "marks": list(self.marks)}
-        robot = {"robot": self.robot.name, "footprint": self.robot.footprint, "discs": body_discs(self.robot)}
-        return about | lists | robot
+        return self._shown | {"reward": self.reward, "trail": list(self._trail), "marks": list(self._marks)}
 
 
 class Dashboard:
@@ -197,15 +185,14 @@ class Dashboard:
             if now - self._figures_at > FIGURES_EVERY:
                 self._figures, self._figures_at = self._counts(), now
             panels = [
-                panel.view() | {"promises": self._reservations_of_others(name)}
+                panel.view() | {"promises": [box for other in self._others(name) for box in other.reservation]}
                 for name, panel in sorted(self._panels.items())
             ]
             return {"robots": panels, "silent": now - self._last_message} | self._figures
 
-    def _reservations_of_others(self, name: str) -> list[list[float]]:
-        """Return the boxes that the other robots of the actor's world reserve."""
-        others = (self._panels[actor] for actor in self._panels[name].fleet if actor != name and actor in self._panels)
-        return [box for panel in others for box in panel.reservation]
+    def _others(self, name: str) -> list[RobotPanel]:
+        """Return the panels of the other robots of the actor's world."""
+        return [self._panels[actor] for actor in self._panels[name].fleet if actor != name and actor in self._panels]
 
     def _counts(self) -> dict[str, Any]:
         figures = self.metrics.figures()

@@ -7,7 +7,6 @@ requests to other servers.
 from __future__ import annotations
 
 import json
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from importlib.resources import files
 from types import TracebackType
 from typing import Any, Self
 
+from brakeline.logs.json_values import finite
 from brakeline.logs.watch.allowed_hosts import rejection_reason
 
 RATE = 10.0  # Hz of events
@@ -119,14 +119,4 @@ class _Handler(BaseHTTPRequestHandler):
 
 def encode(view: dict[str, Any]) -> str:
     """Encode the view as one line of JSON; a number that is not finite becomes null."""
-    return json.dumps(_finite(view), separators=(",", ":"))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, float):
-        return round(value, 4) if math.isfinite(value) else None
-    return value
+    return json.dumps(finite(view, digits=4), separators=(",", ":"))
