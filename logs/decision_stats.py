@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections import Counter
 from collections.abc import Iterable
-from copy import deepcopy
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from brakeline.logs.episode_stats import KINDS, Figures
-from brakeline.logs.quantiles import BATCH, QuantileSketch, merged, spread, summary
+from brakeline.logs.quantiles import QuantileSketch, merged, spread, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
 # Parts of the latency from an actor's request to the reply.
@@ -26,11 +23,6 @@ PARTS = {
 }
 MOST_REASONS, OTHER = 50, "other"
 SOLVED = "solved"  # the solver's status after success
-
-
-Row = tuple[float, ...]  # kind, round trip, queue, decide, verify, solve [ms], iterations, half-width, margin [m]
-ROW = 9  # numbers in a row
-MISSING = math.nan  # in a row without a program or a tube
 
 
 def _latency() -> dict[int, dict[str, QuantileSketch]]:
@@ -50,7 +42,6 @@ class DecisionStats:
     unverified: int = 0  # failsafe decisions without a verified plan
     not_finite: int = 0  # proposals with NaN or infinity
     failures: Counter[str] = field(default_factory=Counter)  # exchanges without a decision, by reason
-    pending: array[float] = field(default_factory=lambda: array("d"))  # rows that the sketches do not include yet
 
     def exchange(self, exchange: pb.Exchange) -> None:
         """Add an exchange."""
@@ -58,38 +49,33 @@ class DecisionStats:
             count(self.failures, failure.split(":", 1)[0])
             return
         decision = exchange.reply.decision
-        solve = iterations = width = margin = MISSING
-        if solver := decision.solver:
-            solve, iterations = decision.solve_ms, decision.iterations
+        solver = decision.solver
+        self._add_latency(exchange.round_trip_ms, decision, bool(solver))
+        if solver:
+            self.iterations.add(decision.iterations)
             count(self.statuses, solver)
         if not decision.verified:
             self.unverified += 1
         if not all(map(math.isfinite, exchange.request.action)):
             self.not_finite += 1
         if widths := decision.tube_half_width[:]:
-            width, margin = max(widths), decision.margin
-        times = exchange.round_trip_ms, decision.queue_ms, decision.time_ms, decision.verify_ms
-        pending = self.pending
-        pending.extend((decision.kind, *times, solve, iterations, width, margin))
-        if len(pending) >= ROW * BATCH:
-            self._flush()
+            self.half_width.add(max(widths))
+            self.margin.add(decision.margin)
 
-    def _flush(self) -> None:
-        """Add the pending rows to the sketches."""
-        rows, self.pending = np.asarray(self.pending).reshape(-1, ROW), array("d")
-        kind, round_trip, queue, decide, verify, solve, iterations, width, margin = rows.T
-        self.round_trip_ms.add_array(round_trip)
-        with np.errstate(invalid="ignore"):  # a message may have infinities, whose difference is NaN
-            network = np.maximum(0.0, round_trip - queue - decide)
-        values = {
-            "round_trip": round_trip, "network": network, "queue": queue, "decide": decide, "solve": solve,
-            "verify": verify,
-        }  # fmt: skip
-        for number, sketches in self.latency.items():
-            for part, sketch in sketches.items():
-                sketch.add_array(values[part][kind == number])
-        for sketch, column in ((self.iterations, iterations), (self.half_width, width), (self.margin, margin)):
-            sketch.add_array(column)
+    def _add_latency(self, round_trip: float, decision: pb.Decision, solved: bool) -> None:
+        """Add the times, ms."""
+        self.round_trip_ms.add(round_trip)
+        if (parts := self.latency.get(decision.kind)) is None:
+            return
+        queue, decide = decision.queue_ms, decision.time_ms
+        rest = round_trip - queue - decide  # NaN, if the message has infinities
+        parts["round_trip"].add(round_trip)
+        parts["network"].add(0.0 if rest < 0.0 else rest)
+        parts["queue"].add(queue)
+        parts["decide"].add(decide)
+        parts["verify"].add(decision.verify_ms)
+        if solved:
+            parts["solve"].add(decision.solve_ms)
 
     def figures(self) -> Figures:
         """Return the figures of all exchanges; None for what was not measured."""
@@ -121,22 +107,16 @@ def count(words: Counter[str], word: str) -> None:
 
 def merge_decisions(parts: Iterable[DecisionStats]) -> DecisionStats:
     """Merge parts. The floating-point sums depend only on the order of the parts."""
-    parts = [_flushed(part) for part in parts]
-    return DecisionStats(
-        round_trip_ms=merged(part.round_trip_ms for part in parts),
-        latency={kind: {name: merged(part.latency[kind][name] for part in parts) for name in PARTS} for kind in KINDS},
-        iterations=merged(part.iterations for part in parts),
-        statuses=sum((part.statuses for part in parts), Counter()),
-        half_width=merged(part.half_width for part in parts),
-        margin=merged(part.margin for part in parts),
-        unverified=sum(part.unverified for part in parts),
-        not_finite=sum(part.not_finite for part in parts),
-        failures=sum((part.failures for part in parts), Counter()),
-    )
+    whole, parts = DecisionStats(), list(parts)
+    for item in fields(DecisionStats):
+        setattr(whole, item.name, _merge([getattr(part, item.name) for part in (whole, *parts)]))
+    return whole
 
 
-def _flushed(part: DecisionStats) -> DecisionStats:
-    """Return a copy without pending rows, so that reading the figures never changes the sums."""
-    copy = deepcopy(part)
-    copy._flush()
-    return copy
+def _merge(values: list[Any]) -> Any:
+    first = values[0]
+    if isinstance(first, QuantileSketch):
+        return merged(values)
+    if isinstance(first, Counter | int):
+        return sum(values, type(first)())
+    return {key: _merge([value[key] for value in values]) for key in first}

@@ -24,6 +24,12 @@ CONTACTS = ("contacts_moving", "contacts_standing", "contacts_robots")  # with m
 
 RUN_INTO = "contacts_standing"  # one episode may have several
 
+# Fields of `EpisodeStats` that are also figures: sums over the actors.
+COUNTS = (
+    *("goals", "collisions", *CONTACTS, "timeouts", "steps", "interventions", "adjusted", "failsafes"),
+    *("recovering", "fallbacks", "broken", "outside"),
+)
+
 KINDS: dict[int, str] = {
     pb.ALLOWED: "allowed",
     pb.ADJUSTED: "adjusted",
@@ -155,28 +161,15 @@ def closed_loop(parts: Iterable[EpisodeStats]) -> Figures:
     clearance = summary(*(part.clearance for part in parts))
     figures = {
         "episodes": len(returns),
-        "goals": total("goals"),
-        "collisions": total("collisions"),
-        "contacts_moving": total("contacts_moving"),
-        "contacts_standing": total("contacts_standing"),
-        "contacts_robots": total("contacts_robots"),
-        "timeouts": total("timeouts"),
-        "steps": steps,
-        "interventions": total("interventions"),
-        "adjusted": total("adjusted"),
+        **{name: total(name) for name in COUNTS},
         "for_clearance": None if total("without_for_clearance") else total("for_clearance"),
-        "failsafes": total("failsafes"),
-        "recovering": total("recovering"),
-        "fallbacks": total("fallbacks"),
         "mean_speed": math.fsum(part.speed for part in parts) / steps if steps else None,
         "max_speed": max(part.max_speed for part in parts) if steps else None,
         "mean_reward": float(returns.mean()) if len(returns) else None,
         "decision_ms": total_ms and total_ms | {kind: spread(*parts) for kind, parts in times.items()},
         "propose_ms": spread(*(part.propose_ms for part in parts)),
         "containment": {"steps": total("compared"), "violations": total("violations")},
-        "broken": total("broken"),
         "fleet": max((part.fleet for part in parts), default=0),
-        "outside": total("outside"),
         "closest_approach": clearance and clearance["min"],
         "clearance": clearance,
     }

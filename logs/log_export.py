@@ -1,77 +1,95 @@
-"""Export a log: its steps as CSV, or all messages with a Foxglove scene of every step."""
+"""Export a log: steps as CSV, MAVLink frames as .tlog, or all messages with a Foxglove scene of every step."""
 
 from __future__ import annotations
 
 import csv
 import math
+import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from google.protobuf.message import DecodeError
 
 from brakeline.errors import ExportError
 from brakeline.logs.foxglove import FoxgloveConverter
-from brakeline.logs.minari_export import nothing_of
 from brakeline.logs.reader import TYPES, Log, Paths, Record, open_log
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
 BATCH = 1000  # messages per write
+TIME = struct.Struct(">Q")  # of a frame in a .tlog file: µs since the Unix epoch
 
 
-def columns(robot: RobotWithTask) -> dict[str, tuple[str, ...]]:
-    """Return the names of the elements of each exported repeated field of a step. `path` is not exported."""
-    return {
-        "observation": robot.task.observed,
-        "proposed": robot.action,
-        "action": robot.action,
-        "next_observation": robot.task.observed,
-        "state": robot.state,
-        "true_state": robot.state,
-    }
-
-
-def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
-    """Write each step of a robot kind as a line, in the order of receipt, and return the number of steps.
-
-    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message;
-    vectors as `field.name [unit]`, the decision by its name.
+def robot_steps(paths: Paths, robot: RobotWithTask) -> Iterator[Record]:
+    """Yield the steps of a robot kind in the order of receipt.
 
     Raises:
         ExportError: the log has no step of this robot; the message lists the robots that it has.
         LogError: as `open_log`.
     """
-    vectors = columns(robot)
+    others, empty = set(), True
+    for record in open_log(paths):
+        if record.topic == "step" and record.message.robot == robot.name:
+            empty = False
+            yield record
+        elif record.topic == "step":
+            others.add(record.message.robot)
+    if empty and others:
+        names = ", ".join(sorted(others))
+        advice = "give --robot NAME or the path of its description"
+        raise ExportError(f"the log has no step of {robot.name}, but steps of {names}: {advice}")
+    if empty:
+        raise ExportError(f"the log has no step of {robot.name} or of any other robot")
+
+
+def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
+    """Write each step of a robot kind as a line, and return the number of steps. Raises as `robot_steps`.
+
+    Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message
+    but `path`; vectors as `field.name [unit]`, the decision by its name.
+    """
+    vectors = {
+        **{"observation": robot.task.observed, "proposed": robot.action, "action": robot.action},
+        **{"next_observation": robot.task.observed, "state": robot.state, "true_state": robot.state},
+    }
     plain = [f.name for f in pb.Step.DESCRIPTOR.fields if not f.is_repeated and f.message_type is None]
     header = ["time", "source", "run", "sequence"]
     table = csv.writer(file, lineterminator="\n")
     titles = [f"{name}.{part}" for name, parts in vectors.items() for part in parts]
     table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles])
-    count, others = 0, set()
-    for record in open_log(paths):
-        if record.topic != "step":
-            continue
+    count = 0
+    for count, record in enumerate(robot_steps(paths, robot), 1):
         step = record.message
-        if step.robot != robot.name:
-            others.add(step.robot)
-            continue
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
         values += [pb.Kind.Name(step.decision) if name == "decision" else _plain(step, name) for name in plain]
         for name, parts in vectors.items():
             row = list(getattr(step, name))
             values += row if len(row) == len(parts) else [""] * len(parts)
         table.writerow(values)
-        count += 1
-    if not count:
-        raise ExportError(nothing_of(robot, others))
     return count
 
 
 def _plain(step: pb.Step, name: str) -> Any:
     value = getattr(step, name)
     return int(value) if isinstance(value, bool) else value
+
+
+def to_tlog(paths: Paths, file: BinaryIO) -> int:
+    """Write all MAVLink frames, each after its time, for ground stations and pymavlink; return their number.
+
+    Raises:
+        ExportError: the log has no frame.
+        NoLog, NotALog: as `open_log`.
+    """
+    frames = (frame for record in open_log(paths) if record.topic == "frames" for frame in record.message.frames)
+    count = 0
+    for count, frame in enumerate(frames, 1):
+        file.write(TIME.pack(frame.wall_time // 1000) + frame.raw)
+    if not count:
+        raise ExportError("the log has no MAVLink frame: `brakeline train` records frames only with --mavlink")
+    return count
 
 
 def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:

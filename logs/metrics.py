@@ -102,6 +102,7 @@ class Metrics:
         self.learners: dict[str, pb.LearnerMetrics] = {}
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()
+        self._tube_stats = partial(TubeStats, self._robots)
         self._roots = {topic.key.split("/", 1)[0] for topic in topics}
         self._handlers: dict[type[Message], Callable[[Any], None]] = {
             pb.Step: self._step,
@@ -161,14 +162,7 @@ class Metrics:
 
     def topics(self) -> dict[str, dict[str, int]]:
         """Return the counts of received `messages`, `missing` messages and `duplicates`, by key."""
-        totals: dict[str, dict[str, int]] = {}
-        for key, _ in sorted(self.streams):
-            totals[key] = {"messages": 0, "missing": 0, "duplicates": 0}
-        for (key, _), stream in self.streams.items():
-            totals[key]["messages"] += stream.received
-            totals[key]["missing"] += stream.missing
-            totals[key]["duplicates"] += stream.duplicates
-        return totals
+        return topics_of([self])
 
     @staticmethod
     def spans(streams: dict[tuple[str, int], PublisherStream]) -> dict[int, tuple[int, int]]:
@@ -202,24 +196,17 @@ class Metrics:
             "notes": process.notes,
         }
 
-    def _stream(self, key: str, run: int) -> PublisherStream:
-        return _get_or_create(self.streams, (key, run), PublisherStream)
-
     def _step(self, step: pb.Step) -> None:
-        name = step.actor
-        stats = self.actors.get(name) or _get_or_create(self.actors, name, EpisodeStats)
-        stats.step(step)
+        _get_or_create(self.actors, step.actor, EpisodeStats).step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = exchange.request.actor
-        decisions = self.decisions.get(name) or _get_or_create(self.decisions, name, DecisionStats)
-        decisions.exchange(exchange)
-        (self.plans.get(name) or _get_or_create(self.plans, name, partial(TubeStats, self._robots))).exchange(exchange)
+        _get_or_create(self.decisions, name, DecisionStats).exchange(exchange)
+        _get_or_create(self.plans, name, self._tube_stats).exchange(exchange)
 
     def _add_learner(self, metrics: pb.LearnerMetrics) -> None:
-        name = metrics.robot
-        _get_or_create(self.learners, name, pb.LearnerMetrics)
-        self.learners[name] = metrics
+        _get_or_create(self.learners, metrics.robot, pb.LearnerMetrics)
+        self.learners[metrics.robot] = metrics
 
     def _health(self, health: pb.Health) -> None:
         process = _get_or_create(self.processes, health.process, ProcessFigures)
@@ -237,7 +224,7 @@ class Metrics:
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
             if count and key.split("/", 1)[0] in self._roots:
-                stream = self._stream(key, health.header.run)
+                stream = _get_or_create(self.streams, (key, health.header.run), PublisherStream)
                 stream.published = max(stream.published, count)
 
     def _log_line(self, line: pb.LogLine) -> None:
@@ -277,7 +264,7 @@ def merge_runs(runs: Mapping[str, Metrics]) -> Figures:
         "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
         **merge_decisions([decisions[name] for name in sorted(decisions)]).figures(),
         "plans": tube_stats.figures(part for run in runs.values() for part in run.plans.copy().values()),
-        "topics": _summed([run.topics() for run in runs.values()]),
+        "topics": topics_of(runs.values()),
         "processes": {
             prefix + name: run.process(name) for prefix, run in runs.items() for name in sorted(run.processes)
         },
@@ -285,14 +272,15 @@ def merge_runs(runs: Mapping[str, Metrics]) -> Figures:
     }
 
 
-def _summed(parts: Iterable[dict[str, dict[str, int]]]) -> dict[str, dict[str, int]]:
-    """Add counts by key and name."""
+def topics_of(runs: Iterable[Metrics]) -> dict[str, dict[str, int]]:
+    """Sum the counts of the messages of several runs, by key."""
     totals: dict[str, dict[str, int]] = {}
-    for part in parts:
-        for key, counts in part.items():
-            sums = totals.setdefault(key, dict.fromkeys(counts, 0))
-            for name, count in counts.items():
-                sums[name] += count
+    for run in runs:
+        for (key, _), stream in run.streams.items():
+            counts = totals.setdefault(key, {"messages": 0, "missing": 0, "duplicates": 0})
+            counts["messages"] += stream.received
+            counts["missing"] += stream.missing
+            counts["duplicates"] += stream.duplicates
     return dict(sorted(totals.items()))
 
 

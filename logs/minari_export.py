@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,23 +12,14 @@ from typing import Any
 import numpy as np
 
 from brakeline.errors import ExportError
-from brakeline.logs.reader import Paths, open_log
+from brakeline.logs.log_export import robot_steps
+from brakeline.logs.reader import Paths
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
 BATCH = 100  # episodes per write
 # Fields of a step in the `infos` of the data set.
 INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weights_version")
-
-
-def nothing_of(robot: RobotWithTask, others: Collection[str]) -> str:
-    """Return the error message for a log without a step of this robot."""
-    if not others:
-        return f"the log has no step of {robot.name} or of any other robot"
-    names = ", ".join(sorted(others))
-    return (
-        f"the log has no step of {robot.name}, but steps of {names}: give --robot NAME or the path of its description"
-    )
 
 
 def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
@@ -38,9 +29,7 @@ def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     steps are skipped.
     """
     running: dict[str, list[pb.Step]] = {}
-    for record in open_log(paths):
-        if record.topic != "step" or record.message.robot != robot.name:
-            continue
+    for record in robot_steps(paths, robot):
         step: pb.Step = record.message
         steps = running.setdefault(step.actor, [])
         if steps:
@@ -106,9 +95,6 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
             dataset.update_dataset_from_buffer(batch)
         count += len(batch)
         steps += sum(len(buffer.rewards) for buffer in batch)
-    if dataset is None:
-        others = {record.message.robot for record in open_log(paths) if record.topic == "step"}
-        raise ExportError(nothing_of(robot, others))
     return Written(path, count, steps)
 
 

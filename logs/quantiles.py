@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -54,7 +55,7 @@ class QuantileSketch:
     low: float = math.inf
     high: float = -math.inf
     not_finite: int = 0
-    bins: dict[int, int] = field(default_factory=dict)
+    bins: Counter[int] = field(default_factory=Counter)
     pending: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, value: float) -> None:
@@ -89,8 +90,7 @@ class QuantileSketch:
         sizes = np.abs(values)
         places = np.floor(np.log(np.maximum(sizes, TINY)) * _PER_E + _SHIFT) * np.sign(values) * (sizes > TINY)
         numbers, counts = np.unique(places.astype(np.int64), return_counts=True)
-        for place, count in zip(numbers.tolist(), counts.tolist(), strict=True):
-            self.bins[place] = self.bins.get(place, 0) + count
+        self.bins.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
 
     @property
     def mean(self) -> float:
@@ -119,26 +119,25 @@ class QuantileSketch:
     def bars(self, ratio: float = 1.25) -> list[tuple[float, float, int]]:
         """Return coarser bins (from, to, count) of the positive values, about `ratio` wide, also the empty ones."""
         width = max(1, round(math.log(ratio) * _PER_E))
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         for place, count in self.bins.items():
             if place > 0:
-                counts[place // width] = counts.get(place // width, 0) + count
+                counts[place // width] += count
         if not counts:
             return []
 
         def edge(bar: int) -> float:
             return math.exp((bar * width - _SHIFT) / _PER_E)
 
-        return [(edge(bar), edge(bar + 1), counts.get(bar, 0)) for bar in range(min(counts), max(counts) + 1)]
+        return [(edge(bar), edge(bar + 1), counts[bar]) for bar in range(min(counts), max(counts) + 1)]
 
 
 def merged(parts: Iterable[QuantileSketch]) -> QuantileSketch:
     """Merge sketches. The floating-point sums depend only on the order of the parts."""
     parts = [part.flushed() for part in parts]
-    bins: dict[int, int] = {}
+    bins: Counter[int] = Counter()
     for part in parts:
-        for place, count in part.bins.items():
-            bins[place] = bins.get(place, 0) + count
+        bins.update(part.bins)
     return QuantileSketch(
         count=sum(part.count for part in parts),
         total=math.fsum(part.total for part in parts),
@@ -150,16 +149,8 @@ def merged(parts: Iterable[QuantileSketch]) -> QuantileSketch:
     )
 
 
-def spread(*parts: QuantileSketch) -> dict[str, float] | None:
-    """Return mean, standard deviation, median and 99th percentile; None without a value."""
-    values = merged(parts)
-    if not values.count:
-        return None
-    return {"mean": values.mean, "std": values.std, "p50": values.percentile(50), "p99": values.percentile(99)}
-
-
 def summary(*parts: QuantileSketch) -> dict[str, float] | None:
-    """Return `spread` with the count, the extremes and the 90th percentile; None without a value."""
+    """Return count, mean, standard deviation, extremes and percentiles; None without a value."""
     values = merged(parts)
     if not values.count:
         return None
@@ -168,8 +159,12 @@ def summary(*parts: QuantileSketch) -> dict[str, float] | None:
         "mean": values.mean,
         "std": values.std,
         "min": values.low,
-        "p50": values.percentile(50),
-        "p90": values.percentile(90),
-        "p99": values.percentile(99),
+        **{f"p{percent}": values.percentile(percent) for percent in (50, 90, 99)},
         "max": values.high,
     }
+
+
+def spread(*parts: QuantileSketch) -> dict[str, float] | None:
+    """Return mean, standard deviation, median and 99th percentile; None without a value."""
+    whole = summary(*parts)
+    return whole and {name: whole[name] for name in ("mean", "std", "p50", "p99")}

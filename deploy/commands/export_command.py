@@ -71,7 +71,7 @@ class ExportCommand:
         return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
 
     def _tlog(self) -> dict[str, Any]:
-        from brakeline.logs.tlog_export import to_tlog
+        from brakeline.logs.log_export import to_tlog
 
         assert self.tlog is not None
         with self.tlog.open("wb") as file:

@@ -11,9 +11,9 @@ from brakeline.actors.mavlink.frame_recorder import FrameRecorder
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.deploy.run.mavlink_json import ENCODING, frames_as_json
 from brakeline.errors import ExportError, Malformed
+from brakeline.logs.log_export import to_tlog
 from brakeline.logs.reader import read
 from brakeline.logs.recorder import Inbox, Recording
-from brakeline.logs.tlog_export import to_tlog
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import FRAMES, LOG
