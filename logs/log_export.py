@@ -60,7 +60,7 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
     titles = [f"{name}.{part}" for name, parts in vectors.items() for part in parts]
     table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles])
     count = 0
-    for count, record in enumerate(robot_steps(paths, robot), 1):
+    for record in robot_steps(paths, robot):
         step = record.message
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
         values += [pb.Kind.Name(step.decision) if name == "decision" else _plain(step, name) for name in plain]
@@ -68,6 +68,7 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
             row = list(getattr(step, name))
             values += row if len(row) == len(parts) else [""] * len(parts)
         table.writerow(values)
+        count += 1
     return count
 
 
@@ -85,8 +86,9 @@ def to_tlog(paths: Paths, file: BinaryIO) -> int:
     """
     frames = (frame for record in open_log(paths) if record.topic == "frames" for frame in record.message.frames)
     count = 0
-    for count, frame in enumerate(frames, 1):
+    for frame in frames:
         file.write(TIME.pack(frame.wall_time // 1000) + frame.raw)
+        count += 1
     if not count:
         raise ExportError("the log has no MAVLink frame: `brakeline train` records frames only with --mavlink")
     return count

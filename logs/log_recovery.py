@@ -7,7 +7,6 @@ run.mcap.damaged.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -124,9 +123,3 @@ def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], 
             schemas[content] = writer.register_schema(schema.name, schema.encoding, schema.data)
         number = schemas[content]
     return int(writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata))
-
-
-def recover_all(paths: tuple[Path, ...]) -> Iterator[Recovery]:
-    """Repair each file in place. Raises as `recover`."""
-    for path in paths:
-        yield recover(path)

@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 from typing import IO, Any
 
 import lz4.frame
@@ -37,18 +38,20 @@ _TO_PAYLOAD = _HEAD.size + _MESSAGE.size
 
 @dataclass(frozen=True)
 class DamagedBytes:
-    """A range of bytes that cannot be read."""
+    """A range of bytes that cannot be read: the recorder was killed, the disk was full, or bytes were changed."""
 
     at: int  # offset of the first byte
     lost: int  # number of bytes; 0: only the summary is missing
     reason: str
     at_end: bool  # the range extends to the end of the file
+    path: Path | None = None  # of the file, in a log
 
     def __str__(self) -> str:
+        file = "" if self.path is None else f"{self.path}: "
         if not self.lost:
-            return f"the file had no summary ({self.reason})"
+            return f"{file}the file has no summary ({self.reason})"
         where = "its end" if self.at_end else f"byte {self.at}"
-        return f"{self.lost} bytes at {where} could not be read ({self.reason})"
+        return f"{file}{self.lost} bytes at {where} cannot be read ({self.reason})"
 
 
 @dataclass(slots=True, eq=False)

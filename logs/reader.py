@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,22 +44,6 @@ class Record(NamedTuple):
     message: Any
     log_time: int
     publish_time: int
-
-
-@dataclass(frozen=True)
-class DamagedFile:
-    """Damage of a file: the recorder was killed, the disk was full, or bytes were changed."""
-
-    path: Path
-    lost: int  # bytes; 0: only the summary is missing
-    reason: str
-    at: int | None = None  # offset of the damage; None: at the end of the file
-
-    def __str__(self) -> str:
-        if not self.lost:
-            return f"{self.path}: the file has no summary ({self.reason})"
-        where = "its end" if self.at is None else f"byte {self.at}"
-        return f"{self.path}: {self.lost} bytes at {where} cannot be read ({self.reason})"
 
 
 @dataclass(frozen=True)
@@ -106,7 +90,7 @@ class Log:
     paths: tuple[Path, ...]
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
-    cuts: list[DamagedFile | MissingSegment] = field(default_factory=list)
+    cuts: list[DamagedBytes | MissingSegment] = field(default_factory=list)
     malformed: int = 0
     segments: list[LogSegment] = field(default_factory=list)
     robots: RecordedRobots = field(default_factory=RecordedRobots)
@@ -144,7 +128,9 @@ class Log:
                         if item[0].known:  # other programs may have added channels
                             yield item
                     elif isinstance(item, DamagedBytes):
-                        self._add_damage(segment, item)
+                        recording = segment.recording and item.at_end
+                        reason = "the file is being recorded" if recording else item.reason
+                        self.cuts.append(replace(item, path=path, reason=reason))
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
                         if item.name == "robots":
@@ -153,10 +139,6 @@ class Log:
                         self.attachments[item.name] = item.data
         except NotMcap as error:
             raise LogError(f"{path} is not an MCAP file: {error}") from error
-
-    def _add_damage(self, segment: LogSegment, damage: DamagedBytes) -> None:
-        reason = "the file is being recorded" if segment.recording and damage.at_end else damage.reason
-        self.cuts.append(DamagedFile(segment.path, damage.lost, reason, None if damage.at_end else damage.at))
 
     @staticmethod
     def _channel(key: str, schema: str) -> LogChannel:
@@ -201,9 +183,9 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     return runs
 
 
-def missing_segments(paths: Sequence[Path]) -> list[DamagedFile | MissingSegment]:
+def missing_segments(paths: Sequence[Path]) -> list[DamagedBytes | MissingSegment]:
     """Return the missing segments: gaps in the numbers of the segments at `paths`."""
-    missing: list[DamagedFile | MissingSegment] = []
+    missing: list[DamagedBytes | MissingSegment] = []
     for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
         numbers = [number_of(path)[1] for path in files]
         if len(numbers) > 1:

@@ -12,11 +12,11 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from brakeline.logs.segment import Attachments, Entry, Metadata, Segment, open_segment
-from brakeline.logs.segment_rotation import Rotation as Rotation
+from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -33,7 +33,7 @@ OVERHEAD = 100  # bytes of a sample besides its payload
 BATCH = 2**20  # bytes per write, so that a nearly full disk still takes what fits
 MOST_DRAWING = 2.0  # s of one flush after which the remaining messages are recorded without scenes
 
-Open = Callable[[Path, Metadata], Segment]
+Open = Callable[[Path, Metadata, Attachments], Segment]
 Derive = Callable[[Sample], Iterable[Entry]]  # additional entries for a sample, e.g. Foxglove's scenes
 
 
@@ -87,6 +87,24 @@ class Inbox:
                 self.bytes -= size_in_memory(sample)
 
 
+@dataclass(frozen=True)
+class LogSettings:
+    """What a recorder writes.
+
+    Attributes:
+        run: path of the log.
+        metadata, attachments: written to each file of the log.
+        derive: returns additional entries for a sample.
+    """
+
+    run: Path
+    metadata: Metadata = field(default_factory=dict)
+    attachments: Attachments = field(default_factory=dict)
+    derive: Derive = lambda sample: ()
+    rotation: Rotation = field(default_factory=Rotation)
+    open_segment: Open = open_segment
+
+
 class Recording:
     """Writes an inbox to the segments of a run, on a disk that may fill up. Use it from one thread only.
 
@@ -97,29 +115,15 @@ class Recording:
         path: of the latest segment.
     """
 
-    def __init__(
-        self,
-        run: Path,
-        metadata: Metadata,
-        inbox: Inbox,
-        open_one: Open = open_segment,
-        derive: Derive | None = None,
-        rotation: Rotation | None = None,
-        rejected: RejectedMessages | None = None,
-    ) -> None:
+    def __init__(self, settings: LogSettings, inbox: Inbox, rejected: RejectedMessages | None = None) -> None:
         self.recorded: Counter[str] = Counter()
+        self.undrawn = 0
         self.failure = ""
         self.path: Path | None = None
-        self._run, self._metadata, self._inbox, self._open = run, metadata, inbox, open_one
-        self._derive = derive or (lambda sample: ())
-        self._rotation = rotation or Rotation()
-        self._rejected = rejected or RejectedMessages()
+        self._settings, self._inbox, self._rejected = settings, inbox, rejected or RejectedMessages()
         self._segment: Segment | None = None
-        self._opened_at = 0.0
-        self._retry_at = 0.0
+        self._opened_at = self._retry_at = self._flush_began = 0.0
         self._reported_drops = 0
-        self.undrawn = 0
-        self._flush_began = 0.0
 
     def save(self) -> None:
         """Write the inbox to the file and flush it; what cannot be written stays in the inbox."""
@@ -157,30 +161,29 @@ class Recording:
     def _entries(self, sample: Sample) -> list[Entry]:
         """Return the entries of a sample: itself, also if it is malformed, and what `derive` adds."""
         try:
-            if time.monotonic() - self._flush_began > MOST_DRAWING:
-                self._count_undrawn()
-                return [entry(sample)]
-            return [entry(sample), *self._derive(sample)]
+            if time.monotonic() - self._flush_began <= MOST_DRAWING:
+                return [entry(sample), *self._settings.derive(sample)]
+            if not self.undrawn:
+                log.warning("messages arrive faster than they can be drawn: some are recorded without scenes")
+            self.undrawn += 1
+            return [entry(sample)]
         except Exception as error:  # its bytes are kept all the same
             self._rejected.reject(sample.key, error)
-            return [malformed_entry(sample)]
-
-    def _count_undrawn(self) -> None:
-        if not self.undrawn:
-            log.warning("messages arrive faster than they can be drawn: some are recorded without scenes")
-        self.undrawn += 1
+            return [Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)]
 
     def _current_segment(self) -> Segment:
         """Return the file to write to; open a new one if needed. Raises OSError."""
         if self._segment is None:
-            self._segment, self._opened_at = self._open(self._run, self._metadata), time.monotonic()
+            settings = self._settings
+            self._segment = settings.open_segment(settings.run, settings.metadata, settings.attachments)
+            self._opened_at = time.monotonic()
             self.path = self._segment.path
             log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)
         return self._segment
 
     def _rotated(self, segment: Segment) -> Segment:
         """Return the file to continue with: a new one if rotation is due. Raises OSError."""
-        if not self._rotation.due(segment, time.monotonic() - self._opened_at):
+        if not self._settings.rotation.due(segment, time.monotonic() - self._opened_at):
             return segment
         self._close()
         return self._current_segment()
@@ -217,50 +220,37 @@ def entry(sample: Sample) -> Entry:
     return Entry(sample.key, sample.topic.message, sample.payload, sample.received, publish_time, header.sequence)
 
 
-def malformed_entry(sample: Sample) -> Entry:
-    """Return the entry of a malformed sample; its time of publication is the time of receipt."""
-    return Entry(sample.key, sample.topic.message, sample.payload, sample.received, sample.received, 0)
-
-
-def record(
-    process: Process,
-    run: Path,
-    metadata: Metadata,
-    attachments: Attachments | None = None,
-    derive: Derive | None = None,
-    rotation: Rotation | None = None,
-) -> Recording:
-    """Record until `process.stop` is set and no more messages arrive.
+def main(settings: BusSettings, log_settings: LogSettings, source: str = "recorder") -> None:
+    """Record until a signal stops the process and no more messages arrive.
 
     Health messages have the figures `recorded`, `dropped` and `undrawn` (messages), `waiting` (bytes), `recorded <key>`
     for each channel, and the notes `file` and `failure` (why the recorder cannot write).
     """
-    inbox = Inbox()
-    opened = partial(open_segment, attachments=attachments)
-    recording = Recording(run, metadata, inbox, opened, derive, rotation, process.bus.rejected)
+    with Process(settings, source) as process:
+        inbox = Inbox()
+        recording = Recording(log_settings, inbox, process.bus.rejected)
 
-    def refresh() -> None:
-        process.figures.update(
-            {f"recorded {key}": float(count) for key, count in recording.recorded.copy().items()},
-            recorded=float(recording.recorded.total()),
-            dropped=float(inbox.dropped.total()),
-            undrawn=float(recording.undrawn),
-            waiting=float(inbox.bytes),
-        )
-        process.notes.update(file=str(recording.path or ""), failure=recording.failure)
+        def refresh() -> None:
+            process.figures.update(
+                {f"recorded {key}": float(count) for key, count in recording.recorded.copy().items()},
+                recorded=float(recording.recorded.total()),
+                dropped=float(inbox.dropped.total()),
+                undrawn=float(recording.undrawn),
+                waiting=float(inbox.bytes),
+            )
+            process.notes.update(file=str(recording.path or ""), failure=recording.failure)
 
-    subscriptions = [process.bus.subscribe(topic, inbox.put) for topic in RECORDED]
-    recording.save()
-    process.refresh = refresh
-    process.announce()
-    while not process.stop.wait(PERIOD):
+        subscriptions = [process.bus.subscribe(topic, inbox.put) for topic in RECORDED]
         recording.save()
-    _until_quiet(inbox, recording)
-    for subscription in subscriptions:
-        subscription.close()
-    recording.finish()
-    log.info("recorded %d messages to %s", recording.recorded.total(), recording.path)
-    return recording
+        process.refresh = refresh
+        process.announce()
+        while not process.stop.wait(PERIOD):
+            recording.save()
+        _until_quiet(inbox, recording)
+        for subscription in subscriptions:
+            subscription.close()
+        recording.finish()
+        log.info("recorded %d messages to %s", recording.recorded.total(), recording.path)
 
 
 def _until_quiet(inbox: Inbox, recording: Recording) -> None:
@@ -271,23 +261,3 @@ def _until_quiet(inbox: Inbox, recording: Recording) -> None:
         time.sleep(QUIET)
         if not inbox.bytes:
             return
-
-
-def main(
-    settings: BusSettings,
-    run: Path,
-    metadata: Metadata,
-    source: str = "recorder",
-    attachments: Attachments | None = None,
-    derive: Derive | None = None,
-    rotation: Rotation | None = None,
-) -> None:
-    """Run the recorder process.
-
-    Args:
-        run: path of the log.
-        metadata, attachments: written to each file of the log.
-        derive: returns additional entries for a sample.
-    """
-    with Process(settings, source) as process:
-        record(process, run, metadata, attachments, derive, rotation)

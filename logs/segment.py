@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import itertools
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -69,12 +70,6 @@ def name_of(path: Path | str, number: int) -> str:
     return f"{path.stem}_{number:04}{path.suffix}" if number else path.name
 
 
-def segments(path: Path) -> Iterator[Path]:
-    """Yield the paths of a run's segments, without end."""
-    for number in itertools.count():
-        yield path.with_name(name_of(path, number))
-
-
 def number_of(path: Path) -> tuple[str, int]:
     """Return the run's name and the segment's number: ("run", 2) for run_0002.mcap, ("run", 0) for run.mcap."""
     numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: the names of earlier versions
@@ -126,14 +121,6 @@ class BufferedFile:
         self._written += len(waiting)
         self._waiting = bytearray()
 
-    def sync(self) -> None:
-        """Wait until the flushed bytes are on the disk. Raises OSError."""
-        os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        """Close the file in the state of the last flush."""
-        self._file.close()
-
 
 class Segment:
     """Writes one MCAP file: one channel per key, self-contained protobuf schemas, zstd chunks.
@@ -151,10 +138,9 @@ class Segment:
         Raises:
             OSError: the disk is full or broken.
         """
-        self.path = path
-        self._spool = BufferedFile(file)
-        output: Any = self._spool  # the writer uses `write`, `tell` and `flush`
-        self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
+        self.path, self._file = path, file
+        self._spool: Any = BufferedFile(file)  # the writer uses `write`, `tell` and `flush`
+        self._writer: Any = mcap.writer.Writer(self._spool, chunk_size=CHUNK)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.empty = True
@@ -170,7 +156,7 @@ class Segment:
     @property
     def size(self) -> int:
         """Size of the file, bytes."""
-        return self._spool.tell()
+        return int(self._spool.tell())
 
     def save(self, entries: Iterable[Entry]) -> int:
         """Write the entries and flush the file, so that only a power cut can lose them.
@@ -210,27 +196,35 @@ class Segment:
             self._writer.finish()
             self._spool.flush()
             if sync:
-                self._spool.sync()
+                os.fsync(self._file.fileno())
         finally:
-            self._spool.close()
+            self._file.close()
 
     def abandon(self) -> None:
         """Close the file without a summary. Remove a file without a message."""
-        self._spool.close()
+        self._file.close()
         if self.empty:
             self.path.unlink(missing_ok=True)
 
     def _channel(self, key: str, kind: type[Message] | str) -> int:
-        if key not in self._channels and isinstance(kind, str):
-            self._channels[key] = self._writer.register_channel(key, kind, NO_SCHEMA)
-        elif key not in self._channels:
-            assert not isinstance(kind, str)
-            name = kind.DESCRIPTOR.full_name
-            if name not in self._schemas:
-                data = build_file_descriptor_set(kind).SerializeToString()
-                self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, data)
-            self._channels[key] = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
+        if key not in self._channels:
+            encoding, schema = (
+                (kind, NO_SCHEMA) if isinstance(kind, str) else (MessageEncoding.Protobuf, self._schema(kind))
+            )
+            self._channels[key] = self._writer.register_channel(key, encoding, schema)
         return self._channels[key]
+
+    def _schema(self, kind: type[Message]) -> int:
+        name = kind.DESCRIPTOR.full_name
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, schema_of(kind))
+        return self._schemas[name]
+
+
+@functools.cache
+def schema_of(kind: type[Message]) -> bytes:
+    """Return the schema of a message type, with the types of its fields."""
+    return bytes(build_file_descriptor_set(kind).SerializeToString())
 
 
 def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None = None) -> Segment:
@@ -240,7 +234,7 @@ def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None 
         OSError: the file cannot be created or the disk is full; no file is left behind.
     """
     run.parent.mkdir(parents=True, exist_ok=True)
-    for path in segments(run):
+    for path in (run.with_name(name_of(run, number)) for number in itertools.count()):
         try:
             file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb", buffering=0)
         except FileExistsError:

@@ -33,5 +33,6 @@ class RecorderCommand:
 
         metadata = {"versions": {"brakeline": version("brakeline")}}
         derive = derive_entries(self.pictures)
-        recorder.main(self.endpoints.bus(), self.log, metadata, self.name, derive=derive, rotation=self.rotation)
+        settings = recorder.LogSettings(self.log, metadata, derive=derive, rotation=self.rotation)
+        recorder.main(self.endpoints.bus(), settings, self.name)
         return 0

@@ -39,7 +39,8 @@ def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettin
     robots = RecordedRobots(robot_maybe_with_task(name) for name in config.robots)
     derive = derive_entries(config.pictures, robots)
     files = attachments(config, folder)
-    recorder.main(bus, folder / LOG, metadata(config), spec.name, files, derive, config.rotation)
+    settings = recorder.LogSettings(folder / LOG, metadata(config), files, derive, config.rotation)
+    recorder.main(bus, settings, spec.name)
     return False
 
 

@@ -10,12 +10,10 @@ from typing import Any, Self
 
 import foxglove
 from foxglove.websocket import ServerListener
-from google.protobuf.message import Message
-from mcap_protobuf.schema import build_file_descriptor_set
 
 from brakeline.logs.foxglove import ROOT, FoxgloveConverter
 from brakeline.logs.recorder import entry as stored_entry
-from brakeline.logs.segment import Entry
+from brakeline.logs.segment import Entry, schema_of
 from brakeline.logs.watch.websocket_gate import WebSocketGate, hidden_host
 from brakeline.messaging.bus import Sample
 
@@ -43,7 +41,6 @@ class FoxgloveServer:
         self._converter = FoxgloveConverter(rate)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        self._schemas: dict[str, foxglove.Schema] = {}
         self._arenas: dict[str, Entry] = {}  # the latest arena of each actor, for viewers that connect later
         self._subscribed: deque[str] = deque()
 
@@ -84,18 +81,12 @@ class FoxgloveServer:
     def _log(self, entry: Entry) -> None:
         if entry.key not in self._channels:
             assert not isinstance(entry.type, str), "every published message has a schema"
-            schema = self._schema(entry.type)
+            name, data = entry.type.DESCRIPTOR.full_name, schema_of(entry.type)
+            schema = foxglove.Schema(name=name, encoding="protobuf", data=data)
             self._channels[entry.key] = foxglove.Channel(
                 entry.key, message_encoding="protobuf", schema=schema, context=self._context
             )
         self._channels[entry.key].log(entry.payload, log_time=entry.log_time)
-
-    def _schema(self, kind: type[Message]) -> foxglove.Schema:
-        name = kind.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            data = build_file_descriptor_set(kind).SerializeToString()
-            self._schemas[name] = foxglove.Schema(name=name, encoding="protobuf", data=data)
-        return self._schemas[name]
 
 
 class _Listener(ServerListener):

@@ -38,9 +38,10 @@ from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
 from brakeline.logs.foxglove import RATE
 from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis
 from brakeline.logs.reader import Log
-from brakeline.logs.recorder import Inbox, Recording, Rotation
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.report_page import render
-from brakeline.logs.segment import Metadata, Segment
+from brakeline.logs.segment import Attachments, Metadata, Segment
+from brakeline.logs.segment_rotation import Rotation
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
@@ -115,12 +116,12 @@ def recorder(folder: Path) -> Party:
     """Record into a file that begins anew all the time, so that the disk does not fill up."""
     path, rejected, inbox = folder / "fuzz.mcap", RejectedMessages(), Inbox()
 
-    def open_one(run: Path, metadata: Metadata) -> Segment:
+    def open_one(run: Path, metadata: Metadata, attachments: Attachments) -> Segment:
         path.unlink(missing_ok=True)
         return Segment(path, path.open("wb", buffering=0), metadata)
 
-    derive = derive_entries(RATE)
-    recording = Recording(path, {}, inbox, open_one, derive, Rotation(mib=16.0), rejected)
+    settings = LogSettings(path, derive=derive_entries(RATE), rotation=Rotation(mib=16.0), open_segment=open_one)
+    recording = Recording(settings, inbox, rejected)
 
     def take(sample: Sample) -> None:
         inbox.put(sample)

@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 import brakeline.logs
 from brakeline.logs import foxglove_scene
 from brakeline.logs.foxglove import ArenaLayout, FoxgloveConverter
-from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
@@ -226,7 +226,7 @@ def test_a_message_that_cannot_be_drawn_costs_its_picture_only(say: Say, caplog:
 
 def test_a_recording_has_the_pictures_beside_the_messages(say: Say, tmp_path: Path) -> None:
     inbox = Inbox()
-    recording = Recording(tmp_path / "run.mcap", {}, inbox, derive=FoxgloveConverter(math.inf).from_sample)
+    recording = Recording(LogSettings(tmp_path / "run.mcap", derive=FoxgloveConverter(math.inf).from_sample), inbox)
     messages = [("episode", episode()), ("exchange", exchange(0)), ("step", step(0))]
     for topic, message in messages:
         inbox.put(say(f"{topic}/ground/actor-0", message))

@@ -20,8 +20,9 @@ from brakeline.deploy.cli import main
 from brakeline.errors import LogError
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import Log, open_log
-from brakeline.logs.recorder import Inbox, Recording, Rotation, malformed_entry
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import being_written, open_segment
+from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.free_ports import free_endpoint
@@ -35,9 +36,10 @@ KILLS = 10
 RECORDER = """
 import sys
 from pathlib import Path
-from brakeline.logs.recorder import Rotation, main
+from brakeline.logs.recorder import LogSettings, Rotation, main
 from brakeline.messaging.bus import BusSettings
-main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"seed": "3"}}, rotation=Rotation(0.02, 1.5))
+settings = LogSettings(Path(sys.argv[2]), {"run": {"seed": "3"}}, rotation=Rotation(0.02, 1.5))
+main(BusSettings(connect=(sys.argv[1],)), settings)
 """
 
 
@@ -143,7 +145,7 @@ def test_files_rotate_by_size_and_by_time_and_each_is_whole(
     now = [100.0]
     monkeypatch.setattr("brakeline.logs.recorder.time.monotonic", lambda: now[0])
     inbox = Inbox()
-    recording = Recording(tmp_path / "run.mcap", ABOUT, inbox, rotation=Rotation(mib=0.02, seconds=60.0))
+    recording = Recording(LogSettings(tmp_path / "run.mcap", ABOUT, rotation=Rotation(0.02, 60.0)), inbox)
     for _ in range(12):
         inbox.put(say("log/a", pb.LogLine(text=os.urandom(2000).hex())))
         recording.save()
@@ -204,7 +206,3 @@ def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(rou
         assert found == list(range(first, first + len(found))), "none is missing in between, or twice"
         old = sum(at < killed - 1.0 for at in dated)
         assert len(found) >= old, f"kill {number}: {old - len(found)} older than a second are missing"
-
-
-def test_entries_of_malformed_messages_have_their_bytes() -> None:
-    assert malformed_entry(Sample(STEP, "step/ground/a", b"\xff", 7)).payload == b"\xff"

@@ -18,7 +18,7 @@ from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
-from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import MOST_CHANNELS, Entry
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
@@ -46,7 +46,7 @@ HOSTILE = [
 
 def record(path: Path, samples: list[Sample], rejected: RejectedMessages | None = None) -> Recording:
     inbox = Inbox()
-    recording = Recording(path, {}, inbox, derive=FoxgloveConverter().from_sample, rejected=rejected)
+    recording = Recording(LogSettings(path, derive=FoxgloveConverter().from_sample), inbox, rejected)
     for one in samples:
         inbox.put(one)
     recording.finish()

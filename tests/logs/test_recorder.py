@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 from brakeline.logs import recorder
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import open_log, read
-from brakeline.logs.recorder import Inbox, Recording, malformed_entry
-from brakeline.logs.segment import Entry, Metadata, Segment, name_of, open_segment
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.segment import Attachments, Entry, Metadata, Segment, name_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.free_ports import free_endpoint
@@ -30,9 +30,9 @@ Start = Callable[[Path], "subprocess.Popen[bytes]"]
 RECORDER = """
 import sys
 from pathlib import Path
-from brakeline.logs.recorder import main
+from brakeline.logs.recorder import LogSettings, main
 from brakeline.messaging.bus import BusSettings
-main(BusSettings(connect=(sys.argv[1],)), Path(sys.argv[2]), {"run": {"method": "none"}})
+main(BusSettings(connect=(sys.argv[1],)), LogSettings(Path(sys.argv[2]), {"run": {"method": "none"}}))
 """
 
 
@@ -140,7 +140,7 @@ class SmallDisk:
     def __init__(self, free: int) -> None:
         self.free = free
 
-    def open_segment(self, run: Path, metadata: Metadata) -> Segment:
+    def open_segment(self, run: Path, metadata: Metadata, attachments: Attachments) -> Segment:
         segment = open_segment(run.with_suffix(".probe"), {})  # a free name is found on the real disk
         segment.abandon()
         number = len(list(run.parent.glob("*.mcap")))
@@ -186,7 +186,7 @@ def test_recording_survives_a_full_disk_and_resumes(
     monkeypatch.setattr("brakeline.logs.recorder.RETRY", 0.0)
     disk = SmallDisk(30_000)
     inbox = Inbox(limit=100_000)
-    recording = Recording(tmp_path / "run.mcap", {}, inbox, disk.open_segment)
+    recording = Recording(LogSettings(tmp_path / "run.mcap", open_segment=disk.open_segment), inbox)
     lines = [say("log/a", pb.LogLine(text=os.urandom(500).hex())) for _ in range(300)]
     for number, line in enumerate(lines):
         if number == 290:
@@ -214,7 +214,7 @@ def test_a_disk_that_stays_full_is_reported_at_the_end(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture
 ) -> None:
     inbox = Inbox()
-    recording = Recording(tmp_path / "run.mcap", {}, inbox, SmallDisk(0).open_segment)
+    recording = Recording(LogSettings(tmp_path / "run.mcap", open_segment=SmallDisk(0).open_segment), inbox)
     inbox.put(say("log/a", pb.LogLine(text="x")))
     recording.finish()
     assert "could not be recorded" in caplog.text
@@ -233,7 +233,7 @@ def test_pictures_that_take_too_long_cost_no_message(
         return [Entry(f"picture/{sample.key}", pb.LogLine, sample.payload, sample.received, sample.received, 0)]
 
     inbox = Inbox()
-    recording = Recording(tmp_path / "run.mcap", {}, inbox, derive=drawn)
+    recording = Recording(LogSettings(tmp_path / "run.mcap", derive=drawn), inbox)
     for number in range(100):
         inbox.put(say("log/a", pb.LogLine(text=f"{number}")))
     recording.finish()
@@ -249,11 +249,6 @@ def _keys(path: Path) -> list[str]:
 
 def test_a_folder_that_cannot_be_written_is_a_failure_too(tmp_path: Path, say: Say) -> None:
     (tmp_path / "file").touch()
-    recording = Recording(tmp_path / "file" / "run.mcap", {}, Inbox())
+    recording = Recording(LogSettings(tmp_path / "file" / "run.mcap"), Inbox())
     recording.save()
     assert "Not a directory" in recording.failure or "File exists" in recording.failure
-
-
-def test_a_message_that_cannot_be_decoded_is_stored_all_the_same() -> None:
-    stored = malformed_entry(Sample(STEP, "step/ground/a", b"\xff", 7))
-    assert (stored.payload, stored.log_time, stored.publish_time, stored.sequence) == (b"\xff", 7, 7, 0)

@@ -13,7 +13,7 @@ from brakeline.deploy.run.mavlink_json import ENCODING, frames_as_json
 from brakeline.errors import ExportError, Malformed
 from brakeline.logs.log_export import to_tlog
 from brakeline.logs.reader import read
-from brakeline.logs.recorder import Inbox, Recording
+from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import FRAMES, LOG
@@ -51,7 +51,7 @@ def taped(periods: int) -> Bus:
 
 def test_a_recorder_stores_bytes_and_json(tmp_path: Path) -> None:
     bus = taped(3)
-    recording = Recording(tmp_path / "run.mcap", {}, bus.inbox, derive=frames_as_json)
+    recording = Recording(LogSettings(tmp_path / "run.mcap", derive=frames_as_json), bus.inbox)
     recording.save()
     recording.finish()
 
