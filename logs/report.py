@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -9,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.logs.console_tables import PLAIN, StackingTable
-from brakeline.logs.episode_stats import CONTACTS
+from brakeline.logs.episode_stats import CONTACTS, KINDS
 from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.metrics import Figures
 from brakeline.logs.reader import Paths
@@ -38,25 +39,17 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
         verbose: also show the metadata of the log.
     """
     several = len(figures.get("runs", {})) > 1
-    parts: list[RenderableType] = [_runs(figures["runs"]) if several else _summary(figures)]
-    if not several:
-        parts += _times(figures)
+    parts = [_runs(figures["runs"])] if several else [_table((), _summary(figures)), *_times(figures)]
     parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
     if figures.get("processes") and figures.get("topics"):
         parts.append(_processes(figures["processes"]))
     if figures.get("topics"):
-        parts.append(_topics(figures["topics"]))
+        counts = ("messages", "missing", "duplicates")
+        rows = [(key, *(str(topic[name]) for name in counts)) for key, topic in figures["topics"].items()]
+        parts.append(_table(("topic", *counts), rows))
     if verbose and figures.get("metadata"):
         parts.append(_metadata(figures["metadata"]))
-    parts += [Text(cut, "yellow") for cut in figures.get("cuts", ())]
-    return Group(*parts)
-
-
-def _times(figures: Figures) -> list[RenderableType]:
-    """Format decision times: by part if the log has the exchanges."""
-    if any(part for parts in figures.get("latency_ms", {}).values() for part in parts.values()):
-        return [_latency(figures["latency_ms"])]
-    return [_decisions(figures["decision_ms"])] if figures.get("decision_ms") else []
+    return Group(*parts, *(Text(cut, "yellow") for cut in figures.get("cuts", ())))
 
 
 def show_episode(episode: Figures) -> RenderableType:
@@ -66,61 +59,59 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
-    table = StackingTable(
-        "step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why", **PLAIN
-    )
-    for row in episode["rows"]:
-        table.add_row(
+    columns = ("step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why")
+    rows = [
+        (
             str(row["step"]),
-            _vector(row["state"][:2]),
-            _vector(row["proposed"]),
-            _vector(row["action"]),
+            *(" ".join(f"{value:.2f}" for value in row[name]) for name in ("state", "proposed", "action")),
             row["decision"] or "-",
             _optional("{:.2f}", row["decide_ms"]),
             _optional("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
             f"{row['clearance']:.3f}",
             row["said"] or row["reason"] or "",
         )
-    return Group(Text(title, "bold"), table)
+        for row in (row | {"state": row["state"][:2]} for row in episode["rows"])
+    ]
+    return Group(Text(title, "bold"), _table(columns, rows))
 
 
-def _vector(values: list[float]) -> str:
-    return " ".join(f"{value:.2f}" for value in values)
+def _table(columns: Sequence[str], rows: Iterable[Sequence[RenderableType]]) -> Table:
+    """Return a table; without `columns`, rows of a name and a value."""
+    table = StackingTable(*columns, show_header=bool(columns), **PLAIN)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
-def _summary(figures: Figures) -> Table:
-    table = StackingTable(show_header=False, **PLAIN)
+def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
+    """Yield a name and a value of each figure of one run."""
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
     if setup:
-        table.add_row("configuration", ", ".join(setup))
-    table.add_row("steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s")))
-    table.add_row("episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"]))
-    touched = CONTACTS if figures["fleet"] else CONTACTS[:2]
-    for name in ("goals", "collisions", *touched, "timeouts"):
-        table.add_row(name.replace("_", " "), _share(figures[name], episodes, within.get(name)))
+        yield "configuration", ", ".join(setup)
+    yield "steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s"))
+    yield "episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"])
+    for name in ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts"):
+        yield name.replace("_", " "), _share(figures[name], episodes, within.get(name))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
-    table.add_row("interventions", f"{interventions}, {figures['failsafes']} of them failsafe")
-    table.add_row("adjusted", _share(figures["adjusted"], steps))
-    table.add_row("adjusted for clearance", for_clearance(figures))
-    table.add_row(
-        "speed",
-        _optional("{:.3f} m/s", figures["mean_speed"]) + _optional(", at most {:.3f} m/s", figures["max_speed"]),
-    )
-    table.add_row("closest approach", _optional("{:.3f} m, to fixed obstacles", figures.get("closest_approach")))
+    yield "interventions", f"{interventions}, {figures['failsafes']} of them failsafe"
+    yield "adjusted", _share(figures["adjusted"], steps)
+    yield "adjusted for clearance", for_clearance(figures)
+    mean, most = figures["mean_speed"], figures["max_speed"]
+    yield "speed", _optional("{:.3f} m/s", mean) + _optional(", at most {:.3f} m/s", most)
+    yield "closest approach", _optional("{:.3f} m, to fixed obstacles", figures.get("closest_approach"))
     containment = figures["containment"]
     outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
-    table.add_row("outside the predicted set", outside)
+    yield "outside the predicted set", outside
     if figures["recovering"]:
-        table.add_row("recovering", _share(figures["recovering"], steps))
+        yield "recovering", _share(figures["recovering"], steps)
     if figures["broken"]:
-        table.add_row("obstacles outside their bounds", str(figures["broken"]))
-    table.add_row("outside the measurement bound", _share(figures["outside"], steps))
-    _add_safety(table, figures)
+        yield "obstacles outside their bounds", str(figures["broken"])
+    yield "outside the measurement bound", _share(figures["outside"], steps)
+    yield from _safety_rows(figures)
     for robot, learner in figures.get("learners", {}).items():
-        table.add_row(f"learner {robot}", LEARNER.format(**learner))
-    return table
+        yield f"learner {robot}", LEARNER.format(**learner)
 
 
 def for_clearance(figures: Figures) -> str:
@@ -130,29 +121,26 @@ def for_clearance(figures: Figures) -> str:
     return f"{figures['for_clearance']} of {figures['adjusted']} adjusted proposals were verified themselves"
 
 
-def _add_safety(table: Table, figures: Figures) -> None:
-    """Add the rows that need the exchanges with the safety service."""
+def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
+    """Yield the rows that need the exchanges with the safety service."""
     if figures.get("round_trip_ms"):
-        table.add_row("request to reply", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"]))
+        yield "request to reply", "p50 {p50:.2f} ms, p99 {p99:.2f} ms".format(**figures["round_trip_ms"])
     for reason, count in figures.get("no_decision", {}).items():
-        table.add_row("no decision", f"{count}: {reason}")
+        yield "no decision", f"{count}: {reason}"
     if figures.get("tube_half_width"):
-        table.add_row("tube half-width", "p50 {p50:.4f} m, at most {max:.4f} m".format(**figures["tube_half_width"]))
+        yield "tube half-width", "p50 {p50:.4f} m, at most {max:.4f} m".format(**figures["tube_half_width"])
     solver = figures.get("solver") or {}
     if solver.get("programs"):
         statuses = ", ".join(f"{status} {count}" for status, count in solver["statuses"].items())
         iterations = "iterations p50 {p50:.0f}, at most {max:.0f}".format(**solver["iterations"])
-        table.add_row(
-            "solver", f"{solver['programs']} programs, {solver['failures']} failed ({statuses}); {iterations}"
-        )
+        yield "solver", f"{solver['programs']} programs, {solver['failures']} failed ({statuses}); {iterations}"
     plans = figures.get("plans") or {}
     if plans.get("flown"):
         outside = f"{_share(plans['outside'], plans['flown'])}; {stated(plans)}"
-        table.add_row("verified plans that were followed", f"{plans['flown']}, left their tube: {outside}")
-    if figures.get("unverified"):
-        table.add_row("[red]unverified failsafes[/]", str(figures["unverified"]))
-    if figures.get("not_finite"):
-        table.add_row("[red]proposals with NaN or infinity[/]", str(figures["not_finite"]))
+        yield "verified plans that were followed", f"{plans['flown']}, left their tube: {outside}"
+    for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):
+        if figures.get(name):
+            yield f"[red]{label}[/]", str(figures[name])
 
 
 LEARNER = (
@@ -163,66 +151,61 @@ LEARNER = (
 
 def _runs(runs: dict[str, Figures]) -> Table:
     """Format one row for each of several runs."""
-    columns = (
-        "method",
-        "certificate",
-        "perception",
-        "seed",
-        "steps",
-        "episodes",
-        "goals",
-        "collisions",
-        "interventions",
-        "reward",
-    )
-    table = StackingTable("run", *columns, **PLAIN)
-    for label, run in runs.items():
-        setup = [
-            "-" if run[name] is None else str(run[name]) for name in ("method", "certificate", "perception", "seed")
-        ]
-        episodes = run["episodes"]
-        ends = [_share(run[name], episodes) for name in ("goals", "collisions")]
-        stopped = _share(run["interventions"], run["steps"])
-        reward = _optional("{:.1f}", run["mean_reward"])
-        table.add_row(label, *setup, str(run["steps"]), str(episodes), *ends, stopped, reward)
-    return table
+    setup, ends = ("method", "certificate", "perception", "seed"), ("goals", "collisions")
+    rows = [
+        (
+            label,
+            *("-" if run[name] is None else str(run[name]) for name in setup),
+            str(run["steps"]),
+            str(run["episodes"]),
+            *(_share(run[name], run["episodes"]) for name in ends),
+            _share(run["interventions"], run["steps"]),
+            _optional("{:.1f}", run["mean_reward"]),
+        )
+        for label, run in runs.items()
+    ]
+    return _table(("run", *setup, "steps", "episodes", *ends, "interventions", "reward"), rows)
 
 
-def _decisions(times: Figures) -> Table:
-    table = StackingTable("decision [ms]", "mean", "std", "p50", "p99", **PLAIN)
-    for kind in ("all", "allowed", "adjusted", "failsafe", "recovering"):
-        row = times if kind == "all" else times[kind]
-        if row is not None:
-            table.add_row(kind, *(f"{row[name]:.3f}" for name in ("mean", "std", "p50", "p99")))
-    return table
-
-
-def _latency(latency: Figures) -> Table:
-    """Format the latency by kind of decision and part."""
+def _times(figures: Figures) -> list[Table]:
+    """Format decision times: by part if the log has the exchanges."""
     columns = ("mean", "std", "p50", "p90", "p99", "max")
-    table = StackingTable("decision [ms]", "part", *columns, **PLAIN)
-    for kind, parts in latency.items():
-        for part, row in parts.items():
-            if row is not None:
-                first = f"{kind} ({row['count']})" if part == "round_trip" else ""
-                table.add_row(first, part.replace("_", " "), *(f"{row[name]:.3f}" for name in columns))
-    return table
+    rows = [
+        [
+            f"{kind} ({row['count']})" if part == "round_trip" else "",
+            part.replace("_", " "),
+            *_milliseconds(row, columns),
+        ]
+        for kind, times in figures.get("latency_ms", {}).items()
+        for part, row in times.items()
+        if row is not None
+    ]
+    if rows:
+        return [_table(("decision [ms]", "part", *columns), rows)]
+    if not (times := figures.get("decision_ms")):
+        return []
+    columns = ("mean", "std", "p50", "p99")
+    kinds = {"all": times, **{kind: times[kind] for kind in KINDS.values()}}
+    rows = [[kind, *_milliseconds(row, columns)] for kind, row in kinds.items() if row is not None]
+    return [_table(("decision [ms]", *columns), rows)]
+
+
+def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:
+    return [f"{row[name]:.3f}" for name in columns]
 
 
 def _training(robot: str, training: Figures) -> Table:
     """Format the learning curves as sparklines."""
-    bins = _coarse(training["bins"], 60)
-    table = StackingTable(f"{robot} over training", "first", "last", "", **PLAIN)
-    for label, name in (("interventions", "interventions"), ("goals", "goals"), ("reward", "reward")):
+    bins, rows = _coarse(training["bins"], 60), []
+    for name in ("interventions", "goals", "reward"):
         values = [row[name] for row in bins if row[name] is not None]
         if values:
-            table.add_row(label, f"{values[0]:.3g}", f"{values[-1]:.3g}", _sparkline(values))
+            rows.append((name, f"{values[0]:.3g}", f"{values[-1]:.3g}", _sparkline(values)))
     stale = training["staleness"]
     if stale is not None and stale["max"] > 0:
-        table.add_row(
-            "weights behind", "", "", "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
-        )
-    return table
+        versions = "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
+        rows.append(("weights behind", "", "", versions))
+    return _table((f"{robot} over training", "first", "last", ""), rows)
 
 
 def _coarse(bins: list[Figures], most: int) -> list[Figures]:
@@ -232,14 +215,13 @@ def _coarse(bins: list[Figures], most: int) -> list[Figures]:
     for start in range(0, len(bins), per):
         part = bins[start : start + per]
         steps, episodes = sum(row["steps"] for row in part), sum(row["episodes"] for row in part)
+        interventions = sum((row["adjusted"] + row["failsafes"]) * row["steps"] for row in part) / steps
         ended = [row for row in part if row["episodes"]]
-        rows.append(
-            {"interventions": sum((row["adjusted"] + row["failsafes"]) * row["steps"] for row in part) / steps}
-            | {
-                name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None
-                for name in ("goals", "reward")
-            }
-        )
+        means = {
+            name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None
+            for name in ("goals", "reward")
+        }
+        rows.append({"interventions": interventions, **means})
     return rows
 
 
@@ -250,30 +232,20 @@ def _sparkline(values: list[float]) -> str:
 
 
 def _processes(processes: Figures) -> Table:
-    table = StackingTable("process", "starts", "alive, s", "messages/s", "silences", "ended", **PLAIN)
+    rows = []
     for name, process in processes.items():
-        rate = _optional("{:.1f}", process["messages_per_s"])
-        longest = process["longest_silence"]
-        silences = f"{process['silences']}" + (f" (longest {longest:.1f} s)" if process["silences"] else "")
+        longest = f" (longest {process['longest_silence']:.1f} s)" if process["silences"] else ""
+        seconds, rate = f"{process['seconds']:.1f}", _optional("{:.1f}", process["messages_per_s"])
         ended = process["notes"].get("died of", process["ended"])
-        table.add_row(name, str(process["starts"]), f"{process['seconds']:.1f}", rate, silences, ended)
-    return table
-
-
-def _topics(topics: dict[str, dict[str, int]]) -> Table:
-    table = StackingTable("topic", "messages", "missing", "duplicates", **PLAIN)
-    for key, counts in topics.items():
-        table.add_row(key, *(str(counts[name]) for name in ("messages", "missing", "duplicates")))
-    return table
+        rows.append((name, str(process["starts"]), seconds, rate, f"{process['silences']}{longest}", ended))
+    return _table(("process", "starts", "alive, s", "messages/s", "silences", "ended"), rows)
 
 
 def _metadata(metadata: Figures) -> Table:
     """Format the metadata, without the configuration, which is long: --json and --html have it."""
-    table = StackingTable("metadata", "", **PLAIN)
-    for name, values in metadata.items():
-        if name != "configuration" and isinstance(values, dict):
-            table.add_row(name, Text(", ".join(f"{key} {value}" for key, value in values.items())))
-    return table
+    groups = {name: values for name, values in metadata.items() if name != "configuration" and isinstance(values, dict)}
+    rows = [(name, Text(", ".join(f"{k} {v}" for k, v in values.items()))) for name, values in groups.items()]
+    return _table(("metadata", ""), rows)
 
 
 def _share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:

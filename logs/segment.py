@@ -208,13 +208,13 @@ class Segment:
 
     def _channel(self, key: str, kind: type[Message] | str) -> int:
         if key not in self._channels:
-            encoding, schema = (
-                (kind, NO_SCHEMA) if isinstance(kind, str) else (MessageEncoding.Protobuf, self._schema(kind))
-            )
-            self._channels[key] = self._writer.register_channel(key, encoding, schema)
+            encoding = kind if isinstance(kind, str) else MessageEncoding.Protobuf
+            self._channels[key] = self._writer.register_channel(key, encoding, self._schema(kind))
         return self._channels[key]
 
-    def _schema(self, kind: type[Message]) -> int:
+    def _schema(self, kind: type[Message] | str) -> int:
+        if isinstance(kind, str):
+            return NO_SCHEMA
         name = kind.DESCRIPTOR.full_name
         if name not in self._schemas:
             self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, schema_of(kind))
