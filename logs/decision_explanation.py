@@ -18,6 +18,7 @@ LEAST = 0.02  # of an input's range: smaller changes are not described
 AHEAD = math.radians(40.0)
 BEHIND = math.radians(140.0)
 UPRIGHT = 0.8  # vertical part of a unit vector above which a direction counts as up or down
+NO_ANSWER = "no answer in time: braked along the plan verified before"  # the sentence for a step without a decision
 NEARER = "verified, but nearer than the clearance margin"
 ARROW = 3  # periods: an arrow ends where the input would take the robot in that time without delay
 
@@ -44,11 +45,20 @@ class Explanation:
     trust: str = ""
 
 
-def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation:
-    """Explain a decision. A proposal with NaN or infinity has an arrow of length zero."""
+def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation | None:
+    """Explain a decision; None if the messages do not have the robot's dimensions.
+
+    A proposal with NaN or infinity has an arrow of length zero.
+    """
+    sizes = len(request.state), len(request.action), len(decision.plan)
+    edge = {len(decision.stopped.normal), len(decision.stopped.at)}
+    whole = sizes == (robot.state_dim, robot.action_dim, robot.horizon * robot.action_dim)
+    if not whole or edge not in ({0}, {robot.position_dim}):
+        return None
     proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
     heading = 0.0 if robot.heading is None else request.state[robot.heading]
     names = [split(label) for label in robot.action]
+    said_already = decision.kind in (pb.FAILSAFE, pb.RECOVERING)
     return Explanation(
         sentence(robot, request, decision),
         [(*name, float(p), float(e)) for name, p, e in zip(names, proposed, executed, strict=True)],
@@ -56,23 +66,13 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
         arrow(robot, heading, executed),
         np.array(decision.stopped.at),
         np.array(decision.stopped.normal),
-        ""
-        if decision.kind in (pb.FAILSAFE, pb.RECOVERING)
-        else describe_verification(decision.verified, bound_in(decision)),
+        "" if said_already else describe_verification(decision.verified, bound_in(decision)),
     )
 
 
 def bound_in(decision: pb.Decision) -> float | None:
     """Return the bound that the model set states; None if the decision has none."""
     return valid_bound(decision.bound) if decision.HasField("bound") else None
-
-
-def fits(robot: Robot, request: pb.Request, decision: pb.Decision) -> bool:
-    """Return whether request and decision have the robot's dimensions; otherwise they cannot be explained."""
-    sizes = len(request.state), len(request.action), len(decision.plan)
-    edge = {len(decision.stopped.normal), len(decision.stopped.at)}
-    whole = sizes == (robot.state_dim, robot.action_dim, robot.horizon * robot.action_dim)
-    return whole and edge in ({0}, {robot.position_dim})
 
 
 def split(label: str) -> tuple[str, str]:
@@ -108,25 +108,20 @@ def sentence(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         did, instead = change(robot, np.array(request.action), np.array(decision.plan[: robot.action_dim]))
         return f"{did}: {instead}, {why}" if why else f"{did}: {decision.reason}"
     if decision.kind == pb.FAILSAFE:
-        how = fell_back_on(decision) if decision.verified else "braked, though no plan is verified"
+        how = _fell_back_on(decision) if decision.verified else "braked, though no plan is verified"
         return f"{how}: as proposed, {why}" if why else f"{how}: {decision.reason}"
     if decision.kind == pb.RECOVERING:
         return f"slowly backs out of where not even standing is verified: as proposed, {why or decision.reason}"
     return "as proposed"
 
 
-def fell_back_on(decision: pb.Decision) -> str:
+def _fell_back_on(decision: pb.Decision) -> str:
     """Say that the robot follows the committed plan, and what the plan's verification is worth."""
     bound = bound_in(decision)
     if bound is None:
         return "braked along the plan verified before"
     worth = "no bound is stated" if bound == UNSTATED else f"at most {percent(bound)} of such plans leave their tube"
     return f"braked along the plan verified before ({worth})"
-
-
-def fell_back() -> str:
-    """Return the sentence for a step without a decision."""
-    return "no answer in time: braked along the plan verified before"
 
 
 def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
@@ -148,10 +143,8 @@ def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         return f"{place} is touched already"
     if stopped.room < 0.0:
         return f"{what} would have come {_length(-stopped.room)} too close to {place}"
-    within = f"{what} would have come within {_length(stopped.room)} of {place}"
-    if decision.for_clearance:
-        return f"{within}: {NEARER}"
-    return f"{within}, too near to move from there"
+    worth = f": {NEARER}" if decision.for_clearance else ", too near to move from there"
+    return f"{what} would have come within {_length(stopped.room)} of {place}{worth}"
 
 
 def _length(metres: float) -> str:
@@ -187,32 +180,21 @@ def _where(robot: Robot, request: pb.Request, stopped: pb.Stopped) -> str:
 def change(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
     """Return the executed action and a name for the proposal: ("turned left", "straight on")."""
     width = robot.high() - robot.low()
-    difference = (executed - proposed) / np.where(width > 0.0, width, 1.0)
-    if np.abs(difference).max() < LEAST:
-        return "changed it a little", "as proposed"
-    if robot.heading is not None:
-        return _describe_turning(robot, proposed, executed, difference)
-    return _describe_velocity(_moves(robot, proposed), _moves(robot, executed)) or _describe_input(
-        robot, proposed, executed
-    )
-
-
-def _describe_turning(robot: Robot, proposed: Array, executed: Array, difference: Array) -> tuple[str, str]:
-    """Describe the change for a robot with a heading: some inputs translate it, the others turn it."""
-    most = int(np.abs(difference).argmax())
-    turns = [i for i, moves in enumerate(robot.translates) if not moves]
-    if most in turns:
-        way = "turned left" if executed[most] > proposed[most] else "turned right"
-        straight = abs(proposed[most]) < LEAST * (robot.high()[most] - robot.low()[most])
-        return way, "straight on" if straight else "as proposed"
-    if sum(robot.translates) > 1:  # a vector, as it looks
-        return _describe_velocity(_moves(robot, proposed), _moves(robot, executed)) or _describe_input(
-            robot, proposed, executed
-        )
+    difference = np.abs(executed - proposed) / np.where(width > 0.0, width, 1.0)
+    most = int(difference.argmax())  # the input that changed most
     before, now = proposed[most], executed[most]
+    small = LEAST * width[most]
+    if difference[most] < LEAST:
+        return "changed it a little", "as proposed"
+    if robot.heading is not None and not robot.translates[most]:
+        return f"turned {'left' if now > before else 'right'}", "straight on" if abs(before) < small else "as proposed"
+    if robot.heading is None or sum(robot.translates) > 1:
+        by_velocity = _describe_velocity(_moves(robot, proposed), _moves(robot, executed))
+        name, unit = split(robot.action[most])
+        return by_velocity or (f"{name} {before:.2f} became {now:.2f} {unit}".rstrip(), "as proposed")
     if before * now < 0.0:
         return ("backed off" if now < 0.0 else "went forward"), "as proposed"
-    if abs(now) < LEAST * (robot.high()[most] - robot.low()[most]):
+    if abs(now) < small:
         return "stopped", "going on"
     return ("slowed down" if abs(now) < abs(before) else "sped up"), "as proposed"
 
@@ -237,11 +219,3 @@ def _describe_velocity(before: Array, now: Array) -> tuple[str, str] | None:
         return ("climbed" if aside[2] > 0.0 else "sank"), "straight on"
     left = before[0] * now[1] - before[1] * now[0] > 0.0
     return f"turned aside to the {'left' if left else 'right'}", "straight on"
-
-
-def _describe_input(robot: Robot, proposed: Array, executed: Array) -> tuple[str, str]:
-    """Describe the input that changed most."""
-    width = robot.high() - robot.low()
-    most = int(np.abs((executed - proposed) / np.where(width > 0.0, width, 1.0)).argmax())
-    name, unit = split(robot.action[most])
-    return f"{name} {proposed[most]:.2f} became {executed[most]:.2f} {unit}".rstrip(), "as proposed"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.logs.decision_explanation import Explanation, explain, fits
+from brakeline.logs.decision_explanation import Explanation, explain
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
@@ -81,12 +81,11 @@ def decision_view(
         return DecisionView(exchange, centers, half_widths, None, None, np.zeros((0, 5)))
     if len(centers) > robot.horizon:
         raise ValueError(f"a tube has {len(centers)} boxes; the horizon is {robot.horizon} periods")
-    fitting = exchange.reply.HasField("decision") and fits(robot, request, decision)
     return DecisionView(
         exchange,
         centers,
         half_widths,
-        explain(robot, request, decision) if fitting else None,
+        explain(robot, request, decision),
         map_for_display(robot, request, corners),
         np.concatenate(boxes) if boxes else np.zeros((0, 2 * robot.position_dim + 1)),
     )

@@ -92,13 +92,15 @@ class EpisodeSampler:
     """Select episodes of one robot kind.
 
     Attributes:
+        label: prefix of the run.
         wanted: number of an episode that is always selected, of every actor or only of `actor`.
         requested_episodes: the episodes with this number, with all their steps.
     """
 
-    def __init__(self, robot: Robot | None, wanted: int | None = None, actor: str | None = None) -> None:
-        self.robot = robot
-        self.label = ""
+    def __init__(
+        self, robot: Robot | None, label: str = "", wanted: int | None = None, actor: str | None = None
+    ) -> None:
+        self.robot, self.label = robot, label
         self.wanted, self.actor = wanted, actor
         self.requested_episodes: list[Figures] = []
         self.last: EpisodeRecord | None = None
@@ -113,10 +115,7 @@ class EpisodeSampler:
     def source(self, name: str) -> ActorBuffer:
         """Return the buffer of an actor; create it for a new actor."""
         name = self.label + name
-        source = self._sources.get(name)
-        if source is None:
-            source = self._sources[name] = ActorBuffer()
-        return source
+        return self._sources.setdefault(name, ActorBuffer())
 
     def step(self, source: ActorBuffer, step: pb.Step) -> None:
         """Add a step. An episode is evaluated when the next one begins, because exchanges may follow their steps."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from brakeline.logs.decision_explanation import bound_in, explain, fell_back, fits
+from brakeline.logs.decision_explanation import NO_ANSWER, bound_in, explain
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures
 from brakeline.logs.json_values import rounded
@@ -70,7 +70,7 @@ def rows(episode: EpisodeRecord, robot: Robot | None) -> Iterable[Figures]:
             "action": list(step.action),
             "decision": "no decision" if step.fallback else KINDS.get(step.decision),
             "reason": decision.reason if decision is not None else None,
-            "said": fell_back() if step.fallback else _explanation(exchange, robot),
+            "said": NO_ANSWER if step.fallback else _explanation(exchange, robot),
             "margin": decision.margin if decision is not None and decision.tube_center else None,
             "at_least": decision.at_least if decision is not None else False,
             "verified": decision.verified if decision is not None else None,
@@ -107,8 +107,8 @@ def _explanation(exchange: pb.Exchange | None, robot: Robot | None) -> str:
     """Return why the filter changed the proposal; empty if it did not, or if that is unknown."""
     if exchange is None or robot is None or exchange.reply.decision.kind not in INTERVENTIONS:
         return ""
-    request, decision = exchange.request, exchange.reply.decision
-    return explain(robot, request, decision).said if fits(robot, request, decision) else ""
+    explanation = explain(robot, exchange.request, exchange.reply.decision)
+    return "" if explanation is None else explanation.said
 
 
 def _tubes(

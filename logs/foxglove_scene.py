@@ -31,7 +31,7 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from brakeline.logs.decision_explanation import Explanation, fell_back
+from brakeline.logs.decision_explanation import NO_ANSWER, Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS
 from brakeline.messaging import brakeline_pb2 as pb
@@ -157,7 +157,7 @@ def decision(
             _draw_perceived(entity, view.perceived, view.reservations)
     if kind in INTERVENTIONS:
         above = HEIGHT + 3.0 * robot.footprint
-        text = fell_back() if step.fallback else words
+        text = NO_ANSWER if step.fallback else words
         entity.texts.append(_text(text, step.state[: robot.position_dim], _color(*color), above))
     return SceneUpdate(entities=[entity])
 
@@ -284,7 +284,11 @@ def _round(
 
 
 def _line(
-    entity: SceneEntity, kind: LinePrimitive.Type, points: Iterable[Iterable[float]], thickness: float, color: Color
+    entity: SceneEntity,
+    kind: LinePrimitive.Type.ValueType,
+    points: Iterable[Iterable[float]],
+    thickness: float,
+    color: Color,
 ) -> None:
     """Add a line whose thickness does not depend on the distance."""
     line = LinePrimitive(type=kind, pose=_pose(()), thickness=thickness, scale_invariant=True, color=color)

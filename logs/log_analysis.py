@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections import deque
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -52,17 +52,14 @@ class RunAnalysis:
         self.label, self.log, self.prefix = label, log, prefix
         self.options = options or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
-        self.training: dict[str, LearningCurve] = {}  # by robot kind
-        self.intervention_maps: dict[str, InterventionMap] = {}
+        self.training: defaultdict[str, LearningCurve] = defaultdict(LearningCurve)  # by robot kind
+        self.intervention_maps: defaultdict[str, InterventionMap] = defaultdict(InterventionMap)
         self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
-        self._drawn: dict[LogChannel, tuple[InterventionMap, EpisodeSampler, ActorBuffer]] = {}
-        self._buffers: dict[LogChannel, deque[Any]] = {}
-        self._rejected = RejectedMessages()
+        self._buffers: dict[LogChannel, tuple[EpisodeSampler, ActorBuffer]] = {}
         self._read(log)
         for sampler in self.samplers.values():
             sampler.close()
-        self._drawn.clear()
         self._buffers.clear()
 
     def figures(self) -> Figures:
@@ -83,72 +80,44 @@ class RunAnalysis:
 
     def _read(self, log: Log) -> None:
         """Read all messages in one loop."""
-        add, options = self.metrics.add, self.options
-        detailed = options.pictures or options.episode is not None
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
-            LEARNER.name: self._learner,
-            **({HEALTH.name: self._health, LOG.name: self._line} if detailed else {}),
+            STEP.name: lambda series, step: self.training[series.robot].step(step),
+            LEARNER.name: lambda _, metrics: self.training[metrics.robot].learner(metrics),
         }
-        curves: dict[str, LearningCurve] = {}
+        if self.options.pictures or self.options.episode is not None:
+            handlers |= {
+                STEP.name: self._step,
+                EXCHANGE.name: lambda series, exchange: self._buffer(series)[1].exchanges.append(exchange),
+                EPISODE.name: lambda series, episode: self._buffer(series)[1].about.append(episode),
+                HEALTH.name: lambda _, health: self.timeline.health(health),
+                LOG.name: lambda _, line: self.timeline.line(line),
+            }
+        rejected, add = RejectedMessages(), self.metrics.add
         for series, message, _, _ in log.decoded():
             try:
-                if not add(series.key, message):
-                    continue
-                topic = series.topic
-                if topic == STEP.name:
-                    curve = curves.get(series.key)
-                    if curve is None:
-                        curve = curves[series.key] = self.training.setdefault(message.robot, LearningCurve())
-                    curve.step(message)
-                    if detailed:
-                        self._draw(series, message)
-                elif topic == EXCHANGE.name or topic == EPISODE.name:
-                    if detailed:
-                        self._buffer(series, message)
-                elif handler := handlers.get(topic):
-                    handler(series, message)
+                if add(series.key, message) and (handle := handlers.get(series.topic)) is not None:
+                    handle(series, message)
             except Exception as error:  # reject one message and go on
                 log.malformed += 1
-                self._rejected.reject(series.key, error)
+                rejected.reject(series.key, error)
 
-    def _draw(self, series: LogChannel, step: Any) -> None:
-        targets = self._drawn.get(series)
-        if targets is None:
-            robot, _, name = series.place.partition("/")
-            places = self.intervention_maps.setdefault(robot, InterventionMap())
-            sampler = self._sampler(robot)
-            targets = self._drawn[series] = places, sampler, sampler.source(name)
-        places, sampler, source = targets
+    def _step(self, series: LogChannel, step: Any) -> None:
+        self.training[series.robot].step(step)
         if len(state := step.state[:2]) == 2:
-            places.step(state, step)
-        sampler.step(source, step)
+            self.intervention_maps[series.robot].step(state, step)
+        sampler, buffer = self._buffer(series)
+        sampler.step(buffer, step)
         self.timeline.step(step.header.wall_time)
 
-    def _buffer(self, series: LogChannel, message: Any) -> None:
-        buffer = self._buffers.get(series)
-        if buffer is None:
-            robot, _, name = series.place.partition("/")
-            source = self._sampler(robot).source(name)
-            buffer = self._buffers[series] = source.exchanges if series.topic == EXCHANGE.name else source.about
-        buffer.append(message)
-
-    def _sampler(self, robot: str) -> EpisodeSampler:
-        sampler = self.samplers.get(robot)
-        if sampler is None:
-            sampler = self.samplers[robot] = EpisodeSampler(
-                self.log.robots.named(robot), self.options.episode, self.options.actor
-            )
-            sampler.label = self.prefix
-        return sampler
-
-    def _learner(self, _: LogChannel, message: Any) -> None:
-        self.training.setdefault(message.robot, LearningCurve()).learner(message)
-
-    def _health(self, _: LogChannel, message: Any) -> None:
-        self.timeline.health(message.process, message)
-
-    def _line(self, _: LogChannel, message: Any) -> None:
-        self.timeline.line(message.process, message)
+    def _buffer(self, series: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:
+        """Return the sampler of the channel's robot kind, and the buffer of its actor."""
+        if series not in self._buffers:
+            if series.robot not in self.samplers:
+                robot, options = self.log.robots.named(series.robot), self.options
+                self.samplers[series.robot] = EpisodeSampler(robot, self.prefix, options.episode, options.actor)
+            sampler = self.samplers[series.robot]
+            self._buffers[series] = sampler, sampler.source(series.actor)
+        return self._buffers[series]
 
     def about(self) -> Figures:
         """Return one row about the run: configuration, figures, missing messages."""

@@ -61,7 +61,7 @@ class LogChannel:
     Attributes:
         decode: None for an unknown message type.
         known: whether the message type is known.
-        place: the key without the topic, e.g. "ground/actor-0".
+        robot, actor: the second and third part of the key, e.g. "ground" and "actor-0".
         sequence: of the message that was read last.
     """
 
@@ -71,12 +71,13 @@ class LogChannel:
     schema: Schema | None = None
     channel: Channel | None = None
     known: bool = False
-    place: str = ""
+    robot: str = ""
+    actor: str = ""
     sequence: int = 0
 
     def __post_init__(self) -> None:
         self.known = self.decode is not None
-        self.place = self.key.partition("/")[2]
+        _, self.robot, self.actor = (*self.key.split("/", 2), "", "")[:3]
 
 
 Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload

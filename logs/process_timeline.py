@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import asdict, dataclass, field
 
 from brakeline.logs.episode_stats import Figures
@@ -36,11 +36,11 @@ class ProcessTimeline:
         self.last_lines: deque[Figures] = deque(maxlen=MOST_LINES // 2)
         self.begin: float | None = None
         self.width = 1.0  # s of a bin
-        self.steps: dict[int, int] = {}  # steps by bin
+        self.steps: Counter[int] = Counter()  # steps by bin
         self._latest: dict[str, Life] = {}
 
-    def health(self, name: str, health: pb.Health) -> None:
-        now, run = health.header.wall_time * 1e-9, health.header.run
+    def health(self, health: pb.Health) -> None:
+        name, now, run = health.process, health.header.wall_time * 1e-9, health.header.run
         life = self._latest.get(name)
         if life is not None and life.run == run and (now - life.end <= SILENT or len(self.lives) >= MOST_LIVES):
             life.end = max(life.end, now)
@@ -51,9 +51,10 @@ class ProcessTimeline:
         if life is not None and life.run == run:
             life.goodbye = health.last
 
-    def line(self, name: str, line: pb.LogLine) -> None:
+    def line(self, line: pb.LogLine) -> None:
         if line.level in LEVELS:
-            row = {"t": line.header.wall_time * 1e-9, "process": name, "level": line.level, "text": line.text[:300]}
+            at = line.header.wall_time * 1e-9
+            row = {"t": at, "process": line.process, "level": line.level, "text": line.text[:300]}
             if len(self.lines) < MOST_LINES // 2:
                 self.lines.append(row)
             else:
@@ -65,12 +66,12 @@ class ProcessTimeline:
         if self.begin is None:
             self.begin = now
         number = int((now - self.begin) / self.width)
-        self.steps[number] = self.steps.get(number, 0) + 1
+        self.steps[number] += 1
         if len(self.steps) > MOST_BINS:
             self.width *= 2.0
-            coarse: dict[int, int] = {}
-            for bin_, count in self.steps.items():
-                coarse[bin_ // 2] = coarse.get(bin_ // 2, 0) + count
+            coarse: Counter[int] = Counter()
+            for place, count in self.steps.items():
+                coarse[place // 2] += count
             self.steps = coarse
 
     def figures(self) -> Figures:

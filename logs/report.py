@@ -184,10 +184,10 @@ def _times(figures: Figures) -> list[Table]:
         return [_table(("decision [ms]", "part", *columns), rows)]
     if not (times := figures.get("decision_ms")):
         return []
-    columns = ("mean", "std", "p50", "p99")
+    shown = ("mean", "std", "p50", "p99")
     kinds = {"all": times, **{kind: times[kind] for kind in KINDS.values()}}
-    rows = [[kind, *_milliseconds(row, columns)] for kind, row in kinds.items() if row is not None]
-    return [_table(("decision [ms]", *columns), rows)]
+    rows = [[kind, *_milliseconds(row, shown)] for kind, row in kinds.items() if row is not None]
+    return [_table(("decision [ms]", *shown), rows)]
 
 
 def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:

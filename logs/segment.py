@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import itertools
 import os
 import re
@@ -139,8 +138,9 @@ class Segment:
             OSError: the disk is full or broken.
         """
         self.path, self._file = path, file
-        self._spool: Any = BufferedFile(file)  # the writer uses `write`, `tell` and `flush`
-        self._writer: Any = mcap.writer.Writer(self._spool, chunk_size=CHUNK)
+        self._spool = BufferedFile(file)
+        output: Any = self._spool  # the writer uses `write`, `tell` and `flush`
+        self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.empty = True
@@ -156,7 +156,7 @@ class Segment:
     @property
     def size(self) -> int:
         """Size of the file, bytes."""
-        return int(self._spool.tell())
+        return self._spool.tell()
 
     def save(self, entries: Iterable[Entry]) -> int:
         """Write the entries and flush the file, so that only a power cut can lose them.
@@ -221,7 +221,6 @@ class Segment:
         return self._schemas[name]
 
 
-@functools.cache
 def schema_of(kind: type[Message]) -> bytes:
     """Return the schema of a message type, with the types of its fields."""
     return bytes(build_file_descriptor_set(kind).SerializeToString())

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brakeline.logs.decision_explanation import arrow, explain, fits, sentence
+from brakeline.logs.decision_explanation import arrow, explain, sentence
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot_description import read_robot
 from tests.robots import GROUND, QUADROTOR
@@ -29,7 +29,7 @@ def answered(robot, kind, action, by="cylinder", room=-0.03, after=None, normal=
         decision.stopped.CopyFrom(
             pb.Stopped(by=by, room=room, after=end if after is None else after, normal=normal, at=at)
         )
-    assert fits(robot, asked(robot, action), decision) or len(normal) not in (0, d)
+    assert explain(robot, asked(robot, action), decision) or len(normal) not in (0, d)
     return decision
 
 
@@ -142,10 +142,10 @@ def test_all_that_a_picture_needs_is_named_with_its_unit():
 
 def test_what_has_another_robots_sizes_fits_not():
     request, decision = asked(GROUND, (0.25, 0.0)), answered(GROUND, pb.ADJUSTED, (0.1, 0.2), normal=(1, 0))
-    assert fits(GROUND, request, decision)
-    assert not fits(QUADROTOR, request, decision)
+    assert explain(GROUND, request, decision) is not None
+    assert explain(QUADROTOR, request, decision) is None
     decision.stopped.at.append(1.0)
-    assert not fits(GROUND, request, decision)
+    assert explain(GROUND, request, decision) is None
 
 
 def test_a_proposal_that_is_not_finite_has_no_arrow():
