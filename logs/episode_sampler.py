@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from brakeline.logs.episode_stats import Figures
+from brakeline.logs.episode_stats import Figures, kind_of
 from brakeline.logs.episode_view import picture, rows
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
@@ -44,8 +44,7 @@ class EpisodeRecord:
         clearance = step.clearance
         if clearance < self.closest:
             self.closest = clearance
-        if step.fallback or step.decision == pb.FAILSAFE:
-            self.failsafes += 1
+        self.failsafes += kind_of(step) == pb.FAILSAFE
 
     def exchanges(self) -> dict[int, pb.Exchange]:
         """Return the episode's exchanges by step."""

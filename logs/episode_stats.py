@@ -26,8 +26,8 @@ RUN_INTO = "contacts_standing"  # one episode may have several
 
 # Fields of `EpisodeStats` that are also figures: sums over the actors.
 COUNTS = (
-    *("goals", "collisions", *CONTACTS, "timeouts", "steps", "interventions", "adjusted", "failsafes"),
-    *("recovering", "fallbacks", "broken", "outside"),
+    *("goals", "collisions", *CONTACTS, "timeouts", "steps", "interventions", "adjusted", "for_clearance"),
+    *("failsafes", "recovering", "fallbacks"),
 )
 
 KINDS: dict[int, str] = {
@@ -36,9 +36,12 @@ KINDS: dict[int, str] = {
     pb.FAILSAFE: "failsafe",
     pb.RECOVERING: "recovering",
 }
-INTERVENTIONS = (pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING)
-_UNKNOWN, _ADJUSTED, _FAILSAFE = int(pb.UNKNOWN), int(pb.ADJUSTED), int(pb.FAILSAFE)
-_RECOVERING = int(pb.RECOVERING)
+_ADJUSTED, _FAILSAFE, _RECOVERING = INTERVENTIONS = int(pb.ADJUSTED), int(pb.FAILSAFE), int(pb.RECOVERING)
+
+
+def kind_of(step: pb.Step) -> int:
+    """Return the kind of a step's decision: a step without a decision in time counts as failsafe."""
+    return _FAILSAFE if step.fallback else step.decision
 
 
 @dataclass
@@ -100,24 +103,23 @@ class EpisodeStats:
             self._end_episode(step)
 
     def _add_decision(self, step: pb.Step) -> None:
-        kind, fallback = step.decision, step.fallback
-        if fallback:
+        kind = kind_of(step)
+        if step.fallback:
             self.fallbacks += 1
-        elif kind != _UNKNOWN and kind in self.decision_ms:
+        elif kind in self.decision_ms:
             self.decision_ms[kind].add(step.decide_ms)
-        if fallback or kind == _FAILSAFE:
-            self.failsafes += 1
+        if kind in INTERVENTIONS:
             self.interventions += 1
+        if kind == _FAILSAFE:
+            self.failsafes += 1
+        elif kind == _RECOVERING:
+            self.recovering += 1
         elif kind == _ADJUSTED:
             self.adjusted += 1
-            self.interventions += 1
             if step.HasField("for_clearance"):
                 self.for_clearance += step.for_clearance
             else:
                 self.without_for_clearance += 1
-        elif kind == _RECOVERING:
-            self.recovering += 1
-            self.interventions += 1
         if propose_ms := step.propose_ms:
             self.propose_ms.add(propose_ms)
 
@@ -162,17 +164,20 @@ def closed_loop(parts: Iterable[EpisodeStats]) -> Figures:
     figures = {
         "episodes": len(returns),
         **{name: total(name) for name in COUNTS},
-        "for_clearance": None if total("without_for_clearance") else total("for_clearance"),
         "mean_speed": math.fsum(part.speed for part in parts) / steps if steps else None,
         "max_speed": max(part.max_speed for part in parts) if steps else None,
         "mean_reward": float(returns.mean()) if len(returns) else None,
         "decision_ms": total_ms and total_ms | {kind: spread(*parts) for kind, parts in times.items()},
         "propose_ms": spread(*(part.propose_ms for part in parts)),
         "containment": {"steps": total("compared"), "violations": total("violations")},
+        "broken": total("broken"),
         "fleet": max((part.fleet for part in parts), default=0),
+        "outside": total("outside"),
         "closest_approach": clearance and clearance["min"],
         "clearance": clearance,
     }
+    if total("without_for_clearance"):
+        figures["for_clearance"] = None
     return figures | {"intervals": intervals(figures, parts)}
 
 

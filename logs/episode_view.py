@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from brakeline.logs.decision_explanation import NO_ANSWER, bound_in, explain
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
-from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures, kind_of
 from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
@@ -40,11 +40,11 @@ def picture(episode: EpisodeRecord, robot: Robot | None) -> Figures:
         "steps": len(steps),
         "first": first.step,
         "reward": math.fsum(step.reward for step in steps),
-        "interventions": sum(step.fallback or step.decision in INTERVENTIONS for step in steps),
+        "interventions": sum(kind_of(step) in INTERVENTIONS for step in steps),
         "failsafes": episode.failsafes,
         "closest": episode.closest if math.isfinite(episode.closest) else None,
         "closest_at": closest,
-        "kinds": "".join("a" if step.fallback else LETTERS.get(step.decision, "n") for step in steps),
+        "kinds": "".join(LETTERS.get(kind_of(step), "n") for step in steps),
         "x": rounded(step.state[0] if step.state else 0.0 for step in steps),
         "y": rounded(step.state[1] if len(step.state) > 1 else 0.0 for step in steps),
         "heading": _headings(steps, robot),
@@ -65,24 +65,18 @@ def rows(episode: EpisodeRecord, robot: Robot | None) -> Iterable[Figures]:
             "episode": episode.number,
             "step": step.step,
             "time": step.header.time,
-            "state": list(step.state),
-            "proposed": list(step.proposed),
-            "action": list(step.action),
+            **{name: list(getattr(step, name)) for name in ("state", "proposed", "action")},
             "decision": "no decision" if step.fallback else KINDS.get(step.decision),
-            "reason": decision.reason if decision is not None else None,
+            "reason": getattr(decision, "reason", None),
             "said": NO_ANSWER if step.fallback else _explanation(exchange, robot),
             "margin": decision.margin if decision is not None and decision.tube_center else None,
-            "at_least": decision.at_least if decision is not None else False,
-            "verified": decision.verified if decision is not None else None,
+            "at_least": decision is not None and decision.at_least,
+            "verified": getattr(decision, "verified", None),
             "bound": bound_in(decision) if decision is not None else None,
-            "decide_ms": decision.time_ms if decision is not None else None,
-            "round_trip_ms": exchange.round_trip_ms if exchange is not None else None,
-            "iterations": decision.iterations if decision is not None else None,
-            "clearance": step.clearance,
-            "speed": step.speed,
-            "reward": step.reward,
-            "penalty": step.penalty,
-            "weights_version": step.weights_version,
+            "decide_ms": getattr(decision, "time_ms", None),
+            "round_trip_ms": getattr(exchange, "round_trip_ms", None),
+            "iterations": getattr(decision, "iterations", None),
+            **{name: getattr(step, name) for name in ("clearance", "speed", "reward", "penalty", "weights_version")},
             "end": episode.outcome() if step is episode.steps[-1] else "",
         }
 

@@ -33,7 +33,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from brakeline.logs.decision_explanation import NO_ANSWER, Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
-from brakeline.logs.episode_stats import INTERVENTIONS, KINDS
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import LidarRays
@@ -142,7 +142,7 @@ def decision(
     Raises:
         ValueError: the tube or the scan is malformed.
     """
-    kind = pb.FAILSAFE if step.fallback else step.decision
+    kind = kind_of(step)
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
     color, words = COLORS.get(kind, (120, 120, 120)), KINDS.get(kind, "")
     if exchange is not None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from brakeline.logs.episode_stats import Figures
+from brakeline.logs.episode_stats import Figures, kind_of
 from brakeline.messaging import brakeline_pb2 as pb
 
 FIRST_CELL = 0.1  # m
 MOST_CELLS = 6400
 
-_ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
+COLUMNS = {int(pb.ADJUSTED): 1, int(pb.FAILSAFE): 2}  # of the counts of a cell
 
 
 class InterventionMap:
@@ -35,11 +35,8 @@ class InterventionMap:
                 self._coarsen()
                 counts = self.cells[place[0] // 2, place[1] // 2]
         counts[0] += 1
-        kind = step.decision
-        if step.fallback or kind == _FAILSAFE:
-            counts[2] += 1
-        elif kind == _ADJUSTED:
-            counts[1] += 1
+        if (column := COLUMNS.get(kind_of(step))) is not None:
+            counts[column] += 1
         if step.collision:
             counts[3] += 1
 

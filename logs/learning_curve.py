@@ -7,10 +7,11 @@ which the steps of different actors arrive, so they are not part of `Metrics`.
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass, fields
+from collections import Counter, deque
+from dataclasses import dataclass
 
-from brakeline.logs.episode_stats import Figures
+from brakeline.logs.episode_stats import INTERVENTIONS, Figures, kind_of
+from brakeline.logs.json_values import finite
 from brakeline.logs.quantiles import QuantileSketch, summary
 from brakeline.messaging import brakeline_pb2 as pb
 
@@ -20,26 +21,19 @@ LAST = 100  # latest episodes that the report summarizes
 MOST_POINTS = 400  # points of a learner's curves
 CURVES = ("steps", "updates", "critic_loss", "actor_loss", "mean_q")  # of the learner
 
-_ADJUSTED, _FAILSAFE = int(pb.ADJUSTED), int(pb.FAILSAFE)
+COUNTED = {int(pb.ADJUSTED): "adjusted", int(pb.FAILSAFE): "failsafes"}
 
 
-@dataclass
-class Bin:
-    """Sums over consecutive steps and over the episodes that ended in them."""
+class Bin(Counter[str]):
+    """Sums over consecutive steps and over the episodes that ended in them, by name."""
 
-    steps: int = 0
-    adjusted: int = 0
-    failsafes: int = 0
-    episodes: int = 0
-    goals: int = 0
-    collisions: int = 0
-    reward: float = 0.0  # of these episodes, without the intervention penalty
-    closest: float = math.inf  # m
+    reward = 0.0  # of these episodes, without the intervention penalty
+    closest = math.inf  # m
 
     def join(self, other: Bin) -> None:
-        for item in fields(self):
-            one, two = getattr(self, item.name), getattr(other, item.name)
-            setattr(self, item.name, min(one, two) if item.name == "closest" else one + two)
+        self.update(other)
+        self.reward += other.reward
+        self.closest = min(self.closest, other.closest)
 
 
 @dataclass
@@ -66,18 +60,15 @@ class LearningCurve:
         self._stride = 1  # learner messages per point
         self._messages = 0
         self._newest = 0
-        self._current = self.bins[0]
 
     def step(self, step: pb.Step) -> None:
-        now = self._current
-        if now.steps >= self.width:
+        now = self.bins[-1]
+        if now["steps"] >= self.width:
             now = self._next()
-        now.steps += 1
-        kind = step.decision
-        if step.fallback or kind == _FAILSAFE:
-            now.failsafes += 1
-        elif kind == _ADJUSTED:
-            now.adjusted += 1
+        now["steps"] += 1
+        kind = kind_of(step)
+        if kind in COUNTED:
+            now[COUNTED[kind]] += 1
         clearance = step.clearance
         if clearance < now.closest:
             now.closest = clearance
@@ -91,13 +82,13 @@ class LearningCurve:
             episode = self._running[actor] = Episode()
         episode.reward += step.reward
         episode.steps += 1
-        episode.interventions += step.fallback or kind in (_ADJUSTED, _FAILSAFE, int(pb.RECOVERING))
+        episode.interventions += kind in INTERVENTIONS
         episode.collision = episode.collision or step.collision
         if step.terminated or step.truncated:
             episode.goal = step.goal
-            now.episodes += 1
-            now.goals += step.goal
-            now.collisions += step.collision
+            now["episodes"] += 1
+            now["goals"] += step.goal
+            now["collisions"] += step.collision
             now.reward += episode.reward
             self.last.append(self._running.pop(actor))
 
@@ -114,21 +105,16 @@ class LearningCurve:
         """Return the curves. Each row of `bins` ends at the step `until`; None: no episode ended in the bin."""
         rows, until = [], 0
         for row in self.bins:
-            until += row.steps
-            if row.steps:
-                rows.append(
-                    {
-                        "until": until,
-                        "steps": row.steps,
-                        "adjusted": row.adjusted / row.steps,
-                        "failsafes": row.failsafes / row.steps,
-                        "episodes": row.episodes,
-                        "goals": row.goals / row.episodes if row.episodes else None,
-                        "collisions": row.collisions,
-                        "reward": row.reward / row.episodes if row.episodes else None,
-                        "closest": row.closest if math.isfinite(row.closest) else None,
-                    }
-                )
+            until, steps, episodes = until + row["steps"], row["steps"], row["episodes"]
+            if steps:
+                rates = {name: row[name] / steps for name in COUNTED.values()}
+                ends = {
+                    "goals": row["goals"] / episodes if episodes else None,
+                    "collisions": row["collisions"],
+                    "reward": row.reward / episodes if episodes else None,
+                }
+                closest = finite(row.closest)
+                rows.append({"until": until, "steps": steps, **rates, "episodes": episodes, **ends, "closest": closest})
         return {
             "bin_steps": self.width,
             "bins": rows,
@@ -156,5 +142,4 @@ class LearningCurve:
             self.bins = self.bins[::2]
             self.width *= 2
         self.bins.append(Bin())
-        self._current = self.bins[-1]
-        return self._current
+        return self.bins[-1]

@@ -38,6 +38,7 @@ RATES = (  # name, unit, description
     ("contacts_robots", "episodes", "contacts with other robots"),
     ("timeouts", "episodes", "timeouts"),
     ("interventions", "steps", "steps with an intervention of the filter"),
+    ("violations", "steps compared", "measured states outside the predicted set"),
 )
 
 
@@ -84,18 +85,13 @@ def write(path: Path, figures: Figures, runs: Mapping[str, tuple[Figures, Figure
 
 def rates(figures: Figures) -> list[Figures]:
     """Return the rows of the table of rates: description, count, number of trials, interval."""
-    rows = [
-        {"name": name, "what": what, "count": figures[name], "of": figures[of], "unit": of}
-        | {"interval": figures["intervals"][name]}
-        for name, of, what in RATES
+    counts = {name: (figures[name], figures[of], of) for name, of, _ in RATES[:-1]}
+    counts["violations"] = figures["containment"]["violations"], figures["containment"]["steps"], "steps compared"
+    return [
+        dict(zip(("count", "of", "unit"), counts[name], strict=True))
+        | {"name": name, "what": what, "interval": figures["intervals"][name]}
+        for name, _, what in RATES
     ]
-    contained = figures["containment"]
-    outside = {"name": "violations", "what": "measured states outside the predicted set", "unit": "steps compared"}
-    rows.append(
-        outside
-        | {"count": contained["violations"], "of": contained["steps"], "interval": figures["intervals"]["violations"]}
-    )
-    return rows
 
 
 def missing(figures: Figures) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from brakeline.errors import Implausible
 from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
-from brakeline.logs.episode_stats import INTERVENTIONS, KINDS
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
 from brakeline.logs.foxglove_scene import half_width
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -104,7 +104,7 @@ class RobotPanel:
     def step(self, step: pb.Step) -> None:
         """Move the robot to its next state."""
         x, y = self._move_to(list(step.state))
-        kind = pb.FAILSAFE if step.fallback else step.decision
+        kind = kind_of(step)
         self._shown["kind"] = KINDS.get(kind, "")
         self.reward += step.reward
         self._trail.append((x, y))
