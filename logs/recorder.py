@@ -33,7 +33,6 @@ OVERHEAD = 100  # bytes of a sample besides its payload
 BATCH = 2**20  # bytes per write, so that a nearly full disk still takes what fits
 MOST_DRAWING = 2.0  # s of one flush after which the remaining messages are recorded without scenes
 
-Open = Callable[[Path, Metadata, Attachments], Segment]
 Derive = Callable[[Sample], Iterable[Entry]]  # additional entries for a sample, e.g. Foxglove's scenes
 
 
@@ -102,7 +101,6 @@ class LogSettings:
     attachments: Attachments = field(default_factory=dict)
     derive: Derive = lambda sample: ()
     rotation: Rotation = field(default_factory=Rotation)
-    open_segment: Open = open_segment
 
 
 class Recording:
@@ -175,7 +173,7 @@ class Recording:
         """Return the file to write to; open a new one if needed. Raises OSError."""
         if self._segment is None:
             settings = self._settings
-            self._segment = settings.open_segment(settings.run, settings.metadata, settings.attachments)
+            self._segment = open_segment(settings.run, settings.metadata, settings.attachments)
             self._opened_at = time.monotonic()
             self.path = self._segment.path
             log.log(logging.WARNING if self.failure else logging.INFO, "recording to %s", self.path)

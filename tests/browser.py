@@ -118,10 +118,6 @@ class Page:
             time.sleep(0.05)
         return value
 
-    def picture(self, path: Path) -> None:
-        """A screenshot, as PNG."""
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
-
     def _note(self, event: dict[str, Any]) -> None:
         method, about = event.get("method"), event.get("params", {})
         if method == "Network.requestWillBeSent":

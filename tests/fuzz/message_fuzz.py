@@ -40,7 +40,6 @@ from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis
 from brakeline.logs.reader import Log
 from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.report_page import render
-from brakeline.logs.segment import Attachments, Metadata, Segment
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
@@ -113,20 +112,18 @@ def launcher(folder: Path) -> Party:
 
 
 def recorder(folder: Path) -> Party:
-    """Record into a file that begins anew all the time, so that the disk does not fill up."""
-    path, rejected, inbox = folder / "fuzz.mcap", RejectedMessages(), Inbox()
-
-    def open_one(run: Path, metadata: Metadata, attachments: Attachments) -> Segment:
-        path.unlink(missing_ok=True)
-        return Segment(path, path.open("wb", buffering=0), metadata)
-
-    settings = LogSettings(path, derive=derive_entries(RATE), rotation=Rotation(mib=16.0), open_segment=open_one)
+    """Record into files that are deleted after the next one begins, so that the disk does not fill up."""
+    rejected, inbox = RejectedMessages(), Inbox()
+    settings = LogSettings(folder / "fuzz.mcap", derive=derive_entries(RATE), rotation=Rotation(mib=16.0))
     recording = Recording(settings, inbox, rejected)
 
     def take(sample: Sample) -> None:
         inbox.put(sample)
         if inbox.bytes > 2**16:
             recording.save()
+            for path in folder.glob("fuzz*.mcap"):
+                if path != recording.path:
+                    path.unlink()
 
     return Party(RECORDED, take, recording.save, rejected, recording.finish)
 

@@ -1,8 +1,11 @@
-"""Fixtures: samples as a recorder receives them, a report, and a browser that shows the report."""
+"""Fixtures: samples as a recorder receives them, a recorder process, a report, and a browser that shows the report."""
 
 import itertools
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +14,25 @@ import pytest
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.report_page import render
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Sample
+from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.topic_keys import names_of
-from brakeline.messaging.topics import TOPICS
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.topics import HEALTH, TOPICS
 from tests.browser import Page, drawn
 from tests.logs.sample_log import mixed
+from tests.waiting import until
 
 Say = Callable[..., Sample]
+Start = Callable[..., "subprocess.Popen[bytes]"]
+
+RECORDER = """
+import sys
+from pathlib import Path
+from brakeline.logs.recorder import LogSettings, Rotation, main
+from brakeline.messaging.bus import BusSettings
+settings = LogSettings(Path(sys.argv[2]), {"run": {"method": "none"}}, rotation=Rotation(*map(float, sys.argv[3:])))
+main(BusSettings(connect=(sys.argv[1],)), settings)
+"""
 
 
 @pytest.fixture
@@ -35,6 +50,30 @@ def say() -> Say:
         return Sample(topic, key, message.SerializeToString(), now + 1000)
 
     return make
+
+
+@pytest.fixture
+def router() -> Iterator[Bus]:
+    with Bus(BusSettings(listen=(free_endpoint(),)), "launcher") as bus:
+        yield bus
+
+
+@pytest.fixture
+def start(router: Bus) -> Iterator[Start]:
+    """Return a function that starts a recorder and waits until it records."""
+    files: list[str] = []
+    router.subscribe(HEALTH, lambda sample: files.append(sample.message().notes["file"]), source="recorder")
+    with ExitStack() as stack:
+
+        def launch(run: Path, *rotation: float) -> "subprocess.Popen[bytes]":
+            files.clear()
+            words = [sys.executable, "-c", RECORDER, router.settings.listen[0], str(run), *map(str, rotation)]
+            child = stack.enter_context(subprocess.Popen(words))
+            stack.callback(child.kill)
+            until(lambda: any(Path(file).parent == run.parent for file in files))
+            return child
+
+        yield launch
 
 
 @pytest.fixture(scope="module")

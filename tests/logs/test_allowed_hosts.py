@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import re
 import socket
 from collections.abc import Iterator
 
@@ -12,7 +13,7 @@ from websockets.sync.client import connect
 
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import FoxgloveServer
-from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.logs.watch.live_page_server import FILES, LivePageServer
 
 
 @pytest.fixture
@@ -56,6 +57,12 @@ def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> N
 def test_a_foreign_page_is_rejected(server: LivePageServer, path: str, headers: dict[str, str]) -> None:
     status, body = asked(server, path, **headers)
     assert status == 403 and b"robots" not in body
+
+
+def test_the_live_page_has_every_script_that_it_names(server: LivePageServer) -> None:
+    names = re.findall(r'(?:src|href)="(/[^"]+)"', asked(server, "/")[1].decode())
+    assert set(names) == set(FILES) - {"/"}
+    assert all(asked(server, name)[0] == 200 for name in names)
 
 
 @pytest.fixture

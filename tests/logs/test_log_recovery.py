@@ -3,11 +3,7 @@
 import json
 import os
 import random
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,23 +20,12 @@ from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import being_written, open_segment
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusSettings, Sample
-from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.topics import HEALTH, STEP
+from brakeline.messaging.bus import Bus
+from brakeline.messaging.topics import STEP
+from tests.logs.conftest import Say, Start
 from tests.logs.sample_log import ABOUT, Writer
-from tests.waiting import until
 
-Say = Callable[..., Sample]
-KILLS = 10
-
-RECORDER = """
-import sys
-from pathlib import Path
-from brakeline.logs.recorder import LogSettings, Rotation, main
-from brakeline.messaging.bus import BusSettings
-settings = LogSettings(Path(sys.argv[2]), {"run": {"seed": "3"}}, rotation=Rotation(0.02, 1.5))
-main(BusSettings(connect=(sys.argv[1],)), settings)
-"""
+KILLS, BESIDE = 10, 5
 
 
 def whole(path: Path) -> list[int]:
@@ -171,38 +156,28 @@ def test_files_rotate_by_size_and_by_time_and_each_is_whole(
         Rotation(mib=0.0)
 
 
-@pytest.fixture
-def router() -> Iterator[Bus]:
-    endpoint = free_endpoint()
-    with Bus(BusSettings(listen=(endpoint,)), "actor-0") as bus:
-        yield bus
-
-
-def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(router: Bus, tmp_path: Path) -> None:
+def test_killed_at_ten_random_moments_nothing_older_than_a_second_is_missing(
+    router: Bus, start: Start, tmp_path: Path
+) -> None:
     """Files rotate all the time, so that some kills happen between the end of a file and the start of the next."""
     chance, publisher = random.Random(os.urandom(8)), router.publisher(STEP, robot="ground")
-    ready: list[str] = []
-    router.subscribe(HEALTH, lambda sample: ready.append(sample.message().notes["file"]), source="recorder")
-    for number in range(KILLS):
-        folder = tmp_path / str(number)
-        ready.clear()
-        child = subprocess.Popen([sys.executable, "-c", RECORDER, router.settings.listen[0], str(folder / "run.mcap")])
-        try:
-            until(lambda place=f"/{number}/": any(place in file for file in ready))
-            first, dated = publisher.count + 1, []
-            end = time.monotonic() + chance.uniform(0.2, 2.2)
-            while time.monotonic() < end:
+    for group in range(0, KILLS, BESIDE):  # recorders of the same messages
+        folders = [tmp_path / str(number) for number in range(group, group + BESIDE)]
+        children = {folder: start(folder / "run.mcap", 0.02, 1.5) for folder in folders}
+        first, dated, killed, begin = publisher.count + 1, list[float](), dict[Path, float](), time.monotonic()
+        for folder, after in sorted(((f, chance.uniform(0.2, 2.2)) for f in folders), key=lambda item: item[1]):
+            while time.monotonic() < begin + after:
                 publisher.put(pb.Step(observation=[chance.random() for _ in range(26)]))
                 dated.append(time.time())
                 time.sleep(0.002)
-        finally:
-            child.send_signal(signal.SIGKILL)
-            killed = time.time()
+            children[folder].kill()
+            killed[folder] = time.time()
+        for folder, child in children.items():
             child.wait()
-        found: list[int] = []
-        for path in sorted(folder.glob("*.mcap")):
-            recover(path)
-            found += whole(path)
-        assert found == list(range(first, first + len(found))), "none is missing in between, or twice"
-        old = sum(at < killed - 1.0 for at in dated)
-        assert len(found) >= old, f"kill {number}: {old - len(found)} older than a second are missing"
+            found: list[int] = []
+            for path in sorted(folder.glob("*.mcap")):
+                recover(path)
+                found += whole(path)
+            assert found == list(range(first, first + len(found))), "none is missing in between, or twice"
+            old = sum(at < killed[folder] - 1.0 for at in dated)
+            assert len(found) >= old, f"{folder}: {old - len(found)} older than a second are missing"

@@ -62,13 +62,19 @@ def test_the_recorder_stores_malformed_messages_and_goes_on(hostile: Sample, say
     log = open_log(path)
     kept = [payload for _, _, _, payload in log.rows()]
     assert hostile.payload in kept and good.payload in kept and not log.cuts
+    decoded = open_log(path)
+    assert [record.message.text for record in decoded if record.topic == "log"][-1] == "after it"
+    assert decoded.malformed >= (hostile.payload == b"\xff\xff")
 
 
 def test_66000_keys_do_not_end_a_recording(tmp_path: Path) -> None:
     rejected = RejectedMessages()
     samples = [sample(LOG, pb.LogLine(text="x"), source=f"a{number}") for number in range(66_000)]
-    record(tmp_path / "run.mcap", samples, rejected)
-    assert sum(1 for _ in open_log(tmp_path).rows()) == MOST_CHANNELS - 1  # and Foxglove's
+    inbox = Inbox()
+    for one in samples:
+        inbox.put(one)
+    Recording(LogSettings(tmp_path / "run.mcap"), inbox, rejected).finish()
+    assert sum(1 for _ in open_log(tmp_path).rows()) == MOST_CHANNELS
     assert rejected.count > 0
 
 

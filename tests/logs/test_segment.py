@@ -15,7 +15,6 @@ from brakeline.logs.recorder import entry
 from brakeline.logs.segment import Entry, Segment, name_of, number_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
-from brakeline.messaging.topics import STEP
 
 Say = Callable[..., Sample]
 
@@ -103,29 +102,6 @@ def test_a_segment_that_was_never_finished_is_read_in_full(tmp_path: Path, say: 
     assert [record.message.text for record in log] == ["1", "2"]
     assert [cut.path.name for cut in log.cuts] == ["run.mcap", "run_0002.mcap"]
     assert "has no summary" in str(log.cuts[0])
-
-
-def test_a_damaged_chunk_is_noticed(tmp_path: Path, say: Say) -> None:
-    run = tmp_path / "run.mcap"
-    write(run, *[[say("log/a", pb.LogLine(text=f"{number} {'x' * 500}"))] for number in range(3)])
-    data = bytearray(run.read_bytes())
-    data[data.rindex(b"zstd", 0, len(data) - 800) + 40] ^= 0xFF
-    run.write_bytes(data)
-    log = open_log(run)
-    assert len(list(log)) < 3
-    assert log.cuts[0].lost > 0
-
-
-def test_a_malformed_message_is_stored_and_counted(tmp_path: Path, say: Say) -> None:
-    noise = Sample(STEP, "step/ground/a", b"\xff\xff", 5)
-    segment = open_segment(tmp_path / "run.mcap", {})
-    segment.save([Entry(noise.key, pb.Step, noise.payload, 5, 5, 0), entry(say("log/a", pb.LogLine()))])
-    segment.finish()
-    log = open_log(tmp_path)
-    assert [record.topic for record in log] == ["log"]
-    assert log.malformed == 1
-    with (tmp_path / "run.mcap").open("rb") as file:
-        assert next(message.data for _, _, message in make_reader(file).iter_messages()) == b"\xff\xff"
 
 
 def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
