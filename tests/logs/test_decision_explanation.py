@@ -33,28 +33,27 @@ def answered(robot, kind, action, by="cylinder", room=-0.03, after=None, normal=
     return decision
 
 
-@pytest.mark.parametrize(
-    ("action", "instead", "normal", "said"),
-    [
-        (
-            (0.25, 0.0),
-            (0.25, 0.4),
-            (1, 0),
-            "turned left: straight on, the stop would have come 3 cm too close to the cylinder ahead",
-        ),
-        (
-            (0.25, 0.2),
-            (0.25, -0.4),
-            (0, 1),
-            "turned right: as proposed, the stop would have come 3 cm too",
-        ),
-        ((0.25, 0.0), (0.1, 0.0), (0.6, -0.8), "slowed down: as proposed, the stop"),
-        ((0.25, 0.0), (0.0, 0.0), (1, 0), "stopped: going on, the stop would"),
-    ],
-)
-def test_a_robot_on_wheels(action, instead, normal, said):
-    decision = answered(GROUND, pb.ADJUSTED, instead, normal=normal)
-    assert sentence(GROUND, asked(GROUND, action), decision).startswith(said)
+TOO_CLOSE = "the stop would have come 3 cm too close to the"
+ADJUSTED = [
+    (GROUND, (0.25, 0.0), (0.25, 0.4), (1, 0), f"turned left: straight on, {TOO_CLOSE} cylinder ahead"),
+    (GROUND, (0.25, 0.2), (0.25, -0.4), (0, 1), "turned right: as proposed, the stop would have come 3 cm too"),
+    (GROUND, (0.25, 0.0), (0.1, 0.0), (0.6, -0.8), "slowed down: as proposed, the stop"),
+    (GROUND, (0.25, 0.0), (0.0, 0.0), (1, 0), "stopped: going on, the stop would"),
+    (OMNI, (0.3, 0.0, 0.0), (0.2, 0.2, 0.0), (1, 0), f"turned aside to the left: straight on, {TOO_CLOSE}"),
+    (OMNI, (0.0, -0.3, 0.0), (0.0, -0.1, 0.0), (0, -1), f"slowed down: as proposed, {TOO_CLOSE} cylinder"),
+    (OMNI, (-0.1, 0.3, 0.0), (0.0, 0.0, 0.0), (0, 1), f"stopped: going on, {TOO_CLOSE} cylinder on the left"),
+    (OMNI, (0.3, 0.0, 0.0), (0.3, 0.0, 0.5), (1, 0), "turned left: straight on"),
+    (QUADROTOR, (5.0, 0.0, 0.0), (3.0, 0.0, 0.0), (1, 0, 0), f"slowed down: as proposed, {TOO_CLOSE} cylinder in"),
+    (QUADROTOR, (5.0, 0.0, 0.0), (4.0, 3.0, 0.0), (1, 0, 0), "turned aside to the left: straight on"),
+    (QUADROTOR, (5.0, 0.0, 0.0), (4.0, 0.0, 2.5), (1, 0, 0), "climbed: straight on"),
+    (QUADROTOR, (5.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0, 0, -1), f"stopped: going on, {TOO_CLOSE} cylinder below"),
+]
+
+
+@pytest.mark.parametrize(("robot", "action", "instead", "normal", "said"), ADJUSTED)
+def test_an_adjusted_action_is_described(robot, action, instead, normal, said):
+    decision = answered(robot, pb.ADJUSTED, instead, normal=normal)
+    assert sentence(robot, asked(robot, action), decision).startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -72,35 +71,6 @@ def test_where_it_is_is_told_as_the_robot_looks(heading, normal, where):
     assert (
         said == f"braked along the plan verified before: as proposed, the stop would have come 3 cm too close {where}"
     )
-
-
-@pytest.mark.parametrize(
-    ("action", "instead", "normal", "said"),
-    [
-        ((0.3, 0.0, 0.0), (0.2, 0.2, 0.0), (1, 0), "turned aside to the left: straight on, the stop would have come 3"),
-        ((0.0, -0.3, 0.0), (0.0, -0.1, 0.0), (0, -1), "slowed down: as proposed, the stop would have come 3 cm too cl"),
-        ((-0.1, 0.3, 0.0), (0.0, 0.0, 0.0), (0, 1), "stopped: going on, the stop would have come 3 cm too close to the "
-         "cylinder on the left"),
-        ((0.3, 0.0, 0.0), (0.3, 0.0, 0.5), (1, 0), "turned left: straight on"),
-    ],
-)  # fmt: skip
-def test_what_goes_anywhere_while_it_turns(action, instead, normal, said):
-    decision = answered(OMNI, pb.ADJUSTED, instead, normal=normal)
-    assert sentence(OMNI, asked(OMNI, action), decision).startswith(said)
-
-
-@pytest.mark.parametrize(
-    ("instead", "normal", "said"),
-    [
-        ((3.0, 0.0, 0.0), (1, 0, 0), "slowed down: as proposed, the stop would have come 3 cm too close to the box in"),
-        ((4.0, 3.0, 0.0), (1, 0, 0), "turned aside to the left: straight on"),
-        ((4.0, 0.0, 2.5), (1, 0, 0), "climbed: straight on"),
-        ((0.0, 0.0, 0.0), (0, 0, -1), "stopped: going on, the stop would have come 3 cm too close to the box below"),
-    ],
-)  # fmt: skip
-def test_what_flies(instead, normal, said):
-    decision = answered(QUADROTOR, pb.ADJUSTED, instead, "box", normal=normal)
-    assert sentence(QUADROTOR, asked(QUADROTOR, (5.0, 0.0, 0.0)), decision).startswith(said)
 
 
 def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified():

@@ -5,7 +5,6 @@ import json
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,14 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 import brakeline.logs
 from brakeline.logs import foxglove_scene
 from brakeline.logs.foxglove import ArenaLayout, FoxgloveConverter
+from brakeline.logs.reader import read
 from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import EXCHANGE, STEP
+from tests.logs.conftest import Say
 from tests.robots import GROUND, QUADROTOR
-
-Say = Callable[..., Sample]
 
 WALLS = [pb.Obstacle(kind="wall", position=(-5 * math.cos(a), -5 * math.sin(a)), yaw=a) for a in (0.0, 1.5707963)]
 OBSTACLES = [
@@ -230,35 +229,31 @@ def test_a_recording_has_the_pictures_beside_the_messages(say: Say, tmp_path: Pa
     messages = [("episode", episode()), ("exchange", exchange(0)), ("step", step(0))]
     for topic, message in messages:
         inbox.put(say(f"{topic}/ground/actor-0", message))
-    recording.save()
     recording.finish()
     assert dict(recording.recorded) == {f"{topic}/ground/actor-0": 1 for topic, _ in messages}
-    read = {record.topic for record in logs_of(tmp_path)}
-    assert read == {"episode", "exchange", "step"}, "our reader passes over them"
+    assert {record.topic for record in read(tmp_path)} == {"episode", "exchange", "step"}, "no pictures"
 
 
-def logs_of(folder: Path) -> list[Any]:
-    return list(importlib.import_module("brakeline.logs.reader").read(folder))
-
-
-def test_all_schemas_are_foxgloves_well_known_ones(studio: Studio) -> None:
-    known = importlib.import_module("foxglove.messages")
-    studio("episode/ground/actor-0", episode())
-    studio("exchange/ground/actor-0", exchange(0))
-    studio("step/ground/actor-0", step(0))
+@pytest.fixture
+def whole(studio: Studio) -> Studio:
+    """A studio that has drawn one message of each kind."""
+    for key, message in (("episode", episode()), ("exchange", exchange(0)), ("step", step(0))):
+        studio(f"{key}/ground/actor-0", message)
     studio("log/a", pb.LogLine(text="x"))
-    types = {entry.type for entry in studio.entries} | {PointCloud}
+    return studio
+
+
+def test_all_schemas_are_foxgloves_well_known_ones(whole: Studio) -> None:
+    known = importlib.import_module("foxglove.messages")
+    types = {entry.type for entry in whole.entries} | {PointCloud}
     assert types == {SceneUpdate, FrameTransforms, LaserScan, Log, PointCloud}
     for kind in types:
         package, name = kind.DESCRIPTOR.full_name.split(".")
         assert package == "foxglove" and hasattr(known, name)
 
 
-def test_the_layout_speaks_of_topics_and_fields_that_there_are(studio: Studio) -> None:
-    studio("episode/ground/actor-0", episode())
-    studio("exchange/ground/actor-0", exchange(0))
-    studio("step/ground/actor-0", step(0))
-    roots = {entry.key.rsplit("/", 2)[0] for entry in studio.entries}
+def test_the_layout_speaks_of_topics_and_fields_that_there_are(whole: Studio) -> None:
+    roots = {entry.key.rsplit("/", 2)[0] for entry in whole.entries} - {"foxglove"}
     layout = json.loads((Path(brakeline.logs.__file__).parent / "brakeline.foxglove-layout.json").read_text())
     panels = layout["configById"]
     topics = panels["3D!scene"]["topics"]

@@ -5,7 +5,6 @@ import math
 import struct
 import tracemalloc
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
-
-Say = Callable[..., Sample]
+from tests.logs.conftest import Say
 
 
 def sample(topic: Topic, message: Any, source: str = "a") -> Sample:

@@ -3,7 +3,6 @@
 import json
 import math
 import random
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,7 @@ from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import LOG
-
-Say = Callable[..., Sample]
+from tests.logs.conftest import Say
 
 
 def episode(number: int, decisions: list[int], actor: str = "a", **last: object) -> list[pb.Step]:

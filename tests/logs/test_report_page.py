@@ -13,7 +13,8 @@ import pytest
 from brakeline.deploy.cli import main
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.report_page import embedded, names, number, percent, render
-from tests.browser import CHROMIUM, Page, drawn
+from brakeline.logs.segment import open_segment
+from tests.browser import Page, drawn
 from tests.logs.sample_log import ABOUT, mixed
 
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
@@ -289,29 +290,19 @@ def test_on_paper_pages_are_full(page: Page) -> None:
     assert pages <= 9
 
 
-def test_an_empty_log_has_a_page_too(tmp_path: Path, report: tuple[Path, dict[str, Any]]) -> None:
-    from brakeline.logs.segment import open_segment
-
+def test_an_empty_log_has_a_page_too(tmp_path: Path) -> None:
     open_segment(tmp_path / "run.mcap", {"run": {"method": TRICKS}, "odd": {TRICKS: TRICKS}}).finish()
     assert main(["analyse", str(tmp_path / "run.mcap"), "--html", str(tmp_path / "a" / "page.html"), "--json"]) == 0
     text = (tmp_path / "a" / "page.html").read_text()
     assert "alert(1)</script>" not in text
-    if CHROMIUM is not None:
-        with Page(tmp_path / "browser") as page:
-            page.open((tmp_path / "a" / "page.html").as_uri())
-            page.until("document.documentElement.dataset.drawn === 'yes'")
-            assert page.complaints == []
-            assert page.value("document.querySelectorAll('.none').length") == 6
+    with drawn(tmp_path / "a" / "page.html", tmp_path / "browser") as page:
+        assert page.complaints == []
+        assert page.value("document.querySelectorAll('.none').length") == 6
 
 
 def test_numbers_are_for_people() -> None:
-    assert [number(value) for value in (None, 0, 1234567, 0.123456, 12.0)] == [
-        "–",
-        "0",
-        "1\u202f234\u202f567",
-        "0.123",
-        "12",
-    ]
+    shown = [number(value) for value in (None, 0, 1234567, 0.123456, 12.0)]
+    assert shown == ["–", "0", "1\u202f234\u202f567", "0.123", "12"]
     assert [percent(value) for value in (None, 0.0, 0.5, 0.00123)] == ["–", "0.0 %", "50.0 %", "0.12 %"]
     assert json.loads(embedded({"x": TRICKS, "y": float("nan")})) == {"x": TRICKS, "y": None}
     assert "<" not in embedded(TRICKS)
@@ -348,18 +339,14 @@ def hostile(folder: Path) -> Path:
 
 
 def test_no_text_of_a_log_runs_as_a_script(tmp_path: Path) -> None:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
     path = hostile(tmp_path)
     bare = tmp_path / "bare.html"  # without its policy: the escaping alone must do
     bare.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", path.read_text()))
-    with Page(tmp_path / "browser") as page:
-        for place in (bare, path):
-            page.open(place.as_uri())
-            page.until("document.documentElement.dataset.drawn === 'yes'")
+    for place in (bare, path):
+        with drawn(place, tmp_path / place.stem) as page:
             assert page.value("document.querySelectorAll('img, svg script, main script').length") == 0
             assert page.value("document.title").startswith("Brakeline: ")
-        assert page.complaints == []
+            assert page.complaints == []
 
 
 def test_its_policy_lets_no_script_or_style_run_but_its_own(
@@ -367,13 +354,9 @@ def test_its_policy_lets_no_script_or_style_run_but_its_own(
 ) -> None:
     policy = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', report[0].read_text())
     assert len(policy) == 1 and "unsafe" not in policy[0] and policy[0].count("'sha256-") == 2
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
     injected = tmp_path / "injected.html"
     tricks = "<script>document.title = 'owned'</script><img src='data:,' onerror=\"document.title = 'owned'\">"
     injected.write_text(report[0].read_text().replace("<main>", f"<main>{tricks}", 1))
-    with Page(tmp_path / "browser") as page:
-        page.open(injected.as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
+    with drawn(injected, tmp_path / "browser") as page:
         assert page.value("document.title").startswith("Brakeline: ")
         assert any("Content Security Policy" in complaint for complaint in page.complaints)

@@ -1,7 +1,6 @@
 """A segment has the received bytes, and every MCAP tool can read it."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,7 @@ from brakeline.logs.recorder import entry
 from brakeline.logs.segment import Entry, Segment, name_of, number_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
-
-Say = Callable[..., Sample]
+from tests.logs.conftest import Say
 
 
 def write(run: Path, *portions: list[Sample], finish: bool = True) -> Segment:

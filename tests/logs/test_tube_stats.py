@@ -39,40 +39,38 @@ def of(*exchanges):
     return plans
 
 
-def test_a_stop_that_keeps_to_its_tube_is_counted_once():
-    plans = of(
-        asked(0, pb.ALLOWED),
-        *(asked(k, pb.FAILSAFE, 0.1 * min(k, N) + 0.02, min(k, 3)) for k in range(1, 6)),
-        asked(6, pb.ALLOWED, 0.42, 3),
-    )
-    assert (plans.flown, plans.outside) == (1, 0)
-    assert plans.excess == pytest.approx(0.4)
+def stop(late=0, off=0.0):
+    """Return a stop along a plan; the robot is `off` the tube's center by more than usual in the period `late`."""
+    along = [asked(k, pb.FAILSAFE, 0.1 * min(k, N) + 0.02 + off * (k == late), min(k, 3)) for k in range(1, 6)]
+    return [asked(0, pb.ALLOWED), *along, asked(6, pb.ALLOWED, 0.42, 3)]
 
 
-@pytest.mark.parametrize("late", range(2, 5))
-def test_a_tube_that_is_left_at_any_period_counts(late):
-    steps = [asked(0, pb.ALLOWED)]
-    for k in range(1, 5):
-        off = 0.06 if k == late else 0.0
-        steps.append(asked(k, pb.FAILSAFE, 0.1 * min(k, N) + off, min(k, 3)))
-    steps.append(asked(5, pb.ADJUSTED, 0.4, 3))
-    plans = of(*steps)
-    assert (plans.flown, plans.outside) == (1, 1) and plans.excess == pytest.approx(1.2)
+SILENT = pb.Exchange(header=pb.Header(run=1), request=asked(1, pb.FAILSAFE, 0.3, 1).request, failure="timeout: 80")
+NAN = float("nan")
 
 
-def test_a_tube_that_is_left_when_the_next_plan_begins_counts():
-    plans = of(asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.1, 1), asked(2, pb.ADJUSTED, 0.26, 2))
-    assert (plans.flown, plans.outside) == (1, 1)
+FIRST = asked(0, pb.ALLOWED)
+CASES = {
+    "a stop in its tube": (stop(), 1, 0),
+    **{f"outside in period {late}": (stop(late, 0.04), 1, 1) for late in range(2, 5)},
+    "outside when the next plan begins": ([FIRST, asked(1, pb.FAILSAFE, 0.1, 1), asked(2, pb.ADJUSTED, 0.26, 2)], 1, 1),
+    "a newer plan at once": ([FIRST, asked(1, pb.ALLOWED, 9.0, 1), asked(2, pb.ADJUSTED, 9.0, 1)], 0, 0),
+    "no reply": ([FIRST, SILENT, asked(2, pb.ALLOWED, 0.2, 2)], 1, 1),
+    "nothing was verified": ([asked(0, pb.FAILSAFE, verified=False), asked(1, pb.FAILSAFE, 9.0, 1)], 0, 0),
+    "no number": ([FIRST, asked(1, pb.FAILSAFE, NAN, 1), asked(2, pb.ALLOWED, 0.2, 2)], 1, 1),
+}
 
 
-def test_a_plan_that_another_follows_at_once_was_not_gone_on_along():
-    plans = of(asked(0, pb.ALLOWED), asked(1, pb.ALLOWED, 9.0, 1), asked(2, pb.ADJUSTED, 9.0, 1), asked(3, pb.ALLOWED))
-    assert (plans.flown, plans.outside) == (0, 0)
+@pytest.mark.parametrize(("exchanges", "flown", "outside"), CASES.values(), ids=CASES)
+def test_plans_that_were_followed_and_left_are_counted(exchanges, flown, outside):
+    plans = of(*exchanges)
+    plans._end()
+    assert (plans.flown, plans.outside) == (flown, outside)
+    assert np.isfinite(plans.excess) and (plans.excess > 1.0) == bool(outside)
 
 
-def test_a_robot_without_a_reply_follows_its_plan():
-    silent = pb.Exchange(header=pb.Header(run=1), request=asked(1, pb.FAILSAFE, 0.3, 1).request, failure="timeout: 80")
-    assert of(asked(0, pb.ALLOWED), silent, asked(2, pb.ALLOWED, 0.2, 2)).outside == 1
+def test_the_excess_is_the_largest_share_of_the_half_width():
+    assert of(*stop()).excess == pytest.approx(0.4) and of(*stop(3, 0.04)).excess == pytest.approx(1.2)
 
 
 @pytest.mark.parametrize(
@@ -83,16 +81,6 @@ def test_a_plan_that_is_not_followed_is_not_compared(change):
     plans = of(asked(0, pb.ALLOWED), asked(**{"step": 1, "kind": pb.FAILSAFE, "x": 9.0, "given": 1} | change))
     plans._end()
     assert plans.flown == 0
-
-
-def test_a_plan_that_nothing_verified_has_no_tube():
-    plans = of(asked(0, pb.FAILSAFE, verified=False), asked(1, pb.FAILSAFE, 9.0, 1), asked(2, pb.ALLOWED, 9.0, 2))
-    assert plans.flown == 0
-
-
-def test_a_position_that_is_no_number_is_outside():
-    plans = of(asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, float("nan"), 1), asked(2, pb.ALLOWED, 0.2, 2))
-    assert plans.outside == 1 and np.isfinite(plans.excess)
 
 
 @settings(max_examples=60)
@@ -112,21 +100,12 @@ def test_malformed_exchanges_raise_no_error(data):
 
 def test_plans_are_among_the_figures_of_a_run():
     metrics = Metrics()
-    for sequence, exchange in enumerate(
-        (asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.9, 1), asked(2, pb.ALLOWED, 0.2, 2)), 1
-    ):
+    exchanges = asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.9, 1), asked(2, pb.ALLOWED, 0.2, 2)
+    for sequence, exchange in enumerate(exchanges, 1):
         exchange.header.sequence = sequence
         metrics.add("exchange/a", exchange)
-    assert (
-        metrics.figures()["plans"]
-        == figures(metrics.plans.values())
-        == {
-            "flown": 1,
-            "outside": 1,
-            "excess": pytest.approx(16.0),
-            "bound": None,
-        }
-    )
+    expected = {"flown": 1, "outside": 1, "excess": pytest.approx(16.0), "bound": None}
+    assert metrics.figures()["plans"] == figures(metrics.plans.values()) == expected
 
 
 def left(*bounds):
