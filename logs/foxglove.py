@@ -120,10 +120,9 @@ class FoxgloveConverter:
         site = self._layout.position(robot.name, name, 2.0 * foxglove_scene.half_width(episode))
         actor = self._actors.setdefault(_source(key), _Actor(robot, name, site))
         actor.waiting = None
-        return [
-            _entry(actor, "arena", foxglove_scene.arena(robot, episode, time), time),
-            _entry(actor, "frames", foxglove_scene.frames(robot, name, site, episode.start, time), time),
-        ]
+        arena = foxglove_scene.arena(robot, episode, time)
+        frames = foxglove_scene.frames(robot, name, site, episode.start, time)
+        return _entries(actor, time, arena=arena, frames=frames)
 
     def _exchange(self, key: str, decode: Decode, time: int) -> list[Entry]:
         actor = self._actors.get(_source(key))
@@ -159,19 +158,13 @@ class FoxgloveConverter:
                 exchange = None
         actor.waiting, actor.drawn = None, time * 1e-9
         robot, name = actor.robot, actor.name
-        entries = [
-            _entry(actor, "frames", foxglove_scene.frames(robot, name, actor.site, step.state, time), time),
-            _entry(
-                actor,
-                "decision",
-                foxglove_scene.decision(robot, step, exchange, time, self._reservations(exchange)),
-                time,
-            ),
-        ]
+        scenes: dict[str, Message] = {
+            "frames": foxglove_scene.frames(robot, name, actor.site, step.state, time),
+            "decision": foxglove_scene.decision(robot, step, exchange, time, self._reservations(exchange)),
+        }
         if isinstance(robot, RobotWithTask):
-            rays = foxglove_scene.lidar(robot.task.rays, name, step.next_observation, time)
-            entries.append(_entry(actor, "lidar", rays, time))
-        return entries
+            scenes["lidar"] = foxglove_scene.lidar(robot.task.rays, name, step.next_observation, time)
+        return _entries(actor, time, **scenes)
 
     def _reservations(self, exchange: pb.Exchange | None) -> list[np.ndarray]:
         """Return the boxes that the other robots of the world reserved last, as far as their exchanges were drawn."""
@@ -190,8 +183,9 @@ def _source(key: str) -> str:
     return key.split("/", 1)[1]
 
 
-def _entry(actor: _Actor, what: str, message: Message, time: int) -> Entry:
-    return _stored(f"{ROOT}/{what}/{actor.robot.name}/{actor.name}", message, time)
+def _entries(actor: _Actor, time: int, **scenes: Message) -> list[Entry]:
+    place = f"{actor.robot.name}/{actor.name}"
+    return [_stored(f"{ROOT}/{what}/{place}", message, time) for what, message in scenes.items()]
 
 
 def _stored(key: str, message: Message, time: int) -> Entry:

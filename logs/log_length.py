@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from brakeline.logs.mcap_container import BROKEN
@@ -21,7 +20,7 @@ def count(paths: Paths, topic: Topic) -> int | None:
         with path.open("rb") as file:
             try:
                 summary = make_reader(file).get_summary()
-            except (*BROKEN, McapError):
+            except BROKEN:
                 return None
         if summary is None or summary.statistics is None:
             return None

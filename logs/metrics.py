@@ -7,10 +7,11 @@ figures to the last bit, however the messages of different actors are interleave
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from operator import itemgetter
 from typing import Any, TypeVar
 
 from google.protobuf.message import Message
@@ -183,17 +184,12 @@ class Metrics:
         latest = max((last for _, last in spans.values()), default=0)
         silent = (latest - process.last_health_at) * 1e-9 > SILENT
         return {
-            "starts": process.starts,
-            "run": process.run,
-            "alive": process.alive,
+            **{name: getattr(process, name) for name in ("starts", "run", "alive")},
             "ended": "in order" if not process.alive else "silently" if silent else "alive at the end of the log",
             "seconds": seconds,
             "messages": messages,
             "messages_per_s": messages / seconds if seconds > 0.0 else None,
-            "silences": process.silences,
-            "longest_silence": process.longest_silence,
-            "figures": process.figures,
-            "notes": process.notes,
+            **{name: getattr(process, name) for name in ("silences", "longest_silence", "figures", "notes")},
         }
 
     def _step(self, step: pb.Step) -> None:
@@ -247,22 +243,25 @@ def merge_runs(runs: Mapping[str, Metrics]) -> Figures:
     Args:
         runs: by the prefix that distinguishes the names of their actors, learners and processes.
     """
-    actors = {prefix + name: stats for prefix, run in runs.items() for name, stats in run.actors.items()}
-    names = sorted(actors)
-    figures = closed_loop([actors[name] for name in names])
-    robots = sorted({stats.robot for stats in actors.values()})
-    by_robot = {robot: [actors[name] for name in names if actors[name].robot == robot] for robot in robots}
-    decisions = {prefix + name: part for prefix, run in runs.items() for name, part in run.decisions.items()}
-    learners = {prefix + robot: last for prefix, run in runs.items() for robot, last in run.learners.items()}
+
+    def by_name(table: str) -> dict[str, Any]:
+        parts = ((prefix + name, part) for prefix, run in runs.items() for name, part in getattr(run, table).items())
+        return dict(sorted(parts, key=itemgetter(0)))
+
+    actors = by_name("actors")
+    figures = closed_loop(actors.values())
+    robots: defaultdict[str, list[EpisodeStats]] = defaultdict(list)
+    for stats in actors.values():
+        robots[stats.robot].append(stats)
     seconds = covered(span for run in runs.values() for span in run.spans(run.streams).values())
     return figures | {
         "seconds": seconds,
         "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
         "driven_s": math.fsum(run.seconds(STEP) for run in runs.values()),
-        "robots": {robot: closed_loop(parts) for robot, parts in by_robot.items()},
-        "actors": {name: closed_loop([actors[name]]) for name in names},
-        "learners": {robot: learner(learners[robot]) for robot in sorted(learners)},
-        **merge_decisions([decisions[name] for name in sorted(decisions)]).figures(),
+        "robots": {robot: closed_loop(robots[robot]) for robot in sorted(robots)},
+        "actors": {name: closed_loop([stats]) for name, stats in actors.items()},
+        "learners": {robot: learner(metrics) for robot, metrics in by_name("learners").items()},
+        **merge_decisions(by_name("decisions").values()).figures(),
         "plans": tube_stats.figures(part for run in runs.values() for part in run.plans.copy().values()),
         "topics": topics_of(runs.values()),
         "processes": {

@@ -175,7 +175,7 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     The label of a run is its folder, with the file's name unless that is `run`.
     """
     runs: dict[str, tuple[Path, ...]] = {}
-    for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
+    for (folder, name), files in groupby(paths, key=_run_of):
         place = folder.resolve().name
         label = place if name == "run" else f"{place}/{name}"
         taken = sum(other == label or other.startswith(f"{label} (") for other in runs)
@@ -183,15 +183,17 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     return runs
 
 
-def missing_segments(paths: Sequence[Path]) -> list[DamagedBytes | MissingSegment]:
-    """Return the missing segments: gaps in the numbers of the segments at `paths`."""
-    missing: list[DamagedBytes | MissingSegment] = []
-    for (folder, name), files in groupby(paths, key=lambda path: (path.parent, number_of(path)[0])):
+def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
+    """Yield the missing segments: gaps in the numbers of the segments at `paths`."""
+    for (folder, name), files in groupby(paths, key=_run_of):
         numbers = [number_of(path)[1] for path in files]
         if len(numbers) > 1:
-            gone = sorted(set(range(numbers[-1])) - set(numbers))
-            missing += [MissingSegment(folder / name_of(f"{name}.mcap", number)) for number in gone]
-    return missing
+            for number in sorted(set(range(numbers[-1])) - set(numbers)):
+                yield MissingSegment(folder / name_of(f"{name}.mcap", number))
+
+
+def _run_of(path: Path) -> tuple[Path, str]:
+    return path.parent, number_of(path)[0]
 
 
 def open_log(paths: Paths) -> Log:
