@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import random
 from collections import Counter, defaultdict
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
+from rich.console import Console, RenderableType
 
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
@@ -149,6 +151,13 @@ def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -
     writer.put("log/learner", pb.LogLine(process="learner", level="INFO", text="done"), run, always=True)
     writer.write(folder / "run.mcap")
     return folder
+
+
+def printed(renderable: RenderableType, width: int = 160, **console: Any) -> str:
+    """Return what a console shows."""
+    file = io.StringIO()
+    Console(file=file, width=width, **console).print(renderable)
+    return file.getvalue()
 
 
 def decoded(paths: Iterable[Path]) -> list[tuple[str, Any]]:

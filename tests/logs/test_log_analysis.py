@@ -1,14 +1,13 @@
 """All figures equal those of an independent reader; several logs; memory that does not grow."""
 
-import io
 import itertools
 import json
 import re
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import pytest
-from rich.console import Console
 
 from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.intervention_map import MOST_CELLS, InterventionMap
@@ -19,7 +18,9 @@ from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import by_run, find, open_log
 from brakeline.logs.report import analyse, show, show_episode
 from brakeline.messaging import brakeline_pb2 as pb
-from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once
+from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
+
+Two = tuple[list[dict[str, Any]], dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
@@ -79,31 +80,35 @@ def test_a_resumed_run_is_one_run_and_its_pause_is_not_counted(log: Path) -> Non
     assert figures["metadata"]["model ground"] == ABOUT["model ground"] and figures["seed"] == 7
 
 
-def test_runs_are_labelled_and_merged(tmp_path: Path) -> None:
-    folders = [mixed(tmp_path / name, seed, 8) for seed, name in enumerate(("one", "two"), 5)]
-    both, single = analyse(folders), [analyse(folder) for folder in folders]
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Two:
+    """The figures of two runs, each by itself, and of both."""
+    folder = tmp_path_factory.mktemp("two")
+    folders = [mixed(folder / "one", 5, 8), mixed(folder / "two", 6, 8, later=1e4)]
+    return [analyse(folder) for folder in folders], analyse(folders)
+
+
+def test_runs_are_labelled_and_merged(two: Two) -> None:
+    single, both = two
     assert list(both["runs"]) == ["one", "two"]
     for name in ("steps", "episodes", "goals", "collisions", "timeouts", "interventions"):
         assert both[name] == sum(figures[name] for figures in single), name
         assert [run[name] for run in both["runs"].values()] == [figures[name] for figures in single]
-    assert both["mean_speed"] == pytest.approx(
-        sum(f["mean_speed"] * f["steps"] for f in single) / sum(f["steps"] for f in single)
-    )
+    driven = sum(f["mean_speed"] * f["steps"] for f in single)
+    assert both["mean_speed"] == pytest.approx(driven / both["steps"])
     assert "one/actor-0" in both["actors"] and "two/actor-0" in both["processes"]
     assert (both["seed"], both["metadata"]["run"]) == (7, ABOUT["run"])
-    assert [run["messages"] for run in both["runs"].values()] == [
-        f["runs"][k]["messages"] for f in single for k in f["runs"]
-    ]
+    messages = [run["messages"] for figures in single for run in figures["runs"].values()]
+    assert [run["messages"] for run in both["runs"].values()] == messages
 
 
-def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(tmp_path: Path) -> None:
-    folders = [mixed(tmp_path / "one", 1, 8), mixed(tmp_path / "two", 2, 8, later=1e4)]
-    both, single = analyse(folders), analyse(folders[0])
-    for name, process in single["processes"].items():
-        assert both["processes"][f"one/{name}"]["ended"] == process["ended"]
+def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(two: Two) -> None:
+    single, both = two
+    for label, figures in zip(("one", "two"), single, strict=True):
+        assert both["training"][f"{label}/ground"] == figures["training"]["ground"], "curves are not joined"
+        for name, process in figures["processes"].items():
+            assert both["processes"][f"{label}/{name}"]["ended"] == process["ended"]
     assert {p["ended"] for p in both["processes"].values()} == {"in order", "alive at the end of the log"}
-    for label, folder in zip(("one", "two"), folders, strict=True):
-        assert both["training"][f"{label}/ground"] == analyse(folder)["training"]["ground"], "curves are not joined"
 
 
 def test_the_headline_is_about_the_last_episodes(log: Path) -> None:
@@ -130,10 +135,8 @@ def test_missing_segments_and_damage_are_reported(tmp_path: Path) -> None:
     whole = (tmp_path / "run_0003.mcap").read_bytes()
     (tmp_path / "run_0003.mcap").write_bytes(whole[: len(whole) // 2])
     figures = analyse(tmp_path)
-    assert ["run_0002.mcap: this segment is missing" in figures["cuts"][0], "cannot be read" in figures["cuts"][1]] == [
-        True,
-        True,
-    ]
+    missing, damaged = figures["cuts"]
+    assert "run_0002.mcap: this segment is missing" in missing and "cannot be read" in damaged
     assert figures["topics"]["step/ground/actor-0"]["missing"] > 0
 
 
@@ -149,9 +152,7 @@ def test_the_table_of_an_episode_has_the_recorded_values(log: Path) -> None:
         if step.step in asked and not step.fallback:
             assert row["decide_ms"] == asked[step.step].reply.decision.time_ms
     assert detail["closest"] == min(step.clearance for step in steps) and detail["start"] == [0.0, 0.0]
-    console = Console(record=True, width=200)
-    console.print(show_episode(detail))
-    assert "actor-1, episode 3" in console.export_text()
+    assert "actor-1, episode 3" in printed(show_episode(detail), 200)
     assert len(analyse_runs(log, AnalysisOptions(episode=3)).figures()["episode_detail"]) == 3, "of every actor"
 
 
@@ -175,9 +176,7 @@ def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
 
 
 def test_it_is_shown_whole(log: Path) -> None:
-    console = Console(record=True, width=160)
-    console.print(show(analyse(log), verbose=True))
-    text = console.export_text()
+    text = printed(show(analyse(log), verbose=True))
     words = (
         "closest approach",
         "network",
@@ -258,12 +257,10 @@ def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path:
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])
-def test_console_output_is_complete_at_any_width(tmp_path: Path, columns: int) -> None:
-    folders = [mixed(tmp_path / name, seed, 6) for seed, name in enumerate(("one", "two"), 1)]
-    for figures in (analyse(folders[0]), analyse(folders)):
-        file = io.StringIO()
-        Console(file=file, width=columns, force_terminal=True, color_system=None).print(show(figures))
-        shown = file.getvalue()
+def test_console_output_is_complete_at_any_width(two: Two, columns: int) -> None:
+    single, both = two
+    for figures in (single[0], both):
+        shown = printed(show(figures), columns, force_terminal=True, color_system=None)
         assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
         assert "flight_" not in shown and "bound_step" not in shown, "noise and model sets are for --verbose"
-    assert str(analyse(folders)["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"
+    assert str(both["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.learning_curve import LearningCurve
@@ -20,6 +19,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import LOG
 from tests.logs.conftest import Say
+from tests.logs.sample_log import printed
 
 
 def episode(number: int, decisions: list[int], actor: str = "a", **last: object) -> list[pb.Step]:
@@ -84,15 +84,6 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
     assert (figures["adjusted"], figures["for_clearance"]) == (1, None)
     assert closed_loop([new, old])["for_clearance"] is None and closed_loop([])["for_clearance"] == 0
     assert for_clearance(figures) == "not recorded by this method or version"
-
-
-def test_a_collision_counts_once_an_episode() -> None:
-    tally = EpisodeStats()
-    for number in range(2):
-        for step in episode(number, [0, 0, 0]):
-            step.collision = True
-            tally.step(step)
-    assert tally.collisions == 2
 
 
 def test_without_steps_and_without_a_filter_there_are_no_numbers() -> None:
@@ -194,18 +185,13 @@ def test_analyse_and_a_live_listener_compute_the_same_figures(tmp_path: Path, sa
     assert figures["cuts"] == [] and figures["malformed"] == 0
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     assert math.isfinite(figures["steps_per_s"])
-
-    console = Console(record=True, width=140)
-    console.print(show(figures))
-    text = console.export_text()
+    text = printed(show(figures), 140)
     for expected in ("280", "method ddpc, certificate residual", "step/ground/a", "adjusted"):
         assert expected in text
 
 
 def test_an_empty_run_can_be_shown() -> None:
-    console = Console(record=True, width=140)
-    console.print(show(Metrics().figures()))
-    assert "steps" in console.export_text()
+    assert "steps" in printed(show(Metrics().figures()))
 
 
 def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:

@@ -1,17 +1,15 @@
 """Plans that robots followed are compared with their verified tubes."""
 
-import io
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from brakeline.logs.metrics import Metrics, closed_loop
 from brakeline.logs.report import show
 from brakeline.logs.tube_stats import TubeStats, figures, stated
 from brakeline.messaging import brakeline_pb2 as pb
+from tests.logs.sample_log import printed
 
 N = 4  # periods of a plan
 PLAN = [0.3, 0.2, 0.1, 0.0]  # of one input
@@ -128,8 +126,5 @@ def test_the_stated_bound_is_reported_with_the_count():
 
 
 def test_the_table_of_a_run_shows_both():
-    figures_of = closed_loop([]) | {"plans": left(0.26)}
-    console = Console(file=io.StringIO(), width=160)
-    console.print(show(figures_of))
-    shown = console.file.getvalue()
+    shown = printed(show(closed_loop([]) | {"plans": left(0.26)}))
     assert "1, left their tube: 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown
