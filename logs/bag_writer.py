@@ -9,7 +9,6 @@ import logging
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -26,7 +25,7 @@ FOREVER = QosTime(sec=9223372036, nsec=854775807)
 
 
 class BagWriter:
-    """Records to a new folder; a `brakeline.messaging.ros2.Tap`.
+    """Records to a new folder; a `brakeline.messaging.ros2.MessageTap`.
 
     Raises:
         OSError: the folder exists or cannot be created.
@@ -48,7 +47,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._lock:
             self._failed = True  # ignore later messages
             try:
@@ -74,13 +73,8 @@ class BagWriter:
     def _connection(self, topic: str, kind: type, qos: ros2.Qos) -> Connection:
         name = type_of(kind)
         if (topic, name) not in self._topics:
-            self._topics[topic, name] = self._writer.add_connection(
-                topic,
-                name,
-                msgdef=definition_of(kind),
-                rihs01=digest_of(kind),
-                offered_qos_profiles=[_profile(qos)],
-            )
+            about = {"msgdef": definition_of(kind), "rihs01": digest_of(kind), "offered_qos_profiles": [_profile(qos)]}
+            self._topics[topic, name] = self._writer.add_connection(topic, name, **about)
         return self._topics[topic, name]
 
     def _flush(self) -> None:

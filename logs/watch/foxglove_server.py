@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Collection
-from types import TracebackType
 from typing import Any, Self
 
 import foxglove
@@ -28,9 +26,7 @@ class FoxgloveServer:
         OSError: on entering, if the port is in use.
     """
 
-    def __init__(
-        self, host: str = "127.0.0.1", port: int = 0, rate: float = RATE, origins: Collection[str] = ORIGINS
-    ) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, origins: Collection[str] = ORIGINS) -> None:
         """Create a server.
 
         Args:
@@ -38,7 +34,7 @@ class FoxgloveServer:
             origins: web pages that may connect. Programs that are no browser can always connect.
         """
         self.host, self.port, self._origins = host, port, origins
-        self._converter = FoxgloveConverter(rate)
+        self._converter = FoxgloveConverter(RATE)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
         self._arenas: dict[str, Entry] = {}  # the latest arena of each actor, for viewers that connect later
@@ -59,7 +55,7 @@ class FoxgloveServer:
         self.url = f"ws://{self.host}:{self.port}"
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._gate.close()
         self._server.stop()
 
@@ -93,8 +89,7 @@ class _Listener(ServerListener):
     """Records, in the server's thread, the channels that viewers subscribe to."""
 
     def __init__(self, subscribed: deque[str]) -> None:
-        self._subscribed, self._lock = subscribed, threading.Lock()
+        self._subscribed = subscribed
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        with self._lock:
-            self._subscribed.append(channel.topic)
+        self._subscribed.append(channel.topic)

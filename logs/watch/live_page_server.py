@@ -13,7 +13,6 @@ from collections.abc import Callable
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from types import TracebackType
 from typing import Any, Self
 
 from brakeline.logs.json_values import finite
@@ -58,7 +57,7 @@ class LivePageServer:
         threading.Thread(target=self._http.serve_forever, name="page", daemon=True).start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._http.shutdown()
         self._http.server_close()

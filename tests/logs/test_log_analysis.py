@@ -177,15 +177,7 @@ def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
 
 def test_it_is_shown_whole(log: Path) -> None:
     text = printed(show(analyse(log), verbose=True))
-    words = (
-        "closest approach",
-        "network",
-        "95 %:",
-        "over training",
-        "tube half-width",
-        "bound_step 0.003",
-        "primal_inf",
-    )
+    words = ("closest approach", "network", "95 %:", "over training", "half-width", "bound_step 0.003", "primal_inf")
     assert not [word for word in words if word not in text]
 
 
