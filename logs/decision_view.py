@@ -23,14 +23,12 @@ class DecisionView:
     """One request with its decision, in the world frame, m.
 
     Attributes:
-        exchange: the request and the reply.
         centers, half_widths: (N, d), the tube: one box for the end of each period of the plan; N = 0 without a tube.
         explanation: why the filter changed the proposal; None if the robot is unknown or the message does not fit it.
         perceived: the scan and the moving obstacles of the request; None if the robot is unknown.
         reservations: (k, 2d + 1), boxes that the other robots of the fleet reserve: center, half-width, body radius.
     """
 
-    exchange: pb.Exchange
     centers: Array
     half_widths: Array
     explanation: Explanation | None
@@ -78,11 +76,10 @@ def decision_view(
     centers, half_widths = tube_boxes(exchange, None if robot is None else robot.position_dim)
     boxes = list(reservations)
     if robot is None:
-        return DecisionView(exchange, centers, half_widths, None, None, np.zeros((0, 5)))
+        return DecisionView(centers, half_widths, None, None, np.zeros((0, 5)))
     if len(centers) > robot.horizon:
         raise ValueError(f"a tube has {len(centers)} boxes; the horizon is {robot.horizon} periods")
     return DecisionView(
-        exchange,
         centers,
         half_widths,
         explain(robot, request, decision),

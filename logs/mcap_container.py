@@ -60,7 +60,6 @@ class LogChannel:
 
     Attributes:
         decode: None for an unknown message type.
-        known: whether the message type is known.
         robot, actor: the second and third part of the key, e.g. "ground" and "actor-0".
         sequence: of the message that was read last.
     """
@@ -70,13 +69,11 @@ class LogChannel:
     decode: Callable[[bytes], Any] | None
     schema: Schema | None = None
     channel: Channel | None = None
-    known: bool = False
     robot: str = ""
     actor: str = ""
     sequence: int = 0
 
     def __post_init__(self) -> None:
-        self.known = self.decode is not None
         _, self.robot, self.actor = (*self.key.split("/", 2), "", "")[:3]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -47,17 +46,11 @@ def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     yield from (steps for steps in running.values() if steps)
 
 
-@dataclass(frozen=True)
-class Written:
-    """A Minari data set on the disk."""
-
-    path: Path
-    episodes: int
-    steps: int
-
-
-def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
+def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> dict[str, Any]:
     """Write the episodes of a robot kind as the local Minari data set `name`, e.g. "brakeline/ground-v0".
+
+    Returns:
+        `path`, and the numbers of `episodes` and `steps`.
 
     Actions are the executed ones; rewards have no intervention penalty. `infos` has the proposed actions, the penalty
     and the decisions. The last step of an incomplete episode is truncated. The data set is in
@@ -95,7 +88,7 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> Written:
             dataset.update_dataset_from_buffer(batch)
         count += len(batch)
         steps += sum(len(buffer.rewards) for buffer in batch)
-    return Written(path, count, steps)
+    return {"path": str(path), "episodes": count, "steps": steps}
 
 
 def _buffer(number: int, steps: list[pb.Step]) -> Any:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 Interval = tuple[float, float]
 
 CONFIDENCE = 0.95
@@ -51,28 +53,22 @@ class ClusteredProportion:
     """
 
     def __init__(self) -> None:
-        self.clusters = self.hits = self.trials = 0
-        self.xx = self.xn = self.nn = 0
+        self._sums = np.zeros(6, dtype=int)  # of 1, x, n, x², x n and n² over the episodes
 
     def add(self, hits: int, trials: int) -> None:
         """Add an episode."""
-        self.clusters += 1
-        self.hits += hits
-        self.trials += trials
-        self.xx += hits * hits
-        self.xn += hits * trials
-        self.nn += trials * trials
+        self._sums += (1, hits, trials, hits * hits, hits * trials, trials * trials)
 
     def join(self, other: ClusteredProportion) -> None:
         """Add all episodes of another."""
-        for name in ("clusters", "hits", "trials", "xx", "xn", "nn"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self._sums += other._sums
 
     def interval(self) -> Interval | None:
         """Return the interval, within [0, 1]; None for fewer than two episodes."""
-        if self.clusters < 2 or not self.trials:
+        clusters, hits, trials, xx, xn, nn = self._sums.tolist()
+        if clusters < 2 or not trials:
             return None
-        rate = self.hits / self.trials
-        squares = max(0.0, self.xx - 2.0 * rate * self.xn + rate * rate * self.nn)
-        half = _Z * math.sqrt(squares * self.clusters / (self.clusters - 1)) / self.trials
+        rate = hits / trials
+        squares = max(0.0, xx - 2.0 * rate * xn + rate * rate * nn)
+        half = _Z * math.sqrt(squares * clusters / (clusters - 1)) / trials
         return max(0.0, rate - half), min(1.0, rate + half)

@@ -125,7 +125,7 @@ class Log:
                 for item in records(file, segment.size, self._channel):
                     if type(item) is tuple:
                         segment.count(item[1])
-                        if item[0].known:  # other programs may have added channels
+                        if item[0].decode is not None:  # other programs may have added channels
                             yield item
                     elif isinstance(item, DamagedBytes):
                         recording = segment.recording and item.at_end

@@ -67,8 +67,7 @@ class ExportCommand:
         from brakeline.logs.minari_export import to_minari
 
         assert self.minari is not None
-        written = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
-        return {"path": str(written.path), "episodes": written.episodes, "steps": written.steps}
+        return to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
 
     def _tlog(self) -> dict[str, Any]:
         from brakeline.logs.log_export import to_tlog
