@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from brakeline.logs.episode_sampler import ActorBuffer, EpisodeSampler
-from brakeline.logs.episode_stats import Figures
+from brakeline.logs.episode_stats import Figures, closed_loop
 from brakeline.logs.intervention_map import InterventionMap
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.mcap_container import LogChannel
-from brakeline.logs.metrics import Metrics, closed_loop, merge_runs
+from brakeline.logs.metrics import Metrics, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find
 from brakeline.messaging.rejected_messages import RejectedMessages

@@ -20,7 +20,7 @@ from brakeline.errors import Implausible
 from brakeline.logs import tube_stats
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
-from brakeline.logs.quantiles import QuantileSketch, spread
+from brakeline.logs.quantiles import QuantileSketch
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
@@ -28,8 +28,6 @@ from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
 
 K = TypeVar("K")
 V = TypeVar("V")
-
-__all__ = ["KINDS", "EpisodeStats", "Figures", "Metrics", "closed_loop", "spread"]
 
 MOST_STREAMS = 20_000  # keys and process starts; a message beyond them is rejected
 MOST_NAMES = 4_000  # actors, learners or processes; the sketches of one actor take 10 kB and more
@@ -136,11 +134,6 @@ class Metrics:
         if handler is not None:
             handler(message)
         return True
-
-    @property
-    def failures(self) -> Counter[str]:
-        """Return the number of exchanges without a decision, by reason."""
-        return sum((decisions.failures for decisions in self.decisions.copy().values()), Counter())
 
     def figures(self) -> Figures:
         """Return all figures; None for what was not measured."""

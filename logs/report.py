@@ -10,9 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.logs.console_tables import PLAIN, StackingTable
-from brakeline.logs.episode_stats import CONTACTS, KINDS
+from brakeline.logs.episode_stats import CONTACTS, KINDS, Figures
 from brakeline.logs.log_analysis import SETUP, analyse_runs
-from brakeline.logs.metrics import Figures
 from brakeline.logs.reader import Paths
 from brakeline.logs.tube_stats import stated
 

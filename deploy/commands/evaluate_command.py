@@ -20,7 +20,7 @@ from brakeline.deploy.commands.common_options import (
 )
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.deploy.progress import under_way
-from brakeline.logs.metrics import EpisodeStats
+from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.logs.report import show
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 

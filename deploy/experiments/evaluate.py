@@ -11,8 +11,8 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotG
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
-from brakeline.logs.metrics import EpisodeStats, closed_loop
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import DDPC, Model

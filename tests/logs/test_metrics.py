@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
+from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.learning_curve import LearningCurve
-from brakeline.logs.metrics import EpisodeStats, Metrics, closed_loop, spread
+from brakeline.logs.metrics import Metrics
+from brakeline.logs.quantiles import spread
 from brakeline.logs.recorder import entry
 from brakeline.logs.report import analyse, for_clearance, show
 from brakeline.logs.run_plots import draw

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline.logs.metrics import Metrics, closed_loop
+from brakeline.logs.episode_stats import closed_loop
+from brakeline.logs.metrics import Metrics
 from brakeline.logs.report import show
 from brakeline.logs.tube_stats import TubeStats, figures, stated
 from brakeline.messaging import brakeline_pb2 as pb

@@ -114,7 +114,7 @@ def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
         _imports_what_it_needs(victims)
         victims["safety-0"].kill()
         run.until_steps(200)  # some are taken before it is back
-        assert not [e for e in run.metrics.failures if e not in ("NoReply", "Late")]
+        assert not [e for e in run.metrics.figures()["no_decision"] if e not in ("NoReply", "Late")]
         until(lambda: run.children().get("safety-0", victims["safety-0"]).pid != victims["safety-0"].pid, "a new one")
         children = run.children()
         run.popen.kill()
