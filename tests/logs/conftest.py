@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
-from brakeline.logs.report_page import render
+from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_runs
+from brakeline.logs.report_page import write
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.topic_keys import names_of
@@ -76,14 +76,16 @@ def start(router: Bus) -> Iterator[Start]:
         yield launch
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+@pytest.fixture(scope="session")
+def analysis(tmp_path_factory: pytest.TempPathFactory) -> LogAnalysis:
+    return analyse_runs(mixed(tmp_path_factory.mktemp("page") / "<b>mixed"), AnalysisOptions(pictures=True))
+
+
+@pytest.fixture(scope="session")
+def report(analysis: LogAnalysis, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """The report of a log, and the figures of `analyse --json`."""
-    folder = tmp_path_factory.mktemp("page")
-    log = mixed(folder / "<b>mixed")
-    analysis = analyse_runs(log, AnalysisOptions(pictures=True))
-    path = folder / "report.html"
-    path.write_text(render(analysis.figures(), analysis.by_label()), encoding="utf-8")
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write(path, analysis.figures(), analysis.by_label())
     return path, json.loads(json.dumps(analysis.figures()))
 
 

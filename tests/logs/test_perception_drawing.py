@@ -9,7 +9,7 @@ import pytest
 from brakeline.logs import foxglove_scene
 from brakeline.logs.episode_sampler import EpisodeSampler
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
-from brakeline.logs.report_page import render
+from brakeline.logs.report_page import write
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging import brakeline_pb2 as pb
@@ -131,7 +131,7 @@ def test_browsers_draw_the_perceived_surroundings(say: Say, tmp_path: Path) -> N
                 board.add(say(f"{topic}/ground/{actor}", message))
     analysis = analyse_runs(writer.write(tmp_path / "run.mcap"), AnalysisOptions(pictures=True))
     path = tmp_path / "report.html"
-    path.write_text(render(analysis.figures(), analysis.by_label()), encoding="utf-8")
+    write(path, analysis.figures(), analysis.by_label())
     with LivePageServer(board.view) as server, Page(tmp_path / "profile") as page:
         page.open(path.as_uri())
         page.until("document.documentElement.dataset.drawn === 'yes'")

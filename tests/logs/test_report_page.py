@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
-from brakeline.logs.report_page import embedded, names, number, percent, render
+from brakeline.logs.log_analysis import LogAnalysis, analyse_runs
+from brakeline.logs.report_page import embedded, names, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
 from tests.logs.sample_log import ABOUT, mixed
@@ -65,8 +65,7 @@ def test_the_tables_have_the_values_of_json_without_a_script(report: tuple[Path,
     assert sum(name.startswith("topics.") for name in cells.values) == 3 * len(figures["topics"])
 
 
-def test_it_says_in_words_how_sure_a_model_set_is(tmp_path: Path) -> None:
-    analysis = analyse_runs(mixed(tmp_path / "run"), AnalysisOptions(pictures=True))
+def test_it_says_in_words_how_sure_a_model_set_is(analysis: LogAnalysis) -> None:
     [(label, (figures, pictures))] = analysis.by_label().items()
 
     def said(**more: str) -> str:
@@ -316,11 +315,9 @@ def test_all_files_of_the_page_are_packaged() -> None:
 HOSTILE = '"><img src=x onerror="document.title=\'owned\'"></title></text><script>document.title="owned"</script>'
 
 
-def hostile(folder: Path) -> Path:
+def hostile(path: Path, analysis: LogAnalysis) -> Path:
     """Write a page in which every text that a log can contain is a script."""
-
-    analysis = analyse_runs(mixed(folder / "log"), AnalysisOptions(pictures=True))
-    figures, pictures = json.loads(json.dumps(analysis.by_label()["log"]))
+    [(figures, pictures)] = json.loads(json.dumps(list(analysis.by_label().values())))
     figures["processes"] |= {HOSTILE: next(iter(figures["processes"].values()))}
     figures["topics"] |= {HOSTILE: {"messages": 1, "missing": 1, "duplicates": 1}}
     figures["training"] = {HOSTILE: next(iter(figures["training"].values()))} | figures["training"]
@@ -333,13 +330,12 @@ def hostile(folder: Path) -> Path:
             episode |= {"actor": HOSTILE, "robot": HOSTILE, "arena": HOSTILE, "outcome": HOSTILE}
             for tube in episode["tubes"].values():
                 tube["reason"] = HOSTILE
-    path = folder / "hostile.html"
-    path.write_text(render(figures, {HOSTILE: (figures, pictures)}), encoding="utf-8")
+    write(path, figures, {HOSTILE: (figures, pictures)})
     return path
 
 
-def test_no_text_of_a_log_runs_as_a_script(tmp_path: Path) -> None:
-    path = hostile(tmp_path)
+def test_no_text_of_a_log_runs_as_a_script(tmp_path: Path, analysis: LogAnalysis) -> None:
+    path = hostile(tmp_path / "hostile.html", analysis)
     bare = tmp_path / "bare.html"  # without its policy: the escaping alone must do
     bare.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", path.read_text()))
     for place in (bare, path):
