@@ -121,7 +121,7 @@ class RunAnalysis:
 
     def about(self) -> Figures:
         """Return one row about the run: configuration, figures, missing messages."""
-        metrics, log = self.metrics, self.log
+        metrics, log, topics = self.metrics, self.log, self.metrics.topics().values()
         about = log.metadata.get("run", {})
         setup: Figures = {name: about.get(name) for name in SETUP}
         if (conditions := log.metadata.get("conditions")) is not None:
@@ -132,9 +132,7 @@ class RunAnalysis:
             **setup,
             **closed_loop([metrics.actors[name] for name in sorted(metrics.actors)]),
             "seconds": metrics.seconds(),
-            "messages": sum(stream.received for stream in metrics.streams.values()),
-            "missing": sum(stream.missing for stream in metrics.streams.values()),
-            "duplicates": sum(stream.duplicates for stream in metrics.streams.values()),
+            **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
             "cuts": [str(cut) for cut in log.cuts],
             "metadata": _metadata(log),
@@ -161,6 +159,9 @@ class LogAnalysis:
         """
         rows = {part.label: part.about() for part in self.parts}
         logs = [part.log for part in self.parts]
+        episode = next((part.options.episode for part in self.parts), None)
+        samplers = [part.samplers[robot] for part in self.parts for robot in sorted(part.samplers)]
+        details = [picture for sampler in samplers for picture in sampler.requested_episodes]
         prefixes = [part.prefix if len(self.parts) > 1 else "" for part in self.parts]
         merged = merge_runs({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
         return {
@@ -177,23 +178,12 @@ class LogAnalysis:
             "segments": [_segment(segment) for log in logs for segment in log.segments],
             "cuts": [str(cut) for log in logs for cut in log.cuts],
             "malformed": sum(log.malformed for log in logs),
-            **self._episode(),
+            **({} if episode is None else {"episode": episode, "episode_detail": details}),
         }
 
     def by_label(self) -> dict[str, tuple[Figures, Figures]]:
         """Return figures and pictures of each run, by its label."""
         return {part.label: (part.figures(), part.pictures()) for part in self.parts}
-
-    def _episode(self) -> Figures:
-        """Return the requested episode of every run, step by step."""
-        wanted = next((part.options.episode for part in self.parts), None)
-        if wanted is None:
-            return {}
-        samplers = [part.samplers[robot] for part in self.parts for robot in sorted(part.samplers)]
-        return {
-            "episode": wanted,
-            "episode_detail": [episode for sampler in samplers for episode in sampler.requested_episodes],
-        }
 
 
 def analyse_runs(paths: Paths, options: AnalysisOptions | None = None) -> LogAnalysis:
