@@ -16,7 +16,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 RATIO = 1.01  # of the edges of a bin
 RESOLUTION = 0.005  # largest relative error of a percentile
@@ -72,11 +71,8 @@ class QuantileSketch:
         return copy
 
     def _flush(self) -> None:
-        batch, self.pending = np.asarray(self.pending), array("d")
-        self.add_array(batch)
-
-    def add_array(self, values: NDArray[np.float64]) -> None:
-        """Add values (n,)."""
+        """Sort the pending values into bins."""
+        values, self.pending = np.asarray(self.pending), array("d")
         finite = np.abs(values) < HUGE  # False for NaN
         self.not_finite += len(values) - int(finite.sum())
         values = values[finite]
