@@ -73,8 +73,10 @@ class BagWriter:
     def _connection(self, topic: str, kind: type, qos: ros2.Qos) -> Connection:
         name = type_of(kind)
         if (topic, name) not in self._topics:
-            about = {"msgdef": definition_of(kind), "rihs01": digest_of(kind), "offered_qos_profiles": [_profile(qos)]}
-            self._topics[topic, name] = self._writer.add_connection(topic, name, **about)
+            definition, digest, profiles = definition_of(kind), digest_of(kind), [_profile(qos)]
+            self._topics[topic, name] = self._writer.add_connection(
+                topic, name, msgdef=definition, rihs01=digest, offered_qos_profiles=profiles
+            )
         return self._topics[topic, name]
 
     def _flush(self) -> None:
