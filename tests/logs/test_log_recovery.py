@@ -32,7 +32,7 @@ def whole(path: Path) -> list[int]:
     """Return the sequence numbers of a file that the `mcap` package's seeking reader can read."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        decoded = reader.iter_decoded_messages(topics=["step/ground/actor-0"])
+        decoded = reader.iter_decoded_messages(topics=["step/ground/actor-0", "step/ground/launcher"])
         numbers = [item.decoded_message.header.sequence for item in decoded]
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
