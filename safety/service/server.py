@@ -166,9 +166,9 @@ class BatchHandler:
             messages = [batch.requests[i] for i in world]
             for i, reply in zip(world, self._decide_world(messages, received), strict=True):
                 replies[i] = reply
-        payload = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
+        answer = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
         self.counts.busy_time += (perf_counter_ns() - received) * 1e-9
-        return payload
+        return answer
 
     def _decide_world(self, messages: Sequence[pb.Request], received: int) -> list[pb.Reply]:
         """Return the replies about the robots of one world; received: time of receipt [ns]."""
