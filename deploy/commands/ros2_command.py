@@ -76,7 +76,7 @@ class Ros2Command:
     fresh: Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
     filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
     connect: tuple[str, ...] = ()
-    """Endpoints of a bus whose safety service to query_service. Without one the filter runs in this process."""
+    """Endpoints of the bus of a safety service to query. Without one the filter runs in this process."""
     keys: Path | None = None
     """With --connect: folder with the keys of --client. Defaults to $BRAKELINE_KEYS, else to no keys."""
     client: str = "client"
