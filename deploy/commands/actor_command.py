@@ -6,16 +6,7 @@ import os
 from dataclasses import dataclass, field
 from functools import partial
 
-from brakeline.deploy.commands.common_options import (
-    ArenaName,
-    BusOptions,
-    FilterOptions,
-    FlightOptions,
-    PhysicsOptions,
-    Robot,
-    Seed,
-    Unprefixed,
-)
+from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.messaging.task import address, address_in_real_time, robot_with_task
@@ -26,10 +17,10 @@ from brakeline.safety.model.model_config import check_reservations
 class ActorCommand:
     """The options of `brakeline actor`."""
 
-    robot: Robot = "ground"
-    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
-    filtering: Unprefixed[FilterOptions] = field(default_factory=FilterOptions)
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    robot: options.Robot = "ground"
+    endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
+    filtering: options.Unprefixed[options.FilterOptions] = field(default_factory=options.FilterOptions)
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     name: str = f"actor-{os.uname().nodename.split('.')[0]}"
     """Name of the actor on the bus. Each actor of a run needs its own."""
     number: int = 0
@@ -39,8 +30,8 @@ class ActorCommand:
     """Robots in this process. They share one request to the safety service."""
     fleet: int = 0
     """Robots in this process that share one world and avoid each other. 0 gives each robot a world of its own."""
-    seed: Seed = 0
-    arena: ArenaName = "default"
+    seed: options.Seed = 0
+    arena: options.ArenaName = "default"
     penalty: float = RunConfig.penalty
     """Penalty subtracted from the learned reward for a correction by the whole range of an input."""
     deadline: float = RunConfig.deadline
@@ -56,7 +47,7 @@ class ActorCommand:
     url: str = ""
     """Link to a vehicle to fly in real time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The map is the arena
     drawn with the seed. The safety service must serve quadrotor-late."""
-    flight: Unprefixed[FlightOptions] = field(default_factory=FlightOptions)
+    flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
 
     def run(self) -> int:
         """Act until the last step, SIGINT or SIGTERM. Returns the exit status."""

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from brakeline.deploy.commands.common_options import Json, Seed, errors, print_json
+from brakeline.deploy.commands.command_output import errors, print_json
+from brakeline.deploy.commands.common_options import Json, Seed
 from brakeline.deploy.run import autopilot_run, px4_simulation
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT

@@ -7,15 +7,8 @@ import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from brakeline.deploy.commands.common_options import (
-    ArenaName,
-    Json,
-    PhysicsOptions,
-    Seed,
-    Unprefixed,
-    errors,
-    print_counts,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import errors, print_counts
 from brakeline.deploy.commands.ros2_command import GraphOptions, log_to_stderr, open_bag
 from brakeline.deploy.run.ros2_bridge import Bridge, BridgeSettings
 from brakeline.messaging.ros2 import RosSettings
@@ -30,9 +23,9 @@ class BridgeSimCommand:
     """Act as the Zenoh router at these endpoints."""
     router: tuple[str, ...] = ()
     """Connect to a running router of rmw_zenoh at these endpoints instead."""
-    graph: Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
-    arena: ArenaName = "default"
-    seed: Seed = 0
+    graph: options.Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
+    arena: options.ArenaName = "default"
+    seed: options.Seed = 0
     sim_time: bool = False
     """Publish simulated time on /clock, instead of using the time of this machine."""
     factor: float = 1.0
@@ -43,12 +36,12 @@ class BridgeSimCommand:
     """Time without a command after which the base stops [s]."""
     stamped: bool = False
     """Expect TwistStamped commands."""
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     bag: Path | None = None
     """Record all received and sent messages as a ROS 2 bag in this folder, which must not exist."""
     seconds: float = 0.0
     """Duration by the clock of the robot [s]. 0 runs until you press ^C."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> int:
         """Simulate until the duration ends, SIGINT or SIGTERM. Returns the exit status."""

@@ -10,18 +10,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import (
-    AcceptBound,
-    BusOptions,
-    Json,
-    Mode,
-    Unprefixed,
-    conditions_table,
-    console,
-    default_keys,
-    errors,
-    print_json,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, record_path
@@ -53,7 +43,7 @@ class CertifyCommand:
     --robot."""
     certificates: tuple[str, ...] = KINDS
     """Error bounds to validate (see docs/certificates.md)."""
-    mode: Mode | None = None
+    mode: options.Mode | None = None
     """Prediction mode to validate. Defaults to both."""
     windows: Literal["plan", "free", "auto"] = "auto"
     """Driving to fit and validate on: plan for plans as the filter makes them, free for any, auto for any if there are
@@ -69,60 +59,66 @@ class CertifyCommand:
     """Number of last steps of a log to take."""
     use: bool = False
     """Write the model sets to where the other commands load them from."""
-    accept_bound: AcceptBound = None
+    accept_bound: options.AcceptBound = None
     publish: bool = False
     """Replace the model set of running safety services by the first of --certificates, in direct mode unless you give
     --mode."""
-    endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
+    endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
     verbose: bool = False
     """Show also the conditions of the recording: sensor errors, wind, payload."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
         path, source = self._load()
-        data, robot = source.data, source.data.robot
-        accepted_bound(robot, self.accept_bound)
+        accepted_bound(source.data.robot, self.accept_bound)
         models: list[tuple[ModelSet, ValidationReport]] = []
         results: dict[str, Any] = {}
         notes: list[str] = []
-        refused = False
         modes = (self.mode,) if self.mode else MODES
         with under_way("certifying", len(self.certificates) * len(modes)) as advance:
             for kind, mode in product(self.certificates, modes):
                 advance(0, f"certifying {kind}, {mode}")
-                config = ModelConfig(kind, mode)
                 try:
+                    config = ModelConfig(kind, mode)
                     config = config.of_minutes() if self.few else config
-                    model, report, unsupported = certify_supported(data, config, self.windows, self.until_held)
+                    model, report, unsupported = certify_supported(source.data, config, self.windows, self.until_held)
                 except Unsupported as error:
-                    results.setdefault(kind, {})[mode] = {"refused": str(error)}
+                    figures = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
                     if not self.few:
                         errors.print("give --few to certify minutes of driving", markup=False)
-                    continue
-                finally:
-                    advance()
-                models.append((model, report))
-                notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
-                figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
-                refusal_text = refusal(robot, model.about, self.accept_bound) if self.use or self.publish else ""
-                if refusal_text:
-                    refused = True
-                    figures["not_used"] = refusal_text
-                    errors.print(f"[red]{kind}, {mode}: not put to use:[/] {escape(refusal_text)}")
-                elif self.use:
-                    self._save(model, data)
+                else:
+                    models.append((model, report))
+                    notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
+                    figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
+                    figures |= self._put_to_use(model, source.data)
                 results.setdefault(kind, {})[mode] = figures
+                advance()
         if self.json:
             # The figures of a certificate are those of the direct mode; those of each mode stand beside them.
             flat = {kind: row.get("direct", next(iter(row.values()))) | row for kind, row in results.items()}
-            print_json(flat | {"source": str(path), "periods": data.periods, "note": source.note})
+            print_json(flat | {"source": str(path), "periods": source.data.periods, "note": source.note})
         else:
             self._print(models, notes, path, source)
-        if self.publish and models and not refusal(robot, models[0][0].about, self.accept_bound):
-            self._publish(models[0][0], data)
-        return 1 if refused or not models else 0
+        if self.publish and models and not self._refusal(models[0][0], source.data):
+            self._publish(models[0][0], source.data)
+        return int(not models or any("not_used" in row for modes in results.values() for row in modes.values()))
+
+    def _put_to_use(self, model: ModelSet, data: Dataset) -> dict[str, str]:
+        """Save the model set if you give --use, or return and print the reason why it may not be used."""
+        if not (self.use or self.publish):
+            return {}
+        if refused := self._refusal(model, data):
+            config = model.model_config
+            errors.print(f"[red]{config.certificate}, {config.mode}: not put to use:[/] {escape(refused)}")
+            return {"not_used": refused}
+        if self.use:
+            self._save(model, data)
+        return {}
+
+    def _refusal(self, model: ModelSet, data: Dataset) -> str:
+        return refusal(data.robot, model.about, self.accept_bound)
 
     def _print(
         self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], path: Path, source: Recorded
@@ -139,7 +135,7 @@ class CertifyCommand:
 
     def _save(self, model: ModelSet, data: Dataset) -> None:
         """Write a model set to where the other commands load it from; signed, if there is a key to sign with."""
-        path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or default_keys()
+        path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or options.default_keys()
         seal_of(path).unlink(missing_ok=True)
         if keys is not None and (keys / KEY).exists():
             ModelSigner.load(keys).sign(model, data).save(path)

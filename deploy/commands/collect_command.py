@@ -8,18 +8,9 @@ from typing import Any
 
 from rich.markup import escape
 
+from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.certify_command import bounds_in_words, validation_table
-from brakeline.deploy.commands.common_options import (
-    AcceptBound,
-    Json,
-    PhysicsOptions,
-    Robot,
-    Seed,
-    Unprefixed,
-    console,
-    errors,
-    print_json,
-)
+from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import model_path, record_path
 from brakeline.deploy.data.simulated_recording import SEED, load_or_record
@@ -32,19 +23,19 @@ from brakeline.safety.model.stated_bound import accepted_bound, refusal
 class CollectCommand:
     """The options of `brakeline collect`."""
 
-    robot: Robot = "ground"
+    robot: options.Robot = "ground"
     trajectories: int | None = None
     """Trajectories to record, each of 300 control periods. Defaults to as many as the plans of the robot need."""
-    seed: Seed = SEED
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    seed: options.Seed = SEED
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     out: Path | None = None
     """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
     url: str = ""
     """Link to a vehicle for its first flight: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The vehicle takes
     off, flies random targets in a box, slowly at first, and lands. No filter checks this flight: clear the box."""
-    first: Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
-    accept_bound: AcceptBound = None
-    json: Json = False
+    first: options.Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
+    accept_bound: options.AcceptBound = None
+    json: options.Json = False
 
     def run(self) -> int:
         """Record the data set. Returns the exit status; 1 if a first flight gave no model set to use."""
@@ -54,11 +45,9 @@ class CollectCommand:
         path = self.out or record_path(robot)
         data = load_or_record(robot, path, self.trajectories, self.seed, self.physics.conditions(), again=True)
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
-        if self.json:
-            print_json(figures | {"digest": data.digest(), "about": data.about})
-        else:
-            console.print(f"{path}: {data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}")
-            console.print(f"next: brakeline certify {path}")
+        figures |= {"digest": data.digest(), "about": data.about}
+        counts = f"{data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}"
+        print_result(self.json, figures, f"{path}: {counts}", f"next: brakeline certify {path}")
         return 0
 
     def _first_flight(self) -> int:
@@ -88,9 +77,5 @@ class CollectCommand:
                 model.save(used)
                 figures["model"] = str(used)
                 text.append(f"{used}: in use from now on")
-        if self.json:
-            print_json(figures)
-        else:
-            for part in (*text, *(f"missing: {line}" for line in flight.missing)):
-                console.print(part, markup=False)
+        print_result(self.json, figures, *text, *(f"missing: {line}" for line in flight.missing))
         return 0 if "model" in figures else 1

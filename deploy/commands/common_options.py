@@ -1,22 +1,19 @@
-"""Define the options and the output helpers that several commands share.
+"""Define the options that several commands share.
 
 This module imports nothing heavy, so that `--help` and a mistyped option are answered at once.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
-from rich.console import Console
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, SensorFaults, Wind
 
@@ -64,10 +61,6 @@ Pictures = Annotated[
 ]
 Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
 VehicleUrl = "udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT"
-
-# The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
-console = Console(highlight=False, soft_wrap=True)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -225,34 +218,3 @@ def bus_of(run: Path) -> BusSettings:
         return client_settings(run)
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(f"no run at {run}: give --connect tls/HOST:PORT, or start `brakeline train`") from error
-
-
-def print_json(figures: dict[str, Any]) -> None:
-    """Print one JSON object on stdout. Numbers that are not finite become null."""
-    print(json.dumps(_finite(figures)))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def print_counts(figures: dict[str, float], as_json: bool) -> None:
-    """Print named numbers: as JSON on stdout, or in one line on stderr."""
-    if as_json:
-        print_json(figures)
-    else:
-        errors.print(", ".join(f"{name} {value:g}" for name, value in figures.items()))
-
-
-def conditions_table(conditions: dict[str, str]) -> StackingTable:
-    """Return a table with one line for each recording condition."""
-    table = StackingTable(show_header=False, **PLAIN)
-    for name, value in conditions.items():
-        table.add_row(name.replace("_", " "), value)
-    return table

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import tyro
 from rich.markdown import Markdown
 
-from brakeline.deploy.commands.common_options import Json, console, errors, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments import conservatism
 from brakeline.deploy.experiments.comparison_cells import (

@@ -5,19 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from brakeline.deploy.commands.common_options import (
-    ArenaName,
-    Json,
-    PhysicsOptions,
-    Robot,
-    Seed,
-    ServiceOptions,
-    Unprefixed,
-    conditions_table,
-    console,
-    errors,
-    print_json,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.deploy.progress import under_way
 from brakeline.logs.episode_stats import EpisodeStats
@@ -29,19 +18,19 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 class EvaluateCommand:
     """The options of `brakeline evaluate`."""
 
-    robot: Robot = "ground"
+    robot: options.Robot = "ground"
     policy: str = "astar"
     """Policy to evaluate: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
     astar, careful (astar far from obstacles), a weights file, or a CSV file of inputs as `brakeline excite` prints
     them."""
-    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
-    arena: ArenaName = "default"
+    filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
+    arena: options.ArenaName = "default"
     episodes: int = 100
     """Episodes to drive. A fleet counts those of all its robots, and completes each world."""
     fleet: int = 0
     """Robots that share one world and avoid each other. 0 evaluates one robot alone."""
-    seed: Seed = 0
+    seed: options.Seed = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""
     episode: int = 0
@@ -50,7 +39,7 @@ class EvaluateCommand:
     """With --render: draw the same episode without the filter beside it."""
     verbose: bool = False
     """Show also the conditions: sensor errors, wind, payload."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> int:
         """Drive the episodes and print the figures. Returns the exit status."""

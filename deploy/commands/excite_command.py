@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from brakeline.deploy.commands.common_options import Json, Robot, Seed, console, print_json
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import Json, Robot, Seed
 from brakeline.deploy.data import excitation_plan
 from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.progress import under_way

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.commands.common_options import LATEST, Json, Logs, console, print_json
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import LATEST, Json, Logs
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.task import robot_with_task
 

@@ -8,21 +8,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.deploy.commands.common_options import (
-    ArenaName,
-    FlightOptions,
-    Json,
-    PhysicsOptions,
-    Pictures,
-    RunBusOptions,
-    RunFolder,
-    Seed,
-    ServiceOptions,
-    Unprefixed,
-    console,
-    errors,
-    print_json,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.train_command import STOPPED, dated_folder
 from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.deploy.run.display import Display, summary
@@ -54,25 +41,25 @@ class FlyCommand:
     """MAVLink system ids of the vehicles, one for each link. Defaults to --system for all."""
     vehicles: int = 1
     """Number of simulated vehicles."""
-    flight: Unprefixed[FlightOptions] = field(default_factory=FlightOptions)
+    flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
     rules: Literal["px4", "ardupilot"] = "px4"
     """Rules of the simulated autopilot: its modes, refusals and parameters."""
     setpoint_timeout: float = AutopilotConfig.setpoint_timeout
     """Time without a setpoint after which the simulated autopilot brakes [s]."""
-    arena: ArenaName = "default"
-    seed: Seed = 0
-    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    arena: options.ArenaName = "default"
+    seed: options.Seed = 0
+    filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     practice: float = 0.0
     """Share of the steps at which a vehicle starts to follow its backup plan to the stop, so that the log has the stops
     that `brakeline certify LOG` needs."""
     deadline: float = 0.12
     """Time that an actor waits for an answer of the safety service [s]. The answer applies from the next control period
     (0.2 s) on."""
-    pictures: Pictures = RunConfig.pictures
-    out: RunFolder = None
-    meeting: Unprefixed[RunBusOptions] = field(default_factory=RunBusOptions)
-    json: Json = False
+    pictures: options.Pictures = RunConfig.pictures
+    out: options.RunFolder = None
+    meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    json: options.Json = False
 
     def run(self) -> int:
         """Fly. Returns the exit status."""

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import Json, console, errors, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data import importer
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.coverage import Coverage, coverage

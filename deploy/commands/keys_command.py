@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from brakeline.deploy.commands.common_options import console
+from brakeline.deploy.commands.command_output import console
 from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.bus.certificate_authority import DAYS, Authority
 from brakeline.messaging.bus.identity import SERVERS, role_of

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from brakeline.deploy.commands.common_options import Json, Robot, console, errors, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.common_options import Json, Robot
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import pretrained
 from brakeline.deploy.data.rival_pretraining import recipe_for

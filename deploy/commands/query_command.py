@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed, console, print_json
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed
 from brakeline.errors import BadScan
 from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.messaging.bus import Bus

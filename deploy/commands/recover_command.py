@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from brakeline.deploy.commands.common_options import Json, console, print_json
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.progress import under_way
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import find

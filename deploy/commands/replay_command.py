@@ -11,7 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, console, print_json
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way

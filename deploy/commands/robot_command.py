@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.common_options import Json, console, errors, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.errors import BadDescription
 from brakeline.logs.console_tables import PLAIN, StackingTable

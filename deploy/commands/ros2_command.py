@@ -14,14 +14,8 @@ from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.ros2_process import Ros2Settings, Topics, driven, run
 from brakeline.actors.ros2.ros_inputs import AgeLimits, SensorSettings
 from brakeline.actors.ros2.sensor_frames import PlanarPose
-from brakeline.deploy.commands.common_options import (
-    Json,
-    Robot,
-    ServiceOptions,
-    Unprefixed,
-    default_keys,
-    print_counts,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import print_counts
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.logs.bag_writer import BagWriter
@@ -48,10 +42,10 @@ class GraphOptions:
 class Ros2Command:
     """The options of `brakeline ros2`."""
 
-    robot: Robot = "ground"
+    robot: options.Robot = "ground"
     router: tuple[str, ...] = (ROUTER,)
     """Endpoints of the router of rmw_zenoh, as Zenoh writes them."""
-    graph: Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
+    graph: options.Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
     name: str = "brakeline"
     """Name of the node."""
     topics: Topics = field(default_factory=Topics)
@@ -73,8 +67,8 @@ class Ros2Command:
     """Frame of the odometry."""
     base_frame: str = "base_footprint"
     """With --tf: frame of the robot. The robot turns about its origin."""
-    fresh: Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
-    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
+    fresh: options.Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
+    filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     connect: tuple[str, ...] = ()
     """Endpoints of the bus of a safety service to query. Without one the filter runs in this process."""
     keys: Path | None = None
@@ -85,7 +79,7 @@ class Ros2Command:
     """Record all received and sent messages as a ROS 2 bag in this folder, which must not exist."""
     seconds: float = 0.0
     """Duration by the clock of the robot [s]. 0 runs until you press ^C."""
-    json: Json = False
+    json: options.Json = False
 
     def run(self) -> int:
         """Filter commands until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
@@ -126,7 +120,7 @@ class Ros2Command:
         def ask_service(requests: Sequence[pb.Request]) -> list[pb.Reply]:
             return query_service(bus, requests, deadline)
 
-        keys = self.keys or default_keys()
+        keys = self.keys or options.default_keys()
         with Bus(BusSettings(connect=self.connect, keys=keys), self.client if keys else self.name) as bus:
             yield ask_service
 

@@ -7,17 +7,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from brakeline.deploy.commands.common_options import (
-    Json,
-    PhysicsOptions,
-    RunBusOptions,
-    RunFolder,
-    ServiceOptions,
-    Unprefixed,
-    console,
-    errors,
-    print_json,
-)
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, load
 
@@ -31,15 +22,15 @@ class TrainCommand(RunConfig):
     steps: int = 0
     """Training steps for each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the logs if
     there is no actor."""
-    filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
-    physics: Unprefixed[PhysicsOptions] = field(default_factory=PhysicsOptions)
+    filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
+    physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     experiment: str = "default"
     """Configuration that the other options start from: default, demo or debug."""
-    out: RunFolder = None
+    out: options.RunFolder = None
     resume: Path | None = None
     """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""
-    meeting: Unprefixed[RunBusOptions] = field(default_factory=RunBusOptions)
-    json: Json = False
+    meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    json: options.Json = False
 
     # Options that `--help` leaves to `--help-all`.
     expert: ClassVar[tuple[str, ...]] = (
@@ -107,7 +98,7 @@ def _run_values(config: RunConfig) -> dict[str, Any]:
     return {item.name: getattr(config, item.name) for item in fields(RunConfig)}
 
 
-def train(config: RunConfig, folder: Path, resume: bool, meeting: RunBusOptions, as_json: bool) -> int:
+def train(config: RunConfig, folder: Path, resume: bool, meeting: options.RunBusOptions, as_json: bool) -> int:
     """Run all processes of a configuration, with a display on stdout (with `as_json` on stderr).
 
     Returns the exit status: 0, or STOPPED if the run was stopped before its last step.

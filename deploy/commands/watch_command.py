@@ -9,7 +9,8 @@ from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from brakeline.deploy.commands.common_options import BusOptions, Unprefixed, console
+from brakeline.deploy.commands.command_output import console
+from brakeline.deploy.commands.common_options import BusOptions, Unprefixed
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
 from brakeline.logs.watch.live_page_server import LivePageServer

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from brakeline.deploy.commands import common_options
+from brakeline.deploy.commands import command_output
 from brakeline.deploy.run.display import Display, line, live, run_phase, summary
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.run_config import RunConfig
@@ -78,7 +78,7 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypa
 
 
 def test_the_summary_has_the_paths_whole(view: Launcher) -> None:
-    console = Console(file=io.StringIO(), soft_wrap=common_options.console.soft_wrap)
+    console = Console(file=io.StringIO(), soft_wrap=command_output.console.soft_wrap)
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
     summary(console, view.metrics.figures() | paths | {"finished": False, "restarts": {"learner": 2, "safety-0": 1}})

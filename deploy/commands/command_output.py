@@ -1,0 +1,53 @@
+"""Print the results of commands: as text for people, or with `--json` as one JSON object."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from rich.console import Console, RenderableType
+
+from brakeline.logs.console_tables import PLAIN, StackingTable
+
+# The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
+console = Console(highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def print_json(figures: dict[str, Any]) -> None:
+    """Print one JSON object on stdout. Numbers that are not finite become null."""
+    print(json.dumps(_finite(figures)))
+
+
+def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType) -> None:
+    """Print the figures as one JSON object, or else the lines, whose text is no markup."""
+    if as_json:
+        print_json(figures)
+        return
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_counts(figures: dict[str, float], as_json: bool) -> None:
+    """Print named numbers: as JSON on stdout, or in one line on stderr."""
+    if as_json:
+        print_json(figures)
+    else:
+        errors.print(", ".join(f"{name} {value:g}" for name, value in figures.items()))
+
+
+def conditions_table(conditions: dict[str, str]) -> StackingTable:
+    """Return a table with one line for each recording condition."""
+    table = StackingTable(show_header=False, **PLAIN)
+    for name, value in conditions.items():
+        table.add_row(name.replace("_", " "), value)
+    return table
