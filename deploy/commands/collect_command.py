@@ -59,7 +59,7 @@ class CollectCommand:
         flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first)
         with folder_lock(path.parent):
             flight.data.save(path)
-        minutes, model, report = flight.seconds / 60.0, flight.model, flight.statement
+        minutes, model, report = flight.seconds / 60.0, flight.model, flight.report
         figures: dict[str, Any] = {"path": str(path), "periods": flight.data.periods, "minutes": minutes}
         figures |= {"level": flight.level, "missing": flight.missing}
         text: list[Any] = [f"{path}: {flight.data.periods} periods in {minutes:.1f} min of flight"]

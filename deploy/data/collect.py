@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from brakeline.deploy.data.excitation import excitation
+from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
@@ -32,18 +33,15 @@ def record(
     for number in range(first, trajectories):
         rng = np.random.default_rng((seed, number))
         vehicle = vehicle_in_empty_arena(robot, rng, conditions)
-        states, inputs, paths, turned = [vehicle.measured], [], [], []
+        built = TrajectoryBuilder(vehicle.measured)
         for u in itertools.islice(excitation(robot, rng), PERIODS):
             period = vehicle.step(u)
             if period.collision:
                 raise RuntimeError(
                     f"trajectory {number} touched something: the recording yard is too small for the robot"
                 )
-            states.append(period.measured)
-            inputs.append(vehicle.input)
-            paths.append(period.subsamples)
-            turned.append(period.turned)
-        yield Trajectory(*(np.array(values) for values in (states, inputs, paths, turned)))
+            built.add(vehicle.input, period.measured, period.subsamples, period.turned)
+        yield built.trajectory()
 
 
 def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions) -> Dataset:

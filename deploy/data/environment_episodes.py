@@ -8,15 +8,17 @@ env = SafetyWrapper(env, Filter(model), state=state, obstacles=obstacles, action
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from brakeline.deploy.data.excitation import MOST_HELD, excitation
+from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
+from brakeline.deploy.progress import under_way
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
@@ -63,31 +65,14 @@ def collect(
         Mismatch: the environment gives no state, or its action space does not match the robot's inputs.
         BadData: the recording is not a valid data set, or every episode ends at once.
     """
-    between = mapping_for_space(env.action_space, robot, actions)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    driven = _Environment(env, robot, mapping_for_space(env.action_space, robot, actions), state, disturbed)
     trajectories: list[Trajectory] = []
-    empty_episodes = number = 0
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as progress:
-        task = progress.add_task(f"driving {robot.name}", total=periods)
-        while not progress.finished:
-            rng = np.random.default_rng((seed, number))
-            first = seed if number == 0 else None
-            left = periods - int(progress.tasks[0].completed)
-            new = [
-                t
-                for t in _episode(
-                    env,
-                    robot,
-                    excitation(robot, rng, held),
-                    first,
-                    min(LONGEST, left),
-                    options,
-                    between,
-                    state,
-                    disturbed,
-                )
-                if len(t.inputs) >= min(FEWEST, left)
-            ]
+    empty_episodes = number = recorded = 0
+    with under_way(f"driving {robot.name}", periods) if shown else nullcontext(_ignore) as advance:
+        while recorded < periods:
+            inputs, left = excitation(robot, np.random.default_rng((seed, number)), held), periods - recorded
+            episode = driven.episode(inputs, min(LONGEST, left), None if number else seed, options)
+            new = [t for t in episode if len(t.inputs) >= min(FEWEST, left)]
             number += 1
             empty_episodes = 0 if new else empty_episodes + 1
             if empty_episodes >= MAX_EMPTY:
@@ -95,75 +80,60 @@ def collect(
                     f"{MAX_EMPTY} episodes in a row ended before period {FEWEST}: check why the environment ends"
                 )
             trajectories += new
-            progress.advance(task, sum(len(t.inputs) for t in new))
-    sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-    off = (
-        chord_deviation
-        if chord_deviation is not None
-        else 0.0
-        if sampled
-        else _chord_deviation_bound(robot, trajectories)
-    )
+            added = sum(len(t.inputs) for t in new)
+            recorded += added
+            advance(added)
+    if chord_deviation is None:
+        sampled = any(t.paths.shape[1] > 1 for t in trajectories)
+        chord_deviation = 0.0 if sampled else _chord_deviation_bound(robot, trajectories)
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
-    data = Dataset(robot, tuple(trajectories), about, off)
+    data = Dataset(robot, tuple(trajectories), about, chord_deviation)
     data.check()
     return data
 
 
-def _episode(
-    env: gymnasium.Env[Any, Any],
-    robot: Robot,
-    inputs: Generator[Array, Array | None, None],
-    seed: int | None,
-    most: int,
-    options: dict[str, Any] | None,
-    between: ActionMapping,
-    state: View,
-    disturbed: Callable[[Any, Any, dict[str, Any]], bool],
-) -> Iterator[Trajectory]:
-    """Yield the undisturbed trajectories of one episode."""
-    observation, info = env.reset(seed=seed, options=options)
-    measured = np.array(state(env, observation, info), dtype=float)
-    u, before = next(inputs), None
-    record = _RecordedEpisode(robot, measured, before)
-    for _ in range(most):
-        action = cast_action(between.control_to_action(u), env.action_space)
-        observation, _, terminated, truncated, info = env.step(action)
-        if terminated:
-            break
-        measured = np.array(state(env, observation, info), dtype=float)
-        executed = np.clip(np.asarray(info.get("input_in_force", u), dtype=float), robot.low(), robot.high())
-        if disturbed(env, observation, info):
-            yield from record.done()
-            record = _RecordedEpisode(robot, measured, executed)
-        else:
-            record.add(executed, measured, info)
-        if truncated:
-            break
-        u = inputs.send(measured)
-    yield from record.done()
+def _ignore(by: int = 1, what: str | None = None) -> None:
+    """Show no progress."""
 
 
-class _RecordedEpisode:
-    """A trajectory during its recording."""
+@dataclass(frozen=True)
+class _Environment:
+    """An environment that a robot's inputs drive."""
 
-    def __init__(self, robot: Robot, state: Array, before: Array | None) -> None:
-        self.robot, self.before = robot, before
-        self.states, self.inputs = [state], list[Array]()
-        self.paths, self.turned = list[Array](), list[float]()
+    env: gymnasium.Env[Any, Any]
+    robot: Robot
+    mapping: ActionMapping
+    view: View
+    disturbed: Callable[[Any, Any, dict[str, Any]], bool]
 
-    def add(self, executed: Array, state: Array, info: dict[str, Any]) -> None:
-        seen = displacement(self.robot, self.states[-1], state)
-        turned = 0.0 if self.robot.heading is None else float(seen[self.robot.heading])
-        self.paths.append(np.asarray(info.get("subsamples", seen[None, : self.robot.position_dim]), dtype=float))
-        self.turned.append(float(info.get("turned", turned)))
-        self.states.append(state)
-        self.inputs.append(executed)
+    def episode(
+        self, inputs: Generator[Array, Array | None, None], most: int, seed: int | None, options: dict[str, Any] | None
+    ) -> Iterator[Trajectory]:
+        """Yield the undisturbed trajectories of one episode of at most `most` periods."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        u, built = next(inputs), TrajectoryBuilder(self._state(observation, info))
+        for _ in range(most):
+            action = cast_action(self.mapping.control_to_action(u), self.env.action_space)
+            observation, _, terminated, truncated, info = self.env.step(action)
+            if terminated:
+                break
+            state, in_force = self._state(observation, info), np.asarray(info.get("input_in_force", u), dtype=float)
+            executed = np.clip(in_force, self.robot.low(), self.robot.high())
+            if self.disturbed(self.env, observation, info):
+                yield from [built.trajectory()] if len(built) else []
+                built = TrajectoryBuilder(state, executed)
+            else:
+                seen = displacement(self.robot, built.state, state)
+                turned = 0.0 if self.robot.heading is None else float(seen[self.robot.heading])
+                path = np.asarray(info.get("subsamples", seen[None, : self.robot.position_dim]), dtype=float)
+                built.add(executed, state, path, float(info.get("turned", turned)))
+            if truncated:
+                break
+            u = inputs.send(state)
+        yield from [built.trajectory()] if len(built) else []
 
-    def done(self) -> Iterator[Trajectory]:
-        if self.inputs:
-            states, inputs, paths = np.array(self.states), np.array(self.inputs), np.array(self.paths)
-            yield Trajectory(states, inputs, paths, np.array(self.turned), self.before)
+    def _state(self, observation: Any, info: dict[str, Any]) -> Array:
+        return np.array(self.view(self.env, observation, info), dtype=float)
 
 
 def _chord_deviation_bound(robot: Robot, trajectories: list[Trajectory]) -> float:

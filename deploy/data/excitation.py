@@ -38,9 +38,8 @@ def limit_slew(robot: Robot, before: Array, target: Array) -> Array:
 def excitation(
     robot: Robot, rng: np.random.Generator, held: int = MOST_HELD, before: Array | None = None
 ) -> Generator[Array, Array | None, None]:
-    """Yield inputs (m,) without end, in cycles of lead-in, plan (free inputs, then braking) and standing.
+    """Yield inputs (m,) without end, in manoeuvres that follow each other.
 
-    A lead-in drives to several targets and may leave each early, so that every speed occurs with every acceleration.
     For a robot that stops by feedback, send the measured state (n,) after each period: `u = inputs.send(state)`.
 
     Args:
@@ -54,35 +53,44 @@ def excitation(
         ValueError: no state was sent for a robot that stops by feedback.
     """
     before = np.zeros(robot.action_dim) if before is None else before
-    schedule = robot.plan_matrix()
+    while True:
+        before = yield from manoeuvre(robot, rng, before, held)
+
+
+def manoeuvre(
+    robot: Robot, rng: np.random.Generator, before: Array, held: int = MOST_HELD
+) -> Generator[Array, Array | None, Array]:
+    """Yield a lead-in, a plan (free inputs, then braking) and standing; return the last input.
+
+    A lead-in drives to several targets and may leave each early, so that every speed occurs with every acceleration.
+    """
+    state: Array | None = None
+    if held > MOST_HELD and rng.random() < RESTLESS:
+        for _ in range(rng.integers(held + 1)):
+            bounds = np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high())
+            before = limit_slew(robot, before, bounds)
+            state = yield before
     across = (robot.high() - robot.low()) / np.asarray(robot.action_slew)  # periods from bound to bound
     longest_lead = held + math.ceil(across.max())
-    state: Array | None = None
-    while True:
-        if held > MOST_HELD and rng.random() < RESTLESS:
-            for _ in range(rng.integers(held + 1)):
-                before = limit_slew(
-                    robot, before, np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high())
-                )
-                state = yield before
-        for _ in range(rng.integers(MOST_LEAD + 1)):
-            target = random_target(robot, rng)
-            hasty = longest_lead > MOST_HELD and rng.random() < HASTE
-            for _ in range(rng.integers(1, (MOST_HELD if hasty else longest_lead) + 1)):
-                before = limit_slew(robot, before, target)
-                state = yield before
-        free = []
-        for _ in range(robot.free_steps):
-            before = limit_slew(robot, before, random_target(robot, rng))
-            free.append(before)
-        for k, planned in enumerate((schedule @ np.concatenate(free)).reshape(robot.horizon, -1)):
-            before = planned if k < robot.free_steps else _braked(robot, planned, state, before)
+    for _ in range(rng.integers(MOST_LEAD + 1)):
+        target = random_target(robot, rng)
+        hasty = longest_lead > MOST_HELD and rng.random() < HASTE
+        for _ in range(rng.integers(1, (MOST_HELD if hasty else longest_lead) + 1)):
+            before = limit_slew(robot, before, target)
             state = yield before
-        standing = np.where(robot.zero_at_rest, 0.0, before)
-        longest = LONG_STOP if rng.random() < LONG_STOPS else SHORT_STOP
-        for _ in range(rng.integers(longest + 1)):
-            before = _braked(robot, standing, state, before)
-            state = yield before
+    free = []
+    for _ in range(robot.free_steps):
+        before = limit_slew(robot, before, random_target(robot, rng))
+        free.append(before)
+    for k, planned in enumerate((robot.plan_matrix() @ np.concatenate(free)).reshape(robot.horizon, -1)):
+        before = planned if k < robot.free_steps else _braked(robot, planned, state, before)
+        state = yield before
+    standing = np.where(robot.zero_at_rest, 0.0, before)
+    longest = LONG_STOP if rng.random() < LONG_STOPS else SHORT_STOP
+    for _ in range(rng.integers(longest + 1)):
+        before = _braked(robot, standing, state, before)
+        state = yield before
+    return before
 
 
 def _braked(robot: Robot, planned: Array, state: Array | None, before: Array) -> Array:

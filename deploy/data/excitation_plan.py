@@ -5,7 +5,6 @@ Printed inputs rely on dead reckoning of a robot without lag. A driven robot use
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -43,18 +42,15 @@ def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> It
     Raises:
         BadData: the region is too small for the robot, or its inputs do not determine its motion.
     """
-    low, high = _room(robot, keep)
-    motion = _motion(robot)
-    if robot.heading is not None and not motion[2].any():
+    bounded = _BoundedExcitation(robot, keep, np.random.default_rng(seed))
+    if robot.heading is not None and not bounded.motion[2].any():
         raise BadData(f"{robot.name}: the inputs {', '.join(robot.action)} do not determine how it turns: use --drive")
-    rng = np.random.default_rng(seed)
-    length = run_length(robot)
     for run in range(max(math.ceil(60.0 * minutes / RUN), 1)):
-        pose = np.array([*(low + high) / 2.0, 0.0])
+        pose = np.array([*(bounded.low + bounded.high) / 2.0, 0.0])
         done: list[Array] = []
-        while len(done) < length:
+        while len(done) < run_length(robot):
             before = done[-1] if done else robot.zero_input()
-            inputs, pose = _manoeuvre(robot, rng, motion, pose, low, high, before)
+            inputs, pose = bounded.draw(pose, bounded.low, bounded.high, before)
             done += inputs
         yield from (InputRow(k * robot.period, run, u) for k, u in enumerate(done))
 
@@ -62,16 +58,6 @@ def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> It
 def run_length(robot: Robot) -> int:
     """Return the number of periods per run."""
     return round(RUN / robot.period)
-
-
-def _room(robot: Robot, keep: Region) -> tuple[Array, Array]:
-    """Return the smallest and largest allowed position (2,) in m."""
-    low, high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
-    if not (low < high).all():
-        raise BadData(
-            f"the region {keep} is too small for a robot with a radius of {robot.footprint:g} m: enlarge it with --keep"
-        )
-    return low, high
 
 
 class RegionExcitation:
@@ -87,16 +73,12 @@ class RegionExcitation:
         Raises:
             BadData: the region is too small to drive and stop, or the inputs do not determine the robot's motion.
         """
-        self._robot, self._rng, self._motion = robot, rng, _motion(robot)
-        self._low, self._high = _room(robot, keep)
-        top = np.abs(self._motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
-        self._to_stop = (
-            nominal_stopping_distance(robot) + float(np.linalg.norm(top)) * robot.period
-        )  # one period of delay
-        if not (self._low + self._to_stop < self._high - self._to_stop).all():
-            raise BadData(
-                f"the region {keep} is too small to stop in: a stop takes about {self._to_stop:.2f} m on each side"
-            )
+        self._robot, self._bounded = robot, _BoundedExcitation(robot, keep, rng)
+        top = np.abs(self._bounded.motion[:2]) @ np.maximum(np.abs(robot.low()), robot.high())
+        to_stop = nominal_stopping_distance(robot) + float(np.linalg.norm(top)) * robot.period  # one period of delay
+        self._low, self._high = self._bounded.low + to_stop, self._bounded.high - to_stop
+        if not (self._low < self._high).all():
+            raise BadData(f"the region {keep} is too small to stop in: a stop takes about {to_stop:.2f} m on each side")
         self._left: list[Array] = []
         self._out = 0.0
 
@@ -104,69 +86,67 @@ class RegionExcitation:
         state, before = info["state"], info["input_in_force"]
         if info["time"] == 0.0:
             self._left, self._out = [], 0.0
-        beyond = np.maximum(self._low + self._to_stop - state[:2], state[:2] - self._high + self._to_stop)
-        out, last = float(beyond.max()), self._out
-        self._out = out
-        if out > max(last, 0.0) and not self._robot.is_stop_input(before):
+        last, self._out = self._out, float(np.maximum(self._low - state[:2], state[:2] - self._high).max())
+        if self._out > max(last, 0.0) and not self._robot.is_stop_input(before):
             self._left = list(braking_plan(self._robot, before)[1:])
         if not self._left:
             heading = 0.0 if self._robot.heading is None else state[self._robot.heading]
-            pose = np.array([*state[:2], heading])
             # Near the edge the robot must not go farther out: it could not stop in time.
-            low, high = (
-                np.minimum(self._low + self._to_stop, pose[:2]),
-                np.maximum(self._high - self._to_stop, pose[:2]),
-            )
-            self._left = _manoeuvre(self._robot, self._rng, self._motion, pose, low, high, before)[0]
+            low, high = np.minimum(self._low, state[:2]), np.maximum(self._high, state[:2])
+            self._left = self._bounded.draw(np.array([*state[:2], heading]), low, high, before)[0]
         return self._left.pop(0)
 
 
-def _manoeuvre(
-    robot: Robot, rng: np.random.Generator, motion: Array, pose: Array, low: Array, high: Array, before: Array
-) -> tuple[list[Array], Array]:
-    """Return inputs from rest to rest that stay inside, and the pose (3,) after them.
+class _BoundedExcitation:
+    """Manoeuvres that stay within bounds by dead reckoning.
 
-    before (m,): the input in force; a stop may hold some of its coordinates.
+    low, high: smallest and largest position (2,) in m within the region; motion (3, m): maps inputs to speeds forward,
+    left and around, or without a heading to x, y and zero.
     """
-    for _ in range(TRIES):
-        inputs = _to_rest(robot, rng, before)
-        after = pose
-        for u in inputs:
-            after = _moved(robot, motion, after, u)
-            if not ((after[:2] >= low) & (after[:2] <= high)).all():
+
+    def __init__(self, robot: Robot, keep: Region, rng: np.random.Generator) -> None:
+        self._robot, self._rng = robot, rng
+        usual, inputs = quantities(robot), column_names(robot)[1]
+        kinds = ("body.x", "body.y", "yaw rate") if robot.heading is not None else ("velocity.x", "velocity.y", "")
+        self.motion = np.array([[usual.get(name) == f"command.{kind}" for name in inputs] for kind in kinds], float)
+        if not self.motion[:2].any():
+            raise BadData(
+                f"{robot.name}: the inputs {', '.join(robot.action)} do not determine its motion: they must be speeds"
+            )
+        self.low, self.high = np.array(keep[:2]) + robot.footprint, np.array(keep[2:]) - robot.footprint
+        if not (self.low < self.high).all():
+            raise BadData(
+                f"the region {keep} is too small for a robot with a radius of {robot.footprint:g} m: enlarge it with "
+                "--keep"
+            )
+
+    def draw(self, pose: Array, low: Array, high: Array, before: Array) -> tuple[list[Array], Array]:
+        """Draw inputs from rest to rest that stay between `low` and `high`, and return the pose (3,) after them.
+
+        before (m,): the input in force; a stop may hold some of its coordinates.
+        """
+        for _ in range(TRIES):
+            inputs, after = self._to_rest(before), pose
+            for u in inputs:
+                after = self._moved(after, u)
+                if not ((after[:2] >= low) & (after[:2] <= high)).all():
+                    break
+            else:
+                return inputs, after
+        raise BadData("no excitation stays within the region: enlarge it with --keep")
+
+    def _to_rest(self, before: Array) -> list[Array]:
+        """Return one lead-in, plan and stop."""
+        inputs: list[Array] = []
+        for u in excitation(self._robot, self._rng, before=before):
+            inputs.append(u)
+            if len(inputs) > LEAD and self._robot.is_stop_input(np.array(inputs[-2:])).all():
                 break
-        else:
-            return inputs, after
-    raise BadData("no excitation stays within the region: enlarge it with --keep")
+        return inputs
 
-
-def _to_rest(robot: Robot, rng: np.random.Generator, before: Array) -> list[Array]:
-    """Return one lead-in, plan and stop."""
-    drawn = excitation(robot, rng, before=before)
-    inputs = list(itertools.islice(drawn, LEAD))
-    for u in drawn:
-        inputs.append(u)
-        if robot.is_stop_input(inputs[-1]) and robot.is_stop_input(inputs[-2]):
-            return inputs
-    raise AssertionError("excitation has no end")
-
-
-def _motion(robot: Robot) -> Array:
-    """Return the matrix (3, m) from inputs to speeds: forward, left and turn; without a heading: x, y and zero."""
-    usual, inputs = quantities(robot), column_names(robot)[1]
-    kinds = ("body.x", "body.y", "yaw rate") if robot.heading is not None else ("velocity.x", "velocity.y", "")
-    motion = np.array([[usual.get(name) == f"command.{kind}" for name in inputs] for kind in kinds], float)
-    if not motion[:2].any():
-        raise BadData(
-            f"{robot.name}: the inputs {', '.join(robot.action)} do not determine its motion: they must be speeds"
-        )
-    return motion
-
-
-def _moved(robot: Robot, motion: Array, pose: Array, u: Array) -> Array:
-    """Return the pose (3,) after one period of dead reckoning."""
-    forward, left, turn = motion @ u * robot.period
-    heading = pose[2] + turn / 2.0
-    cos, sin = math.cos(heading), math.sin(heading)
-    step = np.array([cos * forward - sin * left, sin * forward + cos * left, turn])
-    return np.asarray(pose + step)
+    def _moved(self, pose: Array, u: Array) -> Array:
+        """Return the pose (3,) after one period of dead reckoning."""
+        forward, left, turn = self.motion @ u * self._robot.period
+        heading = pose[2] + turn / 2.0
+        cos, sin = math.cos(heading), math.sin(heading)
+        return np.asarray(pose + np.array([cos * forward - sin * left, sin * forward + cos * left, turn]))

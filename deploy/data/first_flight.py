@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
-from brakeline.deploy.data.excitation import limit_slew, random_target
+from brakeline.deploy.data.excitation import manoeuvre
+from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.errors import BadData, FlightEnded, Unsupported
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
@@ -71,17 +72,10 @@ class Box:
 
 
 def draw_manoeuvre(robot: Robot, share: float, before: Array, rng: np.random.Generator) -> list[Array]:
-    """Draw a manoeuvre: random targets, each held or left at once, then a plan like the filter's: inputs (3,)."""
-    inputs = [before]
-    for _ in range(rng.integers(4)):
-        target = share * random_target(robot, rng)
-        for _ in range(rng.integers(1, 4 if rng.random() < 0.6 else 12)):
-            inputs.append(limit_slew(robot, inputs[-1], target))
-    chosen = limit_slew(robot, inputs[-1], share * random_target(robot, rng))
-    waiting = replace(robot.in_lockstep(), free_steps=1)
-    inputs += list((waiting.plan_matrix() @ chosen).reshape(waiting.horizon, -1))
-    standing = rng.integers(3) if rng.random() < 0.9 else 12
-    return inputs[1:] + [np.zeros(robot.action_dim)] * int(standing)
+    """Draw a manoeuvre that ends at rest, within `share` of the bounds: inputs (3,)."""
+    low, high = (tuple(share * bound) for bound in (robot.low(), robot.high()))
+    slower = replace(robot.in_lockstep(), free_steps=1, action_low=low, action_high=high)
+    return [*manoeuvre(slower, rng, before), np.zeros(robot.action_dim)]
 
 
 def mirror_inwards(inputs: list[Array], state: Array, box: Box, period: float, rng: np.random.Generator) -> list[Array]:
@@ -95,37 +89,13 @@ def mirror_inwards(inputs: list[Array], state: Array, box: Box, period: float, r
     return [np.where(signs == 0.0, 1.0, signs) * u for u in inputs]
 
 
-@dataclass
-class FlightRecording:
-    """The recording in progress, in trajectories."""
-
-    trajectories: list[Trajectory] = field(default_factory=list)
-    states: list[Array] = field(default_factory=list)
-    inputs: list[Array] = field(default_factory=list)
-    paths: list[Array] = field(default_factory=list)
-    before: Array | None = None
-
-    def cut(self) -> None:
-        """End the trajectory, so that no later sample follows its last one."""
-        if len(self.inputs) > 2:
-            arrays = np.array(self.states), np.array(self.inputs), np.array(self.paths)
-            self.trajectories.append(Trajectory(*arrays, np.zeros(len(self.inputs)), self.before))
-        self.states, self.inputs, self.paths = [], [], []
-
-    def dataset(self, robot: Robot, about: dict[str, str]) -> Dataset:
-        """Return the recorded trajectories as a checked data set."""
-        data = Dataset(robot, tuple(self.trajectories), about | {"origin": ORIGIN})
-        data.check()
-        return data
-
-
 @dataclass(frozen=True)
 class FirstFlightResult:
     """The result of a first flight. `missing` says in sentences what the data lack."""
 
     data: Dataset
     model: ModelSet | None
-    statement: ValidationReport | None
+    report: ValidationReport | None
     level: float  # share of the largest inputs that was flown and that a model predicts
     missing: tuple[str, ...]
     seconds: float
@@ -139,26 +109,16 @@ class FirstFlight:
     ) -> None:
         """Prepare the flight. `robot` must be in real time; `stop` is polled every period."""
         self._vehicle, self._robot, self._box, self._stop = vehicle, robot, box, stop
-        self._rng, self._flown = np.random.default_rng(seed), FlightRecording()
-        self._periods = 0
+        self._rng, self._periods = np.random.default_rng(seed), 0
+        self._flown: list[Trajectory] = []
+        self._built: TrajectoryBuilder | None = None
 
     def fly(self, minutes: float, about: dict[str, str]) -> FirstFlightResult:
         """Fly all levels and return the data, and the model set if the data support one."""
         missing, reached = list[str](), 0.0
         try:
             for level, share in zip(LEVELS, SHARES, strict=True):
-                for _ in range(TRIES):
-                    self._record(level, 60.0 * minutes * share)
-                    speed, error = level * float(self._robot.high().max()), self._prediction_error()
-                    drift = _estimate_drift(self._flown.trajectories, self._robot.period)
-                    log.info(
-                        "prediction error one second ahead: %.2f m; drift of the vehicle's own estimate: %.2f m",
-                        error,
-                        drift,
-                    )
-                    if error < drift + ERROR_OFFSET + ERROR_TIME * speed:
-                        break
-                else:
+                if not any(self._predicted(level, 60.0 * minutes * share) for _ in range(TRIES)):
                     missing.append(
                         f"no model predicts the vehicle at {level:.0%} of its speed, so it was not flown faster"
                     )
@@ -166,19 +126,25 @@ class FirstFlight:
                 reached = level
         except FlightEnded as error:
             missing.append(str(error))
-        self._flown.cut()
-        data = self._flown.dataset(self._robot.in_lockstep(), about)
-        model, statement = self._model(data, missing)
-        drift = _estimate_drift(data.trajectories, self._robot.period)
-        if drift > MAX_DRIFT:
+        self._cut()
+        data = self._dataset(about)
+        model, report = self._model(data, missing)
+        if (drift := self._drift()) > MAX_DRIFT:
             missing.append(
                 f"the position of its own estimate is {drift:.2f} m off its integrated velocity after a second "
                 "(95 %), and no set can be narrower: set sensor noise and delay in its estimator, then fly again"
             )
         if reached < 1.0:
             missing.append(f"there are no data above {reached:.0%} of its speed")
-        missing += [] if statement is None else recording_advice(statement, data)
-        return FirstFlightResult(data, model, statement, reached, tuple(missing), self._periods * self._robot.period)
+        missing += [] if report is None else recording_advice(report, data)
+        return FirstFlightResult(data, model, report, reached, tuple(missing), self._periods * self._robot.period)
+
+    def _predicted(self, level: float, seconds: float) -> bool:
+        """Record at one level, and return whether a model predicts the flight so far. Raises FlightEnded."""
+        self._record(level, seconds)
+        error, drift = self._prediction_error(), self._drift()
+        log.info("prediction error one second ahead: %.2f m; drift of the estimate: %.2f m", error, drift)
+        return error < drift + ERROR_OFFSET + ERROR_TIME * level * float(self._robot.high().max())
 
     def _record(self, level: float, seconds: float) -> None:
         """Record at one level. Raises FlightEnded."""
@@ -186,13 +152,13 @@ class FirstFlight:
         bounds = level * robot.high()
         log.info("flying at %.0f %% of its speed: %.1f m/s per axis, for %.0f s", 100 * level, bounds.max(), seconds)
         vehicle.wait(vehicle.current_period.number + 1)
-        self._flown.cut()
+        self._cut()
         end = self._periods + round(seconds / robot.period)
         while self._periods < end:
             for wanted in self._next(level):
                 if self._period(wanted, bounds):
                     break
-        self._flown.cut()
+        self._cut()
         vehicle.wait(vehicle.current_period.number + 5)
 
     def _next(self, level: float) -> list[Array]:
@@ -204,32 +170,39 @@ class FirstFlight:
 
     def _period(self, wanted: Array, level: Array) -> bool:
         """Fly one period; return True if the manoeuvre must end (box rule or gap). Raises FlightEnded."""
-        vehicle, flown, box = self._vehicle, self._flown, self._box
-        before = vehicle.current_period
-        allowed = box.constrain(before.report.measured, wanted, level)
+        vehicle, before = self._vehicle, self._vehicle.current_period
+        allowed = self._box.constrain(before.report.measured, wanted, level)
         vehicle.commit(allowed[None], before.number + 1)
         period = vehicle.wait(before.number + 1)
+        state = period.report.measured
         self._periods += 1
         if period.number != before.number + 1 or period.lost:
-            flown.cut()
+            self._cut()
             if period.lost:
                 self._wait_for_link()
             return True
-        if not flown.states:
-            flown.states, flown.before = [period.report.measured], before.input
+        if self._built is None:
+            self._built = TrajectoryBuilder(state, before.input)
         else:
-            flown.states.append(period.report.measured)
-            flown.paths.append(period.report.subsamples)
-            flown.inputs.append(before.input)
-        if len(flown.inputs) >= PIECE:
-            flown.cut()
-        if box.outside(period.report.measured) > OUTSIDE:
-            raise FlightEnded(
-                f"it left its box by {box.outside(period.report.measured):.0f} m: it does not follow its setpoints"
-            )
+            self._built.add(before.input, state, period.report.subsamples)
+            if len(self._built) >= PIECE:
+                self._cut()
+        if (outside := self._box.outside(state)) > OUTSIDE:
+            raise FlightEnded(f"it left its box by {outside:.0f} m: it does not follow its setpoints")
         if self._stop():
             raise FlightEnded("the flight was stopped")
         return bool((allowed != wanted).any())
+
+    def _cut(self) -> None:
+        """End the trajectory, so that no later sample follows its last one."""
+        if self._built is not None and len(self._built) > 2:
+            self._flown.append(self._built.trajectory())
+        self._built = None
+
+    def _dataset(self, about: dict[str, str]) -> Dataset:
+        data = Dataset(self._robot.in_lockstep(), tuple(self._flown), about | {"origin": ORIGIN})
+        data.check()
+        return data
 
     def _wait_for_link(self) -> None:
         """Hover while telemetry is lost or a pilot has taken over. Raises FlightEnded after 10 s."""
@@ -241,34 +214,28 @@ class FirstFlight:
     def _prediction_error(self) -> float:
         """Return the 95 % quantile in m of the errors of a linear fit on held-out data, `AHEAD` periods ahead."""
         try:
-            parts = [
-                windows(part, AHEAD, FREE)
-                for part in self._flown.dataset(self._robot.in_lockstep(), {}).split((0.5, 0.5))
-            ]
+            fitted, held_out = (windows(part, AHEAD, FREE) for part in self._dataset({}).split((0.5, 0.5)))
         except BadData:
             return math.inf
-        fitted, held_out = parts
         if min(len(fitted), len(held_out)) < fitted.z.shape[1]:
             return math.inf
         C = np.linalg.lstsq(fitted.z, fitted.y[:, :3], rcond=None)[0]
         return float(np.quantile(np.linalg.norm(held_out.y[:, :3] - held_out.z @ C, axis=1), 0.95))
 
+    def _drift(self) -> float:
+        """Return the 95 % quantile in m of position minus integrated velocity over `AHEAD` periods."""
+        errors = [np.zeros((1, 3))]
+        for t in self._flown:
+            position, velocity = t.states[:, :3], t.states[:, 3:6]
+            by_velocity = np.cumsum(0.5 * self._robot.period * (velocity[1:] + velocity[:-1]), axis=0)
+            error = position[1:] - by_velocity
+            errors.append(error[AHEAD:] - error[:-AHEAD])
+        return float(np.quantile(np.linalg.norm(np.concatenate(errors), axis=1), 0.95))
+
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
         """Certify while the vehicle hovers."""
         try:
-            model, statement, _ = certify_supported(replace(data, robot=self._robot), ModelConfig().of_minutes())
+            return certify_supported(replace(data, robot=self._robot), ModelConfig().of_minutes())[:2]
         except (BadData, Unsupported) as error:
             missing.append(f"the data support no model set: {error}")
             return None, None
-        return model, statement
-
-
-def _estimate_drift(trajectories: Sequence[Trajectory], period: float) -> float:
-    """Return the 95 % quantile in m of position minus integrated velocity over `AHEAD` periods."""
-    errors = [np.zeros((1, 3))]
-    for t in trajectories:
-        position, velocity = t.states[:, :3], t.states[:, 3:6]
-        by_velocity = np.cumsum(0.5 * period * (velocity[1:] + velocity[:-1]), axis=0)
-        error = position[1:] - by_velocity
-        errors.append(error[AHEAD:] - error[:-AHEAD])
-    return float(np.quantile(np.linalg.norm(np.concatenate(errors), axis=1), 0.95))

@@ -6,62 +6,50 @@ or, if there are none, the targets of its own position control.
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("MAVLINK20", "1")
 
+import numpy as np
 from pymavlink import DFReader
 
-from brakeline.deploy.data.sources.acceleration import add_accelerations
-from brakeline.deploy.data.sources.angles import yaw_from_ned
-from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, along_body, vector
+from brakeline.deploy.data.sources.message_tables import Columns, MessageKind, MessageTables
+from brakeline.deploy.data.sources.north_east_down import add_accelerations, along_body, enu, force
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
 
 CENTI = 0.01
-GUIDED_VELOCITY = 2  # type of a GUID message
 TARGET = 1  # rank of controller targets, behind received setpoints
+# Messages of the first core, the first unit, and of guided velocities: field -> value.
+ONLY = {"XKF1": ("C", 0), "NKF1": ("C", 0), "IMU": ("I", 0), "GUID": ("Type", 2)}
 
 
-def _filter(m: Any) -> Row | None:
-    """Return state quantities from the first core of the estimator."""
-    if getattr(m, "C", 0) != 0:
-        return None
-    roll, pitch, down_turned = (math.radians(angle) for angle in (m.Roll, m.Pitch, m.Yaw))
-    velocity, yaw = vector("velocity", (m.VN, m.VE, m.VD)), yaw_from_ned(down_turned)
-    attitude = {"attitude.yaw": down_turned, "attitude.pitch": pitch, "attitude.roll": roll}
-    return vector("position", (m.PN, m.PE, m.PD)) | velocity | along_body(velocity, yaw) | {"yaw": yaw} | attitude
+def _filter(c: Columns) -> Columns:
+    """Return state quantities of the estimator."""
+    yaw, pitch, roll = (np.radians(c[name]) for name in ("Yaw", "Pitch", "Roll"))
+    velocity = enu("velocity", c, ("VN", "VE", "VD"))
+    attitude = {"attitude.yaw": yaw, "attitude.pitch": pitch, "attitude.roll": roll}
+    return enu("position", c, ("PN", "PE", "PD")) | velocity | along_body(velocity, yaw) | attitude
 
 
-def _inertial(m: Any) -> Row | None:
-    """Return yaw rate and specific force from the first unit."""
-    if getattr(m, "I", 0) != 0:
-        return None
-    return {"yaw rate": -m.GyrZ, "force.x": m.AccX, "force.y": m.AccY, "force.z": m.AccZ}
+def _guided(c: Columns) -> Columns:
+    """Return guided velocities. The log holds cm/s (north, east, up), whatever unit it declares."""
+    return enu("command.velocity", c | {"down": -c["vZ"]}, ("vX", "vY", "down"), CENTI)
 
 
-def _guided(m: Any) -> Row | None:
-    """Return a guided velocity. The log holds cm/s (north, east, up), whatever unit it declares."""
-    return (
-        vector("command.velocity", (CENTI * m.vX, CENTI * m.vY, -CENTI * m.vZ)) if m.Type == GUIDED_VELOCITY else None
-    )
-
-
-KINDS: Kinds = {
-    "XKF1": (0, _filter),
-    "NKF1": (1, _filter),
-    "IMU": (0, _inertial),
-    "THR": (0, lambda m: {"command.body.x": m.DesSpeed}),
-    "STER": (0, lambda m: {"command.yaw rate": -math.radians(m.DesTurnRate)}),
-    "GUID": (0, _guided),
-    "PSCN": (TARGET, lambda m: {"command.velocity.y": m.DVN}),
-    "PSCE": (TARGET, lambda m: {"command.velocity.x": m.DVE}),
-    "PSCD": (TARGET, lambda m: {"command.velocity.z": -m.DVD}),
-    "PSC": (TARGET, lambda m: {"command.velocity.x": m.TVY, "command.velocity.y": m.TVX}),
-    "CTUN": (TARGET, lambda m: {"command.velocity.z": CENTI * m.DCRt} if hasattr(m, "DCRt") else None),
+KINDS = {
+    "XKF1": MessageKind(0, _filter),
+    "NKF1": MessageKind(1, _filter),
+    "IMU": MessageKind(0, lambda c: {"yaw rate": -c["GyrZ"]} | force(c, ("AccX", "AccY", "AccZ"))),
+    "THR": MessageKind(0, lambda c: {"command.body.x": c["DesSpeed"]}),
+    "STER": MessageKind(0, lambda c: {"command.yaw rate": -np.radians(c["DesTurnRate"])}),
+    "GUID": MessageKind(0, _guided),
+    "PSCN": MessageKind(TARGET, lambda c: {"command.velocity.y": c["DVN"]}),
+    "PSCE": MessageKind(TARGET, lambda c: {"command.velocity.x": c["DVE"]}),
+    "PSCD": MessageKind(TARGET, lambda c: {"command.velocity.z": -c["DVD"]}),
+    "PSC": MessageKind(TARGET, lambda c: {"command.velocity.x": c["TVY"], "command.velocity.y": c["TVX"]}),
+    "CTUN": MessageKind(TARGET, lambda c: {"command.velocity.z": CENTI * c["DCRt"]} if "DCRt" in c else {}),
 }
 
 
@@ -71,8 +59,11 @@ def read(path: Path) -> list[Table]:
         log = DFReader.DFReader_binary(str(path))
     except Exception as error:  # pymavlink raises many types on damaged files
         raise NoSource(f"{path} is not an ArduPilot log: {error}") from error
-    rows = MessageRows(path, KINDS)
+    messages = MessageTables()
     while (message := log.recv_match(type=list(KINDS))) is not None:
-        rows.add(message.get_type(), int(message.TimeUS), message)
+        name, fields = message.get_type(), message.to_dict()
+        field, value = ONLY.get(name, ("", None))
+        if fields.get(field, value) == value:
+            messages.add(name, KINDS[name], fields.items(), 1000 * int(message.TimeUS))
     log.close()
-    return add_accelerations(rows.tables())
+    return add_accelerations(messages.tables(f"{path}: the log contains none of the messages {', '.join(KINDS)}"))

@@ -44,15 +44,3 @@ class Table:
             )
         new = np.diff(time, prepend=-np.inf) > 0.0  # the first of several samples at the same time
         return time[new], values[new]
-
-
-def table_of(name: str, nanoseconds: list[int], rows: list[dict[str, float]], since: int, rank: int = 0) -> Table:
-    """Return a table of named rows with stamps in ns; `since` is time zero.
-
-    Subtract integers first: a double cannot hold nanoseconds since 1970.
-    """
-    order = np.argsort(np.asarray(nanoseconds, np.int64), kind="stable")
-    time = (np.asarray(nanoseconds, np.int64) - since)[order] / 1e9
-    names = dict.fromkeys(key for row in rows for key in row)
-    columns = {key: np.array([rows[i].get(key, np.nan) for i in order], float) for key in names}
-    return Table(name, time, columns, rank=rank)

@@ -10,14 +10,12 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
-from brakeline.deploy.data.sources.acceleration import GRAVITY, add_accelerations
-from brakeline.deploy.data.sources.angles import yaw_from_ned
-from brakeline.deploy.data.sources.message_rows import Kinds, MessageRows, Row, vector
+from brakeline.deploy.data.sources.message_tables import Columns, MessageKind, MessageTables
+from brakeline.deploy.data.sources.north_east_down import GRAVITY, add_accelerations, enu, force
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
 
@@ -27,42 +25,34 @@ VELOCITY_IGNORED, YAW_RATE_IGNORED = 0b111000, 0x800  # in a setpoint's type mas
 MAX_DRIFT_RATE = 0.05  # s per s between the two clocks: a simulator on a busy machine needs it
 
 
-def _local(m: Any) -> Row:
-    return vector("position", (m.x, m.y, m.z)) | vector("velocity", (m.vx, m.vy, m.vz))
+def _attitude(c: Columns) -> Columns:
+    attitude = {"attitude.yaw": c["yaw"], "attitude.pitch": c["pitch"], "attitude.roll": c["roll"]}
+    return {"yaw": np.pi / 2.0 - c["yaw"], "yaw rate": -c["yawspeed"]} | attitude
 
 
-def _attitude(m: Any) -> Row:
-    attitude = {"attitude.yaw": m.yaw, "attitude.pitch": m.pitch, "attitude.roll": m.roll}
-    return {"yaw": yaw_from_ned(m.yaw), "yaw rate": -m.yawspeed} | attitude
+def _setpoint(c: Columns) -> Columns:
+    mask, in_world = c["type_mask"].astype(int), c["coordinate_frame"] == dialect.MAV_FRAME_LOCAL_NED
+    moves, turns = (mask & VELOCITY_IGNORED) == 0, (mask & YAW_RATE_IGNORED) == 0
+    world, body = enu("command.velocity", c, VELOCITY), dict(zip(BODY, (c["vx"], -c["vy"], -c["vz"]), strict=True))
+    return {
+        **{name: np.where(moves & in_world, values, np.nan) for name, values in world.items()},
+        **{name: np.where(moves & ~in_world, values, np.nan) for name, values in body.items()},
+        "command.yaw rate": np.where(turns, -c["yaw_rate"], np.nan),
+    }
 
 
-def _force(m: Any, unit: float = 1.0) -> Row:
-    return {"force.x": unit * m.xacc, "force.y": unit * m.yacc, "force.z": unit * m.zacc}
-
-
-def _milligravities(m: Any) -> Row:
-    return _force(m, 1e-3 * GRAVITY)
-
-
-def _setpoint(m: Any) -> Row | None:
-    row: Row = {}
-    if m.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED and not m.type_mask & VELOCITY_IGNORED:
-        row |= vector("command.velocity", (m.vx, m.vy, m.vz))
-    elif not m.type_mask & VELOCITY_IGNORED:
-        row |= {"command.body.x": m.vx, "command.body.y": -m.vy, "command.body.z": -m.vz}
-    return row | ({} if m.type_mask & YAW_RATE_IGNORED else {"command.yaw rate": -m.yaw_rate})
-
-
-KINDS: Kinds = {
-    "LOCAL_POSITION_NED": (0, _local),
-    "ATTITUDE": (0, _attitude),
-    "HIGHRES_IMU": (0, _force),
-    "SCALED_IMU": (1, _milligravities),
-    "SCALED_IMU2": (2, _milligravities),
-    "SET_POSITION_TARGET_LOCAL_NED": (0, _setpoint),
+VELOCITY, FORCES = ("vx", "vy", "vz"), ("xacc", "yacc", "zacc")
+BODY = ("command.body.x", "command.body.y", "command.body.z")
+SENT = "SET_POSITION_TARGET_LOCAL_NED"
+KINDS = {
+    "LOCAL_POSITION_NED": MessageKind(0, lambda c: enu("position", c, "xyz") | enu("velocity", c, VELOCITY)),
+    "ATTITUDE": MessageKind(0, _attitude),
+    "HIGHRES_IMU": MessageKind(0, lambda c: force(c, FORCES)),
+    "SCALED_IMU": MessageKind(1, lambda c: force(c, FORCES, 1e-3 * GRAVITY)),
+    "SCALED_IMU2": MessageKind(2, lambda c: force(c, FORCES, 1e-3 * GRAVITY)),
+    SENT: MessageKind(0, _setpoint),
 }
 VEHICLE_STAMPS = {"time_boot_ms": 1e-3, "time_usec": 1e-6}  # field -> unit in s
-SENT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
 def read(path: Path) -> list[Table]:
@@ -71,17 +61,18 @@ def read(path: Path) -> list[Table]:
     Raises:
         NoSource: the recording has none of the messages, or it has those of several vehicles.
     """
-    rows, vehicles = MessageRows(path, KINDS), set[int]()
+    messages, vehicles = MessageTables(), set[int]()
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
     for micros, frame in _frames(path.read_bytes()):
         for message in parser.parse_buffer(frame) or ():
-            if message.get_type() in KINDS:
-                rows.add(message.get_type(), micros, message)
-                vehicles |= set() if message.get_type() == SENT else {message.get_srcSystem()}
+            name = message.get_type()
+            if name in KINDS:
+                messages.add(name, KINDS[name], message.to_dict().items(), 1000 * micros)
+                vehicles |= set() if name == SENT else {message.get_srcSystem()}
     if len(vehicles) > 1:
         raise NoSource(f"{path} contains several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
-    tables = rows.tables()
+    tables = messages.tables(f"{path}: the log contains none of the messages {', '.join(KINDS)}")
     return add_accelerations([t if t.name == SENT else _on_recorder_clock(t) for t in tables])
 
 

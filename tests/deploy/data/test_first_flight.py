@@ -67,7 +67,7 @@ def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: 
     found = FirstFlight(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
     assert found.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
     assert found.model is not None and found.model.robot == LATE
-    assert found.statement is not None and found.statement.violations <= 0.25 * found.statement.windows
+    assert found.report is not None and found.report.violations <= 0.25 * found.report.windows
     assert found.model.model_config.windows == PLAN and 11.0 * 60.0 <= found.seconds < 13.0 * 60.0
     assert any("more minutes like these" in line for line in found.missing)
     assert not any("of its own estimate is" in line for line in found.missing)

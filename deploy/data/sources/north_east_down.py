@@ -1,4 +1,4 @@
-"""Compute accelerations in the world frame from accelerometers and attitudes."""
+"""Convert the quantities of autopilots from NED to ENU (`quantity_names`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from brakeline.deploy.data.sources.message_tables import Columns
 from brakeline.deploy.data.sources.quantity_names import AXES
 from brakeline.deploy.data.sources.source_table import Array, Table
 
@@ -15,6 +16,27 @@ FORCE = tuple(f"force.{axis}" for axis in AXES)  # m/s², specific force: forwar
 ATTITUDE = ("attitude.yaw", "attitude.pitch", "attitude.roll")  # rad, intrinsic rotations from NED to the body
 GRAVITY = 9.80665  # m/s²
 MAX_GAP = 0.5  # s between two attitudes for interpolation
+
+
+def enu(kind: str, columns: Columns, names: Sequence[str], unit: float = 1.0) -> Columns:
+    """Return the vector `kind` in ENU from columns north, east and down; empty if one is missing."""
+    if any(name not in columns for name in names):
+        return {}
+    north, east, down = (unit * columns[name] for name in names)
+    return {f"{kind}.x": east, f"{kind}.y": north, f"{kind}.z": -down}
+
+
+def along_body(velocity: Columns, yaw_in_ned: Array) -> Columns:
+    """Return the yaw, and the velocity forward, left and up."""
+    yaw = np.pi / 2.0 - yaw_in_ned
+    x, y, z = (velocity[f"velocity.{axis}"] for axis in AXES)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return {"yaw": yaw, "body.x": cos * x + sin * y, "body.y": cos * y - sin * x, "body.z": z}
+
+
+def force(columns: Columns, names: Sequence[str], unit: float = 1.0) -> Columns:
+    """Return the specific force from columns forward, right and down."""
+    return {name: unit * columns[column] for name, column in zip(FORCE, names, strict=True)}
 
 
 def add_accelerations(tables: Sequence[Table]) -> list[Table]:
@@ -27,11 +49,11 @@ def add_accelerations(tables: Sequence[Table]) -> list[Table]:
     ]
 
 
-def _accelerations(felt: Table, attitudes: Table) -> dict[str, Array]:
+def _accelerations(felt: Table, attitudes: Table) -> Columns:
     time, known_at = felt.time, attitudes.time
     angles = [np.interp(time, known_at, np.unwrap(attitudes.columns[name])) for name in ATTITUDE]
-    force = np.column_stack([felt.columns[name] for name in FORCE])
-    north, east, down = Rotation.from_euler("ZYX", np.column_stack(angles)).apply(force).T
+    forces = np.column_stack([felt.columns[name] for name in FORCE])
+    north, east, down = Rotation.from_euler("ZYX", np.column_stack(angles)).apply(forces).T
     after = np.searchsorted(known_at, time)
     inside = (after > 0) & (after < len(known_at))
     after = np.clip(after, 1, len(known_at) - 1)
