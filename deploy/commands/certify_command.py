@@ -15,7 +15,7 @@ from brakeline.deploy.commands.command_output import conditions_table, console, 
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, record_path
-from brakeline.deploy.data.run_dataset import Recorded, from_log
+from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.progress import under_way
 from brakeline.errors import Unsupported
@@ -70,8 +70,8 @@ class CertifyCommand:
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
-        path, source = self._load()
-        accepted_bound(source.data.robot, self.accept_bound)
+        path, data, note = self._load()
+        accepted_bound(data.robot, self.accept_bound)
         models: list[tuple[ModelSet, ValidationReport]] = []
         results: dict[str, Any] = {}
         notes: list[str] = []
@@ -82,7 +82,7 @@ class CertifyCommand:
                 try:
                     config = ModelConfig(kind, mode)
                     config = config.of_minutes() if self.few else config
-                    model, report, unsupported = certify_supported(source.data, config, self.windows, self.until_held)
+                    model, report, unsupported = certify_supported(data, config, self.windows, self.until_held)
                 except Unsupported as error:
                     figures = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
@@ -92,17 +92,20 @@ class CertifyCommand:
                     models.append((model, report))
                     notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
                     figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
-                    figures |= self._put_to_use(model, source.data)
+                    figures |= self._put_to_use(model, data)
                 results.setdefault(kind, {})[mode] = figures
                 advance()
         if self.json:
             # The figures of a certificate are those of the direct mode; those of each mode stand beside them.
             flat = {kind: row.get("direct", next(iter(row.values()))) | row for kind, row in results.items()}
-            print_json(flat | {"source": str(path), "periods": source.data.periods, "note": source.note})
+            print_json(flat | {"source": str(path), "periods": data.periods, "note": note})
         else:
-            self._print(models, notes, path, source)
-        if self.publish and models and not self._refusal(models[0][0], source.data):
-            self._publish(models[0][0], source.data)
+            self._print(models, notes, data)
+            console.print(f"{path}: {note}", markup=False)
+            if self.verbose:
+                console.print(conditions_table(data.about))
+        if self.publish and models and not self._refusal(models[0][0], data):
+            self._publish(models[0][0], data)
         return int(not models or any("not_used" in row for modes in results.values() for row in modes.values()))
 
     def _put_to_use(self, model: ModelSet, data: Dataset) -> dict[str, str]:
@@ -120,18 +123,13 @@ class CertifyCommand:
     def _refusal(self, model: ModelSet, data: Dataset) -> str:
         return refusal(data.robot, model.about, self.accept_bound)
 
-    def _print(
-        self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], path: Path, source: Recorded
-    ) -> None:
-        reports = [report for _, report in models]
+    def _print(self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], data: Dataset) -> None:
         console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
-        lines = [bounds_in_words(reports[0], source.data.robot.period)] if reports else []
-        lines += dict.fromkeys((*notes, *filter(None, map(widening, reports))))
-        lines += [f"missing: {text}" for text in recording_advice(reports[0], source.data)] if reports else []
-        for line in (*lines, f"{path}: {source.note}"):
+        lines = [bounds_in_words(models[0][1], data.robot.period)] if models else []
+        lines += dict.fromkeys((*notes, *filter(None, (widening(report) for _, report in models))))
+        lines += [f"missing: {text}" for text in recording_advice(models[0][1], data)] if models else []
+        for line in lines:
             console.print(line, markup=False)
-        if self.verbose:
-            console.print(conditions_table(source.data.about))
 
     def _save(self, model: ModelSet, data: Dataset) -> None:
         """Write a model set to where the other commands load it from; signed, if there is a key to sign with."""
@@ -142,8 +140,8 @@ class CertifyCommand:
         else:
             model.save(path)
 
-    def _load(self) -> tuple[Path, Recorded]:
-        """Return the source and its data. Raises ValueError if a named data set does not exist."""
+    def _load(self) -> tuple[Path, Dataset, str]:
+        """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""
         robot = robot_maybe_with_task(self.robot)
         if self.data is None:
             path, data = record_path(robot.in_lockstep()), data_for(robot)
@@ -154,8 +152,8 @@ class CertifyCommand:
             if robot.kind == data.robot.kind:  # today's description sets the limit, not the one that was recorded
                 data = replace(data, robot=replace(data.robot, accept_bound=robot.accept_bound))
         else:
-            return self.data, from_log(self.data, robot, self.last)
-        return path, Recorded(data, f"{data.periods} recorded periods of {data.robot.name}")
+            return self.data, *from_log(self.data, robot, self.last)
+        return path, data, f"{data.periods} recorded periods of {data.robot.name}"
 
     def _publish(self, model: ModelSet, data: Dataset) -> None:
         settings = self.endpoints.bus()

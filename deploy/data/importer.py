@@ -86,7 +86,8 @@ def import_sources(
     """
     field_map = mapping(words, robot)
     parts = [_import_one(path, robot, field_map, delay, hold) for path in paths]
-    samples = {part.report.samples for part in parts}
+    reports = [part.report for part in parts]
+    samples = {report.samples for report in reports}
     if len(samples) > 1:
         raise NoSource(
             f"the sources have different numbers of positions per period ({samples}): import them one by one"
@@ -97,29 +98,26 @@ def import_sources(
         {"origin": "import", "sources": ", ".join(path.name for path in paths)},
         max(part.data.chord_deviation for part in parts),
     )
-    several = len(paths) > 1
-    notes = [
-        f"{path.name}: {n}" if several else n for path, p in zip(paths, parts, strict=True) for n in p.report.notes
-    ]
-    uneven = sum(p.report.uneven * p.report.periods for p in parts) / data.periods
-    delays = {name: seconds for p in parts for name, seconds in p.report.delays.items()}
-    report = ImportReport(
-        data.periods, len(data.trajectories), samples.pop(), data.chord_deviation, delays, uneven, tuple(notes)
+    names = [f"{path.name}: " if len(paths) > 1 else "" for path in paths]
+    report = replace(
+        reports[0],
+        periods=data.periods,
+        trajectories=len(data.trajectories),
+        chord_deviation=data.chord_deviation,
+        delays={name: seconds for report in reports for name, seconds in report.delays.items()},
+        uneven=sum(report.uneven * report.periods for report in reports) / data.periods,
+        notes=tuple(name + note for name, report in zip(names, reports, strict=True) for note in report.notes),
     )
     return ImportedData(data, report)
 
 
 def _import_one(path: Path, robot: Robot, field_map: dict[str, str], delay: float, hold: float) -> ImportedData:
     if own_log(path):
-        recorded = from_log(path, robot, ALL_STEPS)
-        data = recorded.data
+        data, note = from_log(path, robot, ALL_STEPS)
         samples = data.trajectories[0].paths.shape[1]
-        return ImportedData(
-            data, ImportReport(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (recorded.note,))
-        )
+        return ImportedData(data, ImportReport(data.periods, len(data.trajectories), samples, 0.0, {}, 0.0, (note,)))
     try:
-        imported = resample(tables_of(path), robot, field_map, delay, hold)
+        return resample(tables_of(path), robot, field_map, delay, hold)
     except NoSource as error:
         text = str(error)
         raise NoSource(text if text.startswith(str(path)) else f"{path}: {text}") from error
-    return replace(imported, data=replace(imported.data, about=imported.data.about | {"source": path.name}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -19,16 +18,10 @@ from brakeline.safety.model.dataset import Dataset, Trajectory
 FEWEST_STEPS = 5  # shorter trajectories are dropped
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """A data set and a sentence about its source."""
-
-    data: Dataset
-    note: str
-
-
-def from_log(path: Path, robot: Robot, last: int) -> Recorded:
+def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     """Read the last `last` steps of a robot from a log, as trajectories that end at episode ends and lost steps.
+
+    Returns the data set, and a sentence about its source.
 
     Raises:
         BadData: the log holds too few steps of the robot.
@@ -43,7 +36,7 @@ def from_log(path: Path, robot: Robot, last: int) -> Recorded:
         raise BadData(f"{path}: no trajectory of {robot.name}; was anything recorded?")
     data = Dataset(robot, trajectories, {"origin": "log"})
     data.check()
-    return Recorded(data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}")
+    return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}"
 
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:

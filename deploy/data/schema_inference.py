@@ -7,18 +7,17 @@ name. The role and the unit of any other column follow from its correlation with
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.deploy.data.aligned_log import AlignedLog, align
 from brakeline.deploy.data.input_delay import estimate_delay
 from brakeline.deploy.data.sources.quantity_names import AXES, COMMAND
 from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.errors import NoSource
-
-Indices = NDArray[np.signedinteger]
 
 POSITION = re.compile(r"(?:pos(?:ition)?[ _.]?|p)?([xyz])(?:[ _.]?pos(?:ition)?)?", re.IGNORECASE)
 HEADING = re.compile(r"heading|yaw|theta|psi", re.IGNORECASE)
@@ -62,68 +61,36 @@ class InferredSchema:
     notes: tuple[str, ...]
 
 
-@dataclass
-class _Rows:
-    """One run, resampled to the time stamps of its positions: time (T,) in s, each column (T,)."""
-
-    time: Array
-    columns: dict[str, Array]
-
-
-@dataclass
-class _Log:
-    """All runs of a log, and the roles of its columns."""
-
-    runs: list[_Rows]
-    positions: list[str]  # names of the position columns
-    inputs: list[str]
-    period: float
-    heading: str = ""
-    units: dict[str, str] = field(default_factory=dict)
-
-    def values(self, name: str) -> Array:
-        """Return a column over all runs."""
-        return np.concatenate([run.columns[name] for run in self.runs])
-
-    def spans(self, seconds: float) -> Iterator[tuple[_Rows, Indices, Indices]]:
-        """Yield for each run the row indices i and j of all spans of about `seconds` without a missing row."""
-        for run in self.runs:
-            n = max(round(seconds / float(np.median(np.diff(run.time)))), 1)
-            i = np.arange(0, len(run.time) - n)
-            whole = run.time[i + n] - run.time[i] < 1.5 * n * np.median(np.diff(run.time))
-            yield run, i[whole], i[whole] + n
-
-
 def infer_schema(tables: Sequence[Table]) -> InferredSchema:
     """Infer the schema of a log.
 
     Raises:
         NoSource: the log has fewer than two position columns; the message gives the expected names.
     """
-    notes: list[str] = []
     log = _from_messages(tables) if tables[0].name else _from_columns(tables[0])
-    for name in [n for n in (*log.runs[0].columns,) if np.ptp(log.values(n)) == 0.0]:
-        notes.append(f"{name} never changes, so that it is left out")
-        for names in (log.positions, log.inputs):
-            if name in names:
-                names.remove(name)
-        for run in log.runs:
-            del run.columns[name]
+    constant = [name for name, values in log.columns.items() if np.ptp(values) == 0.0]
+    notes = [f"{name} never changes, so that it is left out" for name in constant]
+    for name in constant:
+        del log.columns[name]
+    log.positions, log.inputs = ([n for n in names if n not in constant] for names in (log.positions, log.inputs))
     if len(log.positions) < 2:
         raise NoSource(
             f"the log needs two position columns ({', '.join(AXES)}) that change: {'; '.join(notes) or 'none'}"
         )
     if not tables[0].name:
-        _read_motion(log, notes)
-    others = [n for n in log.runs[0].columns if n not in (*log.positions, log.heading, *log.inputs)]
-    pairs, delays = _followers(log, others)
+        notes += _find_heading(log)
+        _find_speeds(log)
+    others = [n for n in log.columns if n not in (*log.positions, log.heading, *log.inputs)]
+    pairs = _followers(log, others)
     for name, follower in pairs.items():
         log.units.setdefault(name, log.units.get(follower, ""))
-    by_follower = {follower: name for name, follower in pairs.items()}
+    leader = {follower: name for name, follower in pairs.items()}
     states = [_column(log, name, role="position", unit="m") for name in log.positions]
-    states += [_column(log, log.heading, role="heading", unit="rad")] if log.heading else []
+    states += [_column(log, log.heading, role="heading", unit="rad")] if log.heading in log.columns else []
     states += [
-        _column(log, n, follows=_plain(by_follower.get(n, ""), log), change=_braking(log, n), delay=delays.get(n))
+        _column(log, n, follows=_plain(leader[n], log), change=_braking(log, n), delay=_delay(log, leader[n], n))
+        if n in leader
+        else _column(log, n, change=_braking(log, n))
         for n in others
     ]
     inputs = [_column(log, n, name=_plain(n, log), change=_slew(log, n), moves=_moves(log, n)) for n in log.inputs]
@@ -132,247 +99,171 @@ def infer_schema(tables: Sequence[Table]) -> InferredSchema:
     return InferredSchema(float(f"{log.period:.3g}"), tuple(states), tuple(inputs), tuple(notes))
 
 
-def _column(log: _Log, column: str, name: str = "", unit: str = "", **more: object) -> InferredColumn:
-    values = log.values(column)
+def _column(log: AlignedLog, column: str, name: str = "", unit: str = "", **more: Any) -> InferredColumn:
+    values = log.columns[column]
     unit = unit or log.units.get(column, "")
-    return InferredColumn(name or column, unit, float(values.min()), float(values.max()), **more)  # type: ignore[arg-type]
+    return InferredColumn(name or column, unit, float(values.min()), float(values.max()), **more)
 
 
-def _plain(name: str, log: _Log) -> str:
+def _plain(name: str, log: AlignedLog) -> str:
     """Return an input's name in the description: `command NAME` is NAME if a coordinate has that name too."""
     short = name.removeprefix(f"{COMMAND} ")
-    return short if short in log.runs[0].columns and short not in log.inputs else name
+    return short if short in log.columns and short not in log.inputs else name
 
 
-# --- from tables to rows ------------------------------------------------------------------------------------------
+# --- columns and their roles by name ------------------------------------------------------------------------------
 
 
-def _from_messages(tables: Sequence[Table]) -> _Log:
+def _from_messages(tables: Sequence[Table]) -> AlignedLog:
     def field_of(quantity: str) -> tuple[Table, str] | None:
         candidates = [t for t in tables if quantity in t.columns]
         return (min(candidates, key=lambda t: t.rank), quantity) if candidates else None
 
-    places = {axis: field_of(f"position.{axis}") for axis in AXES}
-    flat = (up := places["z"]) is None or float(np.nanstd(up[0].columns[up[1]])) < 1e-3
-    kinds = {q: (*named, field_of(q)) for q, named in (STATES if flat else SPACE).items()}
-    input_names = INPUTS if flat else FLYING
-    commands = {q: (*named, field_of(f"{COMMAND}.{q}")) for q, named in input_names.items()}
-    fields = {axis: place for axis, place in places.items() if place is not None and (axis != "z" or not flat)}
-    if len(fields) < 2:
+    up = field_of("position.z")
+    flat = up is None or float(np.nanstd(up[0].columns[up[1]])) < 1e-3
+    fields: dict[str, tuple[Table, str]] = {}
+    units: dict[str, str] = {}
+    wanted = [(axis, "m", f"position.{axis}") for axis in (AXES[:2] if flat else AXES)]
+    wanted += [("heading", "rad", "yaw")] if flat else []
+    wanted += [(name, unit, quantity) for quantity, (name, unit) in (STATES if flat else SPACE).items()]
+    commands = INPUTS if flat else FLYING
+    wanted += [(f"{COMMAND} {name}", unit, f"{COMMAND}.{quantity}") for quantity, (name, unit) in commands.items()]
+    for name, unit, quantity in wanted:
+        if (place := field_of(quantity)) is not None:
+            fields[name], units[name] = place, unit
+    positions = [axis for axis in AXES if axis in fields]
+    if len(positions) < 2:
         available = "; ".join(f"{t.name}: {', '.join(t.columns)}" for t in tables)
         raise NoSource(f"no message holds positions (Odometry, PoseStamped, TF). The source has: {available}")
-    yaw = field_of("yaw") if flat else None
-    units = {name: unit for name, unit, place in kinds.values() if place is not None}
-    fields |= {"heading": yaw} if yaw is not None else {}
-    fields |= {name: place for name, _, place in kinds.values() if place is not None}
-    inputs = []
-    for name, unit, place in commands.values():
-        if place is not None:
-            full = f"{COMMAND} {name}"
-            fields[full], units[full] = place, unit
-            inputs.append(full)
-    runs = _runs(fields, inputs)
-    heading = "heading" if yaw is not None else ""
-    for run in runs if heading else ():
-        run.columns[heading] = np.unwrap(run.columns[heading])
-    return _Log(runs, [axis for axis in AXES if axis in fields], inputs, _command_period(runs, inputs), heading, units)
+    inputs = [name for name in fields if name.startswith(f"{COMMAND} ")]
+    return align(fields, positions, inputs, units, "heading" if "heading" in fields else "")
 
 
-def _from_columns(table: Table) -> _Log:
+def _from_columns(table: Table) -> AlignedLog:
     axes = {match[1].lower(): name for name in table.columns if (match := POSITION.fullmatch(name.strip()))}
     if not {"x", "y"} <= axes.keys():
         raise NoSource(f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}")
-    places = [axes[axis] for axis in AXES if axis in axes]
-    used = {name: (table, name) for name in table.columns if np.isfinite(table.columns[name]).any()}
-    inputs = [name for name in used if INPUT.match(name)]
-    if not inputs:
-        repeated = {n: float(np.mean(np.diff(c[np.isfinite(c)]) == 0.0)) for n, c in table.columns.items() if n in used}
-        inputs = [n for n, share in repeated.items() if share >= HELD and n not in places]
-    runs = _runs(used, inputs)
-    return _Log(runs, places, inputs, _command_period(runs, inputs))
-
-
-def _command_period(runs: Sequence[_Rows], inputs: Sequence[str]) -> float:
-    """Return the median time in s between two changes of an input, or between two rows if there is none."""
-    changed = [np.any([np.diff(run.columns[name]) != 0.0 for name in inputs], axis=0) for run in runs if inputs]
-    between = [np.diff(run.time[1:][at]) for run, at in zip(runs, changed, strict=False)]
-    usual = _row_period(runs[0].time)
-    return max(float(np.median(np.concatenate(between))), usual) if sum(map(len, between)) else usual
-
-
-def _row_period(time: Array) -> float:
-    return float(np.median(np.diff(time)))
-
-
-def _runs(fields: dict[str, tuple[Table, str]], inputs: Sequence[str]) -> list[_Rows]:
-    """Resample all columns to the time stamps of the first one: states linearly, inputs held."""
-    first = next(iter(fields.values()))[0]
-    runs = []
-    for run in np.unique(first.run) if len(first.run) else [0]:
-        series = {name: table.series(column, int(run)) for name, (table, column) in fields.items()}
-        if any(len(time) < 2 for time, _ in series.values()):
-            continue
-        begin, end = max(t[0] for t, _ in series.values()), min(t[-1] for t, _ in series.values())
-        clock = next(iter(series.values()))[0]
-        clock = clock[(clock >= begin) & (clock <= end)]
-        if len(clock) < FEWEST_SPANS:
-            continue
-        columns = {}
-        for name, (time, values) in series.items():
-            if name in inputs:
-                columns[name] = values[np.searchsorted(time, clock + 1e-9, "right") - 1]
-            else:
-                columns[name] = np.interp(clock, time, values)
-        runs.append(_Rows(clock, columns))
-    if not runs:
-        raise NoSource(f"fewer than {FEWEST_SPANS} rows have values in all columns")
-    return runs
+    positions = [axes[axis] for axis in AXES if axis in axes]
+    known = {name: values[np.isfinite(values)] for name, values in table.columns.items()}
+    used = {name: (table, name) for name, values in known.items() if len(values)}
+    inputs = [name for name in used if INPUT.match(name)] or [
+        name for name in used if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
+    ]
+    return align(used, positions, inputs, {})
 
 
 # --- roles and units from the motion -------------------------------------------------------------------------------
 
 
-def _read_motion(log: _Log, notes: list[str]) -> None:
-    """Find the heading, and the units of the columns that measure speeds."""
-    flat = len(log.positions) == 2
-    candidates = [n for n in log.runs[0].columns if n not in (*log.positions, *log.inputs)]
-    if flat:
-        scores = {n: _heading_score(log, n) for n in candidates}
-        named = [n for n in candidates if HEADING.fullmatch(n.strip())]
-        best = max(scores, key=lambda n: scores[n], default="")
-        if best and scores[best] > SAME_CORRELATION:
-            log.heading = best
-        elif named:
-            log.heading = named[0]
-            notes.append(f"{named[0]} is taken as the heading by its name: the motion does not confirm it")
-        else:
-            notes.append(
-                "no column is clearly the heading: none agrees with the motion, and none is named heading or yaw"
-            )
-    for run in log.runs if log.heading else ():
-        run.columns[log.heading] = np.unwrap(run.columns[log.heading])
-    speeds = _speeds(log)
-    for name in candidates:
-        if name == log.heading:
-            continue
-        for unit, measured in speeds:
-            if _same_quantity(measured, _span_means(log, name)):
-                log.units[name] = unit
-                break
+def _find_heading(log: AlignedLog) -> list[str]:
+    """Set the heading of a robot in the plane, and return notes on it."""
+    if len(log.positions) != 2:
+        return []
+    candidates = [n for n in log.columns if n not in (*log.positions, *log.inputs)]
+    scores = {n: _heading_score(log, n) for n in candidates}
+    best = max(scores, key=lambda n: scores[n], default="")
+    if best and scores[best] > SAME_CORRELATION:
+        log.set_heading(best)
+        return []
+    if named := [n for n in candidates if HEADING.fullmatch(n.strip())]:
+        log.set_heading(named[0])
+        return [f"{named[0]} is taken as the heading by its name: the motion does not confirm it"]
+    return ["no column is clearly the heading: none agrees with the motion, and none is named heading or yaw"]
 
 
-def _heading_score(log: _Log, name: str) -> float:
+def _heading_score(log: AlignedLog, name: str) -> float:
     """Return how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|, in [0, 1]."""
-    cosines = []
-    for run, i, j in log.spans(SPAN):
-        way = np.stack([run.columns[p][j] - run.columns[p][i] for p in log.positions])
-        length = np.hypot(*way)
-        far = length > 0.3 * length.max(initial=0.0)
-        angle = run.columns[name][(i + j) // 2]
-        cosines.append((np.abs(np.cos(np.arctan2(way[1], way[0]) - angle)) * far)[far])
-    values = np.concatenate(cosines)
+    i, j = log.spans(SPAN)
+    x, y = (log.change(p, i, j) for p in log.positions)
+    length = np.hypot(x, y)
+    far = length > 0.3 * length.max(initial=0.0)
+    cosines = np.abs(np.cos(np.arctan2(y, x) - log.columns[name][(i + j) // 2]))[far]
     # On a straight path a constant agrees as well as the heading does: require that the angle changes.
-    turned = np.ptp(log.values(name)) > 0.5
-    return float(values.mean()) if turned and len(values) >= FEWEST_SPANS else 0.0
+    turned = np.ptp(log.columns[name]) > 0.5
+    return float(cosines.mean()) if turned and len(cosines) >= FEWEST_SPANS else 0.0
 
 
-def _speeds(log: _Log) -> list[tuple[str, Array]]:
-    """Return (unit, mean speed in each span): along and across the heading and around it, or along the axes."""
-    speeds: dict[str, list[Array]] = {}
-    for run, i, j in log.spans(SPAN):
-        time = run.time[j] - run.time[i]
-        way = [(run.columns[p][j] - run.columns[p][i]) / time for p in log.positions]
-        if log.heading:
-            middle = run.columns[log.heading][(i + j) // 2]
-            turned = (run.columns[log.heading][j] - run.columns[log.heading][i]) / time
-            cos, sin = np.cos(middle), np.sin(middle)
-            way = [cos * way[0] + sin * way[1], cos * way[1] - sin * way[0], turned]
-        for k, part in enumerate(way):
-            speeds.setdefault("rad/s" if log.heading and k == 2 else f"m/s {k}", []).append(part)
-    return [(unit.split(" ")[0], np.concatenate(parts)) for unit, parts in speeds.items()]
+def _find_speeds(log: AlignedLog) -> None:
+    """Set the units of the columns that measure speeds: along and across the heading and around it, or along axes."""
+    i, j = log.spans(SPAN)
+    time = log.time[j] - log.time[i]
+    speeds = [("m/s", log.change(p, i, j) / time) for p in log.positions]
+    if log.heading:
+        (_, x), (_, y) = speeds
+        middle = log.columns[log.heading][(i + j) // 2]
+        cos, sin = np.cos(middle), np.sin(middle)
+        turned = log.change(log.heading, i, j) / time
+        speeds = [("m/s", cos * x + sin * y), ("m/s", cos * y - sin * x), ("rad/s", turned)]
+    for name, values in log.columns.items():
+        if name not in (*log.positions, *log.inputs, log.heading):
+            sums = np.concatenate([[0.0], np.cumsum(values)])
+            means = (sums[j + 1] - sums[i]) / (j - i + 1)
+            unit = next((unit for unit, speed in speeds if _correlation(speed, means) > SAME_CORRELATION), "")
+            log.units |= {name: unit} if unit else {}
 
 
-def _span_means(log: _Log, name: str) -> Array:
-    """Return a column's mean in each span."""
-    means = []
-    for run, i, j in log.spans(SPAN):
-        sums = np.concatenate([[0.0], np.cumsum(run.columns[name])])
-        means.append((sums[j + 1] - sums[i]) / (j - i + 1))
-    return np.concatenate(means)
-
-
-def _same_quantity(one: Array, other: Array, correlation: float = SAME_CORRELATION) -> bool:
-    """Return whether two series correlate more than `correlation`, with a gain of about 1."""
+def _correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series; 0 for too few values, or if the gain is not near 1."""
     if len(one) < FEWEST_SPANS or np.ptp(one) == 0.0 or np.ptp(other) == 0.0:
-        return False
-    slope = float(np.std(other) / np.std(one))
-    return float(np.corrcoef(one, other)[0, 1]) > correlation and SAME_GAIN[0] < slope < SAME_GAIN[1]
+        return 0.0
+    near = SAME_GAIN[0] < float(np.std(other) / np.std(one)) < SAME_GAIN[1]
+    return float(np.corrcoef(one, other)[0, 1]) if near else 0.0
 
 
-def _followers(log: _Log, others: Sequence[str]) -> tuple[dict[str, str], dict[str, float]]:
-    """Return for each input the coordinate that follows it, and for each such coordinate the delay in s."""
-    fits: list[tuple[float, str, str]] = []
-    for name in log.inputs:
-        for other in others:
-            if log.units.get(name) and log.units.get(other) and log.units[name] != log.units[other]:
-                continue
-            fits.append((_lagged_correlation(log, name, other), name, other))
+def _followers(log: AlignedLog, others: Sequence[str]) -> dict[str, str]:
+    """Return for each input the coordinate that follows it."""
     # NAME follows `command NAME` by definition, however slowly.
     named = {name: name.removeprefix(f"{COMMAND} ") for name in log.inputs}
     pairs = {name: other for name, other in named.items() if other in others}
+    fits = [
+        (_lagged_correlation(log, name, other), name, other)
+        for name in log.inputs
+        for other in others
+        if log.units.get(name, "") in ("", log.units.get(other, "")) or not log.units.get(other)
+    ]
     for score, name, other in sorted(fits, reverse=True):
         if score > FOLLOWS_CORRELATION and name not in pairs and other not in pairs.values():
             pairs[name] = other
-    delays = {}
-    for name, other in pairs.items():
-        series = [
-            ((r.time, r.columns[name]), (r.time, r.columns[other]), float(r.time[0]), float(r.time[-1]))
-            for r in log.runs
-        ]
-        if (delay := estimate_delay(series, log.period)) is not None:
-            delays[other] = delay
-    return pairs, delays
+    return pairs
 
 
-def _lagged_correlation(log: _Log, name: str, other: str) -> float:
+def _lagged_correlation(log: AlignedLog, name: str, other: str) -> float:
     """Return the best correlation of an input with a coordinate up to `MAX_LAG` later; 0 if the gain is not near 1."""
-    best = 0.0
-    for late in np.arange(0.0, MAX_LAG, max(_row_period(log.runs[0].time), log.period / 4.0)):
-        n = round(late / _row_period(log.runs[0].time))
-        command = np.concatenate([r.columns[name][: len(r.time) - n] for r in log.runs if len(r.time) > n])
-        response = np.concatenate([r.columns[other][n:] for r in log.runs if len(r.time) > n])
-        if _same_quantity(command, response, best):
-            best = float(np.corrcoef(command, response)[0, 1])
-    return best
+    lags = np.arange(0.0, MAX_LAG, max(log.step, log.period / 4.0))
+    pairs = (log.rows_apart(round(lag / log.step)) for lag in lags)
+    return max(_correlation(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
 
 
-def _slew(log: _Log, name: str) -> float:
+def _delay(log: AlignedLog, name: str, follower: str) -> float | None:
+    """Return the delay in s from an input to the coordinate that follows it, or None if nothing moved."""
+    series = [(log.time[r], log.columns[name][r], log.columns[follower][r]) for r in log.runs()]
+    recordings = [((t, u), (t, values), float(t[0]), float(t[-1])) for t, u, values in series]
+    return estimate_delay(recordings, log.period)
+
+
+def _slew(log: AlignedLog, name: str) -> float:
     """Return the largest change of an input over one period."""
-    return max(float(np.abs(run.columns[name][j] - run.columns[name][i]).max()) for run, i, j in log.spans(log.period))
+    return float(np.abs(log.change(name, *log.spans(log.period))).max())
 
 
-def _braking(log: _Log, name: str) -> float:
+def _braking(log: AlignedLog, name: str) -> float:
     """Return the 95 % quantile of the decrease of a coordinate's magnitude per period, without noise."""
-    falls = [np.abs(run.columns[name][i]) - np.abs(run.columns[name][j]) for run, i, j in log.spans(log.period)]
-    decrease = np.concatenate(falls)
-    decrease = decrease[decrease > 0.02 * np.abs(log.values(name)).max()]
+    i, j = log.spans(log.period)
+    size = np.abs(log.columns[name])
+    decrease = size[i] - size[j]
+    decrease = decrease[decrease > 0.02 * size.max()]
     return float(np.quantile(decrease, 0.95)) if len(decrease) >= FEWEST_SPANS else 0.0
 
 
-def _moves(log: _Log, name: str) -> bool | None:
+def _moves(log: AlignedLog, name: str) -> bool | None:
     """Return whether the input moves the robot while all others are zero; None if that was never recorded."""
-    alone, driving = [], []
-    seconds = max(2.0 * log.period, SPAN)
-    for run, i, j in log.spans(seconds):
-        way = np.linalg.norm([run.columns[p][j] - run.columns[p][i] for p in log.positions], axis=0)
-        small = [np.abs(run.columns[n]) <= 0.05 * np.abs(log.values(n)).max() for n in log.inputs if n != name]
-        large = np.abs(run.columns[name]) > 0.2 * np.abs(log.values(name)).max()
-        calm = np.concatenate([[0], np.cumsum(large & np.all(small, axis=0) if small else large)])
-        before = np.maximum(i - (j - i), 0)  # and for as long before, so that earlier motion has ended
-        isolated = calm[j + 1] - calm[before] == j + 1 - before
-        alone.append(way[isolated])
-        driving.append(way)
-    ways = np.concatenate(alone)
-    if len(ways) < FEWEST_SPANS:
+    i, j = log.spans(max(2.0 * log.period, SPAN))
+    way = np.linalg.norm([log.change(p, i, j) for p in log.positions], axis=0)
+    sizes = {n: np.abs(log.columns[n]) / np.abs(log.columns[n]).max() for n in log.inputs}
+    alone = np.all([size > 0.2 if n == name else size <= 0.05 for n, size in sizes.items()], axis=0)
+    count = np.concatenate([[0], np.cumsum(alone)])
+    before = np.maximum(i - (j - i), 0)  # and for as long before, so that earlier motion has ended
+    isolated = way[count[j + 1] - count[before] == j + 1 - before]
+    if len(isolated) < FEWEST_SPANS:
         return None
-    return bool(np.quantile(ways, 0.5) > 0.1 * np.quantile(np.concatenate(driving), 0.9))
+    return bool(np.quantile(isolated, 0.5) > 0.1 * np.quantile(way, 0.9))

@@ -157,9 +157,9 @@ def test_the_last_steps_of_a_log(tmp_path):
     made = [*steps("a", 0, range(50)), *steps("a", 1, range(50))]
     segment.save([Entry("step/ground/a", pb.Step, s.SerializeToString(), i, i, i) for i, s in enumerate(made)])
     segment.finish()
-    recorded = from_log(tmp_path / "run.mcap", GROUND, last=60)
-    assert [len(t.inputs) for t in recorded.data.trajectories] == [9, 49]
-    assert "58 of the last 60 steps" in recorded.note and recorded.data.about == {"origin": "log"}
+    data, note = from_log(tmp_path / "run.mcap", GROUND, last=60)
+    assert [len(t.inputs) for t in data.trajectories] == [9, 49]
+    assert "58 of the last 60 steps" in note and data.about == {"origin": "log"}
     open_segment(tmp_path / "none.mcap", {}).finish()
     with pytest.raises(BadData, match="no trajectory of ground"):
         from_log(tmp_path / "none.mcap", GROUND, last=60)

@@ -1,0 +1,123 @@
+"""Split the columns of a source into recordings without gaps, jumps of the pose and lost inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from brakeline.deploy.data.sources.quantity_names import column_names, split
+from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.errors import NoSource
+from brakeline.messaging.robot import Robot
+
+Series = tuple[Array, Array]  # time in s and values (T,)
+Span = tuple[float, float]  # begin and end in s
+
+GAP = 1.5  # times the usual time between two samples: a larger one is a gap
+JUMP = 2.0  # times the fastest motion: faster is a jump
+
+
+@dataclass(frozen=True)
+class GapFreeRecording:
+    """One run without gaps: a series per state coordinate and input, from `begin` to `end` in s."""
+
+    states: list[Series]
+    inputs: list[Series]
+    begin: float
+    end: float
+
+
+def gap_free_recordings(
+    places: dict[str, tuple[Table, str]], robot: Robot, delay: float, hold: float
+) -> tuple[list[GapFreeRecording], list[str]]:
+    """Return the recordings, with unwrapped headings, and notes on gaps and jumps.
+
+    Args:
+        places: table and field of each column of the robot.
+        robot: gives the columns, the period and the fastest motion.
+        delay: time in s by which the stamps of the inputs are too early.
+        hold: time in s for which an input is valid after its last message.
+
+    Raises:
+        NoSource: a coordinate has less than one sample per period, or its time decreases.
+    """
+    names, input_names = column_names(robot)
+    recordings: list[GapFreeRecording] = []
+    gaps = jumps = 0
+    for run in sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0}):
+        states, given = (
+            [table.series(column, run) for table, column in (places[name] for name in columns)]
+            for columns in (names, input_names)
+        )
+        inputs = [(time + delay, values) for time, values in given]
+        if any(len(time) < 2 for time, _ in states) or not all(len(time) for time, _ in inputs):
+            continue
+        cuts = [_gaps(time, robot.period, name) for (time, _), name in zip(states, names, strict=True)]
+        torn = _jumps(robot, states)
+        gaps += len(cuts[0])
+        jumps += len({float(states[i][0][j]) for i, indices in torn.items() for j in indices})
+        spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
+        spans += [_uncut(states[i][0], indices) for i, indices in torn.items()]
+        spans += [_uncut(time, np.flatnonzero(np.diff(time) > hold), hold) for time, _ in inputs]
+        if robot.heading is not None:
+            time, heading = states[robot.heading]
+            states[robot.heading] = time, np.unwrap(heading)
+        for begin, end in _common(spans):
+            part = [_within(series, begin, end) for series in states]
+            if all(len(time) >= 2 for time, _ in part):
+                recordings.append(GapFreeRecording(part, inputs, begin, end))
+    counts = {"gaps": gaps, "jumps of the pose": jumps}
+    return recordings, [f"{count} {what}" for what, count in counts.items() if count]
+
+
+def _gaps(time: Array, period: float, name: str) -> Array:
+    """Return the indices of the samples before gaps. Raises NoSource if there are too few samples."""
+    apart = np.diff(time)
+    usual = float(np.median(apart))
+    if usual > 1.05 * period:
+        raise NoSource(
+            f"{name} has a sample every {usual:.3g} s: the robot's period of {period:g} s needs at least one per period"
+        )
+    return np.flatnonzero(apart > max(GAP * usual, 0.5 * period))
+
+
+def _jumps(robot: Robot, states: list[Series]) -> dict[int, Array]:
+    """Return for each coordinate of the pose the indices of the samples before a motion faster than the robot's."""
+    fastest = {"m/s": 0.0, "rad/s": 0.0}
+    for label, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True):
+        if (unit := split(label)[1]) in fastest:
+            fastest[unit] = float(np.hypot(fastest[unit], max(abs(low), abs(high))))
+    torn = {}
+    for i in (*range(robot.position_dim), *(() if robot.heading is None else (robot.heading,))):
+        time, values = states[i]
+        apart, moved = np.diff(time), np.abs(np.diff(values))
+        if i == robot.heading:
+            moved = np.abs((np.diff(values) + np.pi) % (2.0 * np.pi) - np.pi)
+        usual = float(np.quantile(moved / apart, 0.99))
+        most = JUMP * max(fastest["rad/s" if i == robot.heading else "m/s"], usual)
+        torn[i] = np.flatnonzero(moved > most * apart + 4.0 * robot.measurement_bound[i])
+    return torn
+
+
+def _uncut(time: Array, cuts: Array, hold: float = 0.0) -> list[Span]:
+    """Return the spans of a series that is cut after the samples `cuts`; its values are valid for `hold` s."""
+    starts, ends = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(time) - 1]])
+    return [(float(time[i]), float(time[j]) + hold) for i, j in zip(starts.astype(int), ends.astype(int), strict=True)]
+
+
+def _common(spans: Sequence[list[Span]]) -> list[Span]:
+    """Return the intersection of the lists of spans."""
+    common = spans[0]
+    for other in spans[1:]:
+        met = ((max(a, c), min(b, d)) for a, b in common for c, d in other if c < b and d > a)
+        common = [(a, b) for a, b in met if a < b]
+    return common
+
+
+def _within(series: Series, begin: float, end: float) -> Series:
+    """Return the samples from the last one at or before `begin` to the first one at or after `end`."""
+    time, values = series
+    i, j = max(int(np.searchsorted(time, begin, "right")) - 1, 0), int(np.searchsorted(time, end)) + 1
+    return time[i:j], values[i:j]
