@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console, RenderableType
@@ -16,8 +17,8 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def print_json(figures: dict[str, Any]) -> None:
-    """Print one JSON object on stdout. Numbers that are not finite become null."""
-    print(json.dumps(_finite(figures)))
+    """Print one JSON object on stdout. Numbers that are not finite become null, paths become text."""
+    print(json.dumps(_plain(figures)))
 
 
 def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType) -> None:
@@ -29,11 +30,13 @@ def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType)
         console.print(line, markup=False)
 
 
-def _finite(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
+        return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
+        return [_plain(inner) for inner in value]
+    if isinstance(value, Path):
+        return str(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -11,8 +11,6 @@ from brakeline.deploy.run.run_config import EXPERIMENTS
 
 @dataclass(frozen=True)
 class DemoCommand:
-    """The options of `brakeline demo`."""
-
     steps: int = EXPERIMENTS["demo"].steps
     """Training steps."""
     seed: Seed = 0

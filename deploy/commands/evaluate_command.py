@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from brakeline.deploy.commands import common_options as options
-from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
+from brakeline.deploy.commands.command_output import conditions_table, errors, print_result
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.deploy.progress import under_way
 from brakeline.logs.episode_stats import EpisodeStats
@@ -16,8 +16,6 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 @dataclass(frozen=True)
 class EvaluateCommand:
-    """The options of `brakeline evaluate`."""
-
     robot: options.Robot = "ground"
     policy: str = "astar"
     """Policy to evaluate: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
@@ -72,12 +70,9 @@ class EvaluateCommand:
                 advance(what=counts)
 
             figures = evaluate(robot, evaluation, show_progress)
-        if self.json:
-            print_json(figures)
-        else:
-            console.print(show(figures))
-            if self.verbose:
-                console.print(conditions_table(figures["conditions"]))
+        print_result(
+            self.json, figures, show(figures), *([conditions_table(figures["conditions"])] if self.verbose else [])
+        )
         return 0
 
     def _draw(self, robot: RobotWithTask, evaluation: Evaluation, path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import Json, Robot, Seed
 from brakeline.deploy.data import excitation_plan
 from brakeline.deploy.data.sources.quantity_names import column_names
@@ -16,8 +16,6 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 @dataclass(frozen=True)
 class ExciteCommand:
-    """The options of `brakeline excite`."""
-
     robot: Robot = "ground"
     keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
     """Region that the robot stays in: least x, least y, greatest x, greatest y [m]. Each run starts in its middle,
@@ -46,10 +44,8 @@ class ExciteCommand:
 
         with under_way(f"driving {robot.name}", round(60.0 * self.minutes / robot.period)) as advance:
             driven = drive(robot, self.keep, self.minutes, self.seed, path, advance=advance)
-        if self.json:
-            print_json(asdict(driven))
-            return 0
         edge = f"{-driven.outside:.2f} m inside the region" if driven.outside <= 0.0 else f"{driven.outside:.2f} m OUT"
-        console.print(f"{path}: {driven.periods} periods in {driven.runs} runs; the body came to {edge}", markup=False)
-        console.print(f"next: brakeline import LOG {path} --robot {self.robot}", markup=False)
+        counts = f"{driven.periods} periods in {driven.runs} runs; the body came to {edge}"
+        following = f"next: brakeline import LOG {path} --robot {self.robot}"
+        print_result(self.json, asdict(driven), f"{path}: {counts}", following)
         return 0

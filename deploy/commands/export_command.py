@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.task import robot_with_task
@@ -14,8 +14,6 @@ from brakeline.messaging.task import robot_with_task
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """The options of `brakeline export`."""
-
     logs: Logs = (LATEST,)
     csv: Path | None = None
     """Write each step as a line of this CSV file."""
@@ -41,12 +39,11 @@ class ExportCommand:
         for name in formats:
             with under_way(f"writing {getattr(self, name)}"):
                 figures[name] = writers[name]()
-        if self.json:
-            print_json(figures)
-        else:
-            for written in figures.values():
-                counts = ", ".join(f"{count} {unit}" for unit, count in written.items() if unit != "path")
-                console.print(f"{written['path']}: {counts}", markup=False)
+        counts = {
+            written["path"]: ", ".join(f"{count} {unit}" for unit, count in written.items() if unit != "path")
+            for written in figures.values()
+        }
+        print_result(self.json, figures, *(f"{path}: {text}" for path, text in counts.items()))
         return 0
 
     def _csv(self) -> dict[str, Any]:

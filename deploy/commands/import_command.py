@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 from rich.markup import escape
+from rich.text import Text
 
-from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data import importer
 from brakeline.deploy.data.build_lock import folder_lock
@@ -23,8 +24,6 @@ from brakeline.messaging.robot import robot_named
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """The options of `brakeline import`."""
-
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Logs to import: CSV, Parquet, ROS 2 bags, .bin and .tlog of ArduPilot, .ulg of PX4, own runs (docs/data.md)."""
     robot: str = "ground"
@@ -53,22 +52,15 @@ class ImportCommand:
         if not covered.refused:
             with folder_lock(path.parent):
                 imported.data.save(path)
-        if self.json:
-            figures: dict[str, Any] = {"path": None if covered.refused else str(path), "digest": imported.data.digest()}
-            figures |= {"report": asdict(imported.report), "coverage": asdict(covered), "refused": covered.refused}
-            print_json(figures)
-            return int(bool(covered.refused))
-        for note in imported.report.notes:
-            console.print(note, markup=False)
-        console.print(coverage_table(covered))
-        for text in covered.missing:
-            console.print(f"[yellow]missing:[/] {escape(text)}")
-        if covered.refused:
-            errors.print(f"[red]refused:[/] no model set can be made of this: {escape(covered.refused)}")
-            return 1
+        figures: dict[str, Any] = {"path": None if covered.refused else str(path), "digest": imported.data.digest()}
+        figures |= {"report": asdict(imported.report), "coverage": asdict(covered), "refused": covered.refused}
         counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
-        console.print(f"{path}: {counts}\nnext: brakeline certify {path} --use", markup=False)
-        return 0
+        missing = [Text.from_markup(f"[yellow]missing:[/] {escape(text)}") for text in covered.missing]
+        following = [] if covered.refused else [f"{path}: {counts}", f"next: brakeline certify {path} --use"]
+        print_result(self.json, figures, *imported.report.notes, coverage_table(covered), *missing, *following)
+        if covered.refused and not self.json:
+            errors.print(f"[red]refused:[/] no model set can be made of this: {escape(covered.refused)}")
+        return int(bool(covered.refused))
 
 
 def coverage_table(covered: Coverage) -> StackingTable:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_result
 from brakeline.deploy.commands.common_options import Json, Robot
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import pretrained
@@ -20,8 +20,6 @@ from brakeline.safety.rivals.pretrained import Pretrained
 
 @dataclass(frozen=True)
 class PretrainCommand:
-    """The options of `brakeline pretrain`."""
-
     method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
     """The rival method."""
     robot: Robot = "ground"
@@ -44,21 +42,15 @@ class PretrainCommand:
         if self.tune:
             return self._tune(model, robot)
         path = method_path(robot, self.method, ModelConfig())
-        if self.json:
-            print_json({"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about)
-        else:
-            console.print(f"{path}: {model.version}")
+        figures = {"path": str(path), "version": model.version, "settings": dict(model.settings)} | model.about
+        print_result(self.json, figures, f"{path}: {model.version}")
         return 0
 
     def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
         rows = tune_threshold(model, robot, values_for(model, robot), self.episodes, self._print_row)
         chosen = best_threshold(rows)
-        if self.json:
-            print_json({"tried": [row.figures() for row in rows], "best": chosen.value})
-        else:
-            console.print(
-                f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"
-            )
+        best = f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"
+        print_result(self.json, {"tried": [row.figures() for row in rows], "best": chosen.value}, best)
         return 0
 
     def _print_row(self, row: ThresholdTrial) -> None:

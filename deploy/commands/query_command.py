@@ -6,13 +6,13 @@ import json
 import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.markup import escape
+from rich.text import Text
 
-from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed
 from brakeline.errors import BadScan
 from brakeline.logs.console_tables import PLAIN, StackingTable
@@ -33,8 +33,6 @@ OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW
 
 @dataclass(frozen=True)
 class QueryCommand:
-    """The options of `brakeline query`."""
-
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     state: tuple[float, ...] = ()
@@ -63,28 +61,23 @@ class QueryCommand:
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
             client = SafetyClient(bus, robot, self.timeout)
             answer = client.decide(state, action, obstacles, scan=scan, known_free=self.known_free)
-        figures: dict[str, Any] = {
+        names = ("margin", "at_least", "for_clearance", "time_ms", "model", "reason", "verified", "bound")
+        figures = {name: getattr(answer, name) for name in names} | {
             "decision": answer.kind,
-            "for_clearance": answer.for_clearance,
             "plan": answer.plan.tolist(),
-            "tube": {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()},
-            "margin": answer.margin,
-            "at_least": answer.at_least,
-            "time_ms": answer.time_ms,
-            "model": answer.model,
-            "reason": answer.reason,
-            "verified": answer.verified,
-            "bound": answer.bound,
         }
-        if self.json:
-            print_json(figures)
-            return 0
+        figures["plan"] = answer.plan.tolist()
+        figures["tube"] = {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()}
         clearance = " for clearance: the proposal is verified too," if answer.for_clearance else ""
-        console.print(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}")
-        console.print(describe_verification(answer.verified, answer.bound), markup=False)
-        console.print(plan_table(answer, robot.action))
         margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f} m"
-        console.print(f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}")
+        print_result(
+            self.json,
+            figures,
+            Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}"),
+            describe_verification(answer.verified, answer.bound),
+            plan_table(answer, robot.action),
+            f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}",
+        )
         return 0
 
 

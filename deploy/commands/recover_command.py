@@ -17,8 +17,6 @@ from brakeline.logs.reader import find
 
 @dataclass(frozen=True)
 class RecoverCommand:
-    """The options of `brakeline recover`."""
-
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays beside it as
     *.mcap.damaged."""
@@ -38,10 +36,5 @@ class RecoverCommand:
             if not self.json:
                 console.print(str(recovered[-1]), markup=False)
         if self.json:
-            files = [{name: _plain(value) for name, value in asdict(file).items()} for file in recovered]
-            print_json({"files": files})
+            print_json({"files": [asdict(file) for file in recovered]})
         return 0
-
-
-def _plain(value: object) -> object:
-    return str(value) if isinstance(value, Path) else value

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.markup import escape
 
-from brakeline.deploy.commands.command_output import console, errors, print_json
+from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.errors import BadDescription
@@ -21,8 +21,6 @@ from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 @dataclass(frozen=True)
 class RobotCommand:
-    """The options of `brakeline robot`."""
-
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
     """new writes a description with comments, check lists all mistakes in one, show prints what follows from it."""
     file: Annotated[str, tyro.conf.Positional]
@@ -49,12 +47,8 @@ class RobotCommand:
         if self.from_ is not None:
             text, notes = _from_log(self.from_, text, path.stem)
         path.write_text(text)
-        if self.json:
-            print_json({"file": str(path), "notes": list(notes)})
-            return 0
-        for note in notes:
-            console.print(note, markup=False)
-        console.print(f"{path}: fill it in, then `brakeline robot check {path}`")
+        following = f"{path}: fill it in, then `brakeline robot check {path}`"
+        print_result(self.json, {"file": str(path), "notes": list(notes)}, *notes, following)
         return 0
 
     def _check(self) -> int:
@@ -67,13 +61,13 @@ class RobotCommand:
                 errors.print(str(error), markup=False)
             return 1
         remarks = summary(robot)["remarks"]
-        if self.json:
-            print_json({"file": self.file, "problems": [], "remarks": remarks})
-            return 0
-        console.print(f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake")
-        for line in (*remarks, _task_text(self.file)):
-            console.print(f"  {line}", markup=False)
-        console.print(f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`")
+        print_result(
+            self.json,
+            {"file": self.file, "problems": [], "remarks": remarks},
+            f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake",
+            *(f"  {line}" for line in (*remarks, _task_text(self.file))),
+            f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`",
+        )
         return 0
 
     def _show(self) -> int:
@@ -82,16 +76,15 @@ class RobotCommand:
         if self.picture is not None:
             draw_description(robot, self.picture)
             values["picture"] = str(self.picture)
-        if self.json:
-            print_json(values)
-            return 0
         table = StackingTable(show_header=False, **PLAIN)
-        for label, one in values.pop("inputs").items():
+        for label, one in values["inputs"].items():
             table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
         for name, value in values.items():
-            text = "\n".join(value) if isinstance(value, list) else f"{value:g}" if isinstance(value, float) else value
-            table.add_row(name.replace("_", " "), escape(str(text)))
-        console.print(table)
+            if name != "inputs":
+                text = "\n".join(value) if isinstance(value, list) else value
+                text = f"{text:g}" if isinstance(text, float) else str(text)
+                table.add_row(name.replace("_", " "), escape(text))
+        print_result(self.json, values, table)
         return 0
 
 

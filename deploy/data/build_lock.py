@@ -7,11 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from rich.console import Console
+
+from brakeline.deploy.progress import console
 
 LOCK = ".lock"
-
-console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 @contextmanager

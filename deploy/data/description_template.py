@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from typing import Any
 
 from brakeline.deploy.data.schema_inference import InferredColumn, InferredSchema
 
@@ -19,40 +20,27 @@ UNKNOWN = "cannot be inferred from the log"
 def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     """Return the template with the values that the log shows; comments mark values that it does not show."""
     horizon, brake = periods(schema)
-    lines = []
-    section = ""
-    for line in template.splitlines():
-        if line.startswith(("[", "# [[")):
-            section = line.strip("[]# ")
-        if line.startswith("period"):
-            lines.append(
-                f"period = {schema.period:g} # s between decisions; the median time between input changes in the log"
-            )
-        elif line.startswith("sight"):
-            lines.append(f"{line}; {UNKNOWN}")
-        elif section in ("state", "input") and line and not line.startswith(("[", "#")):
-            continue  # the template's robot
-        elif section == "plan" and line.startswith("horizon"):
-            lines.append(f"horizon = {horizon}")
-        elif section == "plan" and line.startswith("brake"):
-            lines.append(f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it")
-        elif line.startswith("[[body]]"):
-            lines += [f"# The body {UNKNOWN}: measure it.", line]
-        elif section == "body" and line.startswith("at ="):
-            zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
-            lines.append(line.replace("[0.0, 0.0]", f"[{zeros}]"))
-        else:
-            lines.append(line)
-        if line == "[state]":
-            lines.append(f"# error: {UNKNOWN}.")
-            lines += [text for column in schema.states for text in _state(column)]
-        elif line == "[input]":
-            lines.append("# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more.")
-            lines += [text for column in schema.inputs for text in _input(column)]
-            lines += _template_inputs(template) if not schema.inputs else []
+    states = [f"# error: {UNKNOWN}.", *map(_state, schema.states)]
+    inputs = ["# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more."]
+    inputs += [*map(_input, schema.inputs)] if schema.inputs else [f"# Inputs {UNKNOWN}: these come from the template."]
+    zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
+    replacements = (
+        (
+            r"^period = .*",
+            f"period = {schema.period:g} # s between decisions: the median time of inputs in the log",
+        ),
+        (r"^sight = .*", rf"\g<0>; {UNKNOWN}"),
+        (r"^\[state\]\n(.+\n)+", "\n".join(["[state]", *states, ""])),
+        (r"^\[input\]\n" + ("(.+\n)+" if schema.inputs else ""), "\n".join(["[input]", *inputs, ""])),
+        (r"^horizon = .*", f"horizon = {horizon}"),
+        (r"^brake = .*", f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it"),
+        (r"^\[\[body\]\]", rf"# The body {UNKNOWN}: measure it.\n\g<0>"),
+        (r"^at = \[0.0, 0.0\]", f"at = [{zeros}]"),
+    )
+    for pattern, text in replacements:
+        template = re.sub(pattern, text, template, flags=re.MULTILINE)
     about = [f"# Inferred from {source}. Check every line: the log shows what the robot did, not what it can do."]
-    about += [f"# {note}" for note in schema.notes]
-    return "\n".join((*about, *lines)) + "\n"
+    return "\n".join((*about, *(f"# {note}" for note in schema.notes), template))
 
 
 def periods(schema: InferredSchema) -> tuple[int, int]:
@@ -77,35 +65,30 @@ def _high(one: InferredColumn) -> float:
     return max(_outwards(one.most), 0.0)
 
 
-def _template_inputs(template: str) -> list[str]:
-    body = template.split("[input]\n", 1)[1].split("\n\n", 1)[0]
-    return [f"# Inputs {UNKNOWN}: these come from the template.", *body.splitlines()]
-
-
-def _state(one: InferredColumn) -> list[str]:
-    error = ERRORS.get(one.role, ERROR)
-    words = [f"unit = {json.dumps(one.unit or '1')}"]
-    words += [f"role = {json.dumps(one.role)}"] if one.role != "other" else []
-    words.append(f"error = {error:g}")
-    words += [f"follows = {json.dumps(one.follows)}"] if one.follows else []
+def _state(one: InferredColumn) -> str:
+    values: dict[str, Any] = {"unit": one.unit or "1"}
+    values |= {"role": one.role} if one.role != "other" else {}
+    values |= {"error": ERRORS.get(one.role, ERROR)} | ({"follows": one.follows} if one.follows else {})
     remarks = [f"{one.least:.3g} to {one.most:.3g} in the log"] if one.role != "heading" else []
     remarks += [] if one.unit else [f"its unit {UNKNOWN}"]
     remarks += [f"{1e3 * one.delay:.0f} ms after its input"] if one.delay is not None else []
     remarks += [f"brakes by {one.change:.2g} a period"] if one.follows and one.change else []
-    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(remarks)}" if remarks else "")]
+    return _line(one.name, values, remarks)
 
 
-def _input(one: InferredColumn) -> list[str]:
-    words = [f"unit = {json.dumps(one.unit or '1')}", f"low = {_low(one):g}", f"high = {_high(one):g}"]
-    most = slew(one)
-    words += [f"slew = {most:g}"] if most is not None else []
-    steers = one.unit == "rad"
-    moves = not steers if one.moves is None else one.moves
-    words += [f"moves = {str(moves).lower()}", 'stop = "hold"' if steers else 'stop = "ramp"']
+def _input(one: InferredColumn) -> str:
+    most, steers = slew(one), one.unit == "rad"
+    values: dict[str, Any] = {"unit": one.unit or "1", "low": _low(one), "high": _high(one)}
+    values |= {} if most is None else {"slew": most}
+    values |= {"moves": not steers if one.moves is None else one.moves, "stop": "hold" if steers else "ramp"}
     remarks = [] if one.unit else [f"its unit {UNKNOWN}"]
     remarks += [] if one.moves is not None else [f"moves: {UNKNOWN}, the log never changes it alone"]
     remarks += ["it jumps, so that it has no slew limit"] if most is None else []
-    return [f"{key(one.name)} = {{ {', '.join(words)} }}" + (f" # {'; '.join(remarks)}" if remarks else "")]
+    return _line(one.name, values, remarks)
+
+
+def _line(name: str, values: dict[str, Any], remarks: list[str]) -> str:
+    return f"{toml_key(name)} = {toml_value(values)}" + (f" # {'; '.join(remarks)}" if remarks else "")
 
 
 def _outwards(value: float) -> float:
@@ -113,9 +96,18 @@ def _outwards(value: float) -> float:
     if abs(value) < 1e-9:
         return 0.0
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
-    return math.copysign(math.ceil(round(abs(value) / unit, 6)) * unit, value)
+    return float(f"{math.copysign(math.ceil(round(abs(value) / unit, 6)) * unit, value):g}")
 
 
-def key(name: str) -> str:
+def toml_key(name: str) -> str:
     """Return a name as a TOML key."""
     return name if BARE.fullmatch(name) else json.dumps(name)
+
+
+def toml_value(value: Any) -> str:
+    """Return a JSON value as an inline TOML value."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{toml_key(name)} = {toml_value(one)}" for name, one in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    return json.dumps(value)

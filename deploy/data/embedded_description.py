@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.data.description_template import key
+from brakeline.deploy.data.description_template import toml_key, toml_value
 from brakeline.errors import NoSource
 from brakeline.logs.reader import open_log
 
@@ -39,22 +39,15 @@ def read_embedded_description(path: Path, name: str) -> str:
 
 def _lines(described: dict[str, Any]) -> Iterator[str]:
     """Yield the TOML lines: plain values first, then tables, then arrays of tables."""
-    for name, value in described.items():
-        if not isinstance(value, dict | list):
-            yield f"{key(name)} = {_value(value)}"
+    yield from _values({name: value for name, value in described.items() if not isinstance(value, dict | list)})
     for name, value in described.items():
         if isinstance(value, dict):
-            yield f"\n[{key(name)}]"
-            yield from (f"{key(inner)} = {_value(one)}" for inner, one in value.items())
-        elif isinstance(value, list):
-            for table in value:
-                yield f"\n[[{key(name)}]]"
-                yield from (f"{key(inner)} = {_value(one)}" for inner, one in table.items())
+            yield f"\n[{toml_key(name)}]"
+            yield from _values(value)
+        for table in value if isinstance(value, list) else ():
+            yield f"\n[[{toml_key(name)}]]"
+            yield from _values(table)
 
 
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key(name)} = {_value(one)}" for name, one in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return json.dumps(value)
+def _values(table: dict[str, Any]) -> Iterator[str]:
+    return (f"{toml_key(name)} = {toml_value(value)}" for name, value in table.items())

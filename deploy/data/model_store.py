@@ -13,11 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from rich.console import Console
-
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import method_path, model_path
-from brakeline.deploy.progress import under_way
+from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
     from brakeline.deploy.data.rival_pretraining import ModelConfig as RivalRecipe
 
 M = TypeVar("M")
-
-console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def model_for(robot: Robot, model_config: ModelConfig, accept_bound: float | None = None) -> ModelSet:

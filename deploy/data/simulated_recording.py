@@ -7,12 +7,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from brakeline.deploy.data import collect
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
-from brakeline.deploy.progress import each
+from brakeline.deploy.progress import console, each
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
@@ -22,8 +20,6 @@ from brakeline.sim.sim_conditions import Conditions
 PACE = 0.25  # s per trajectory, on a core that other processes share
 SAVE_EVERY = 20.0  # s: a killed recording loses no more than this
 SEED = 20260
-
-console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def load_or_record(
@@ -35,9 +31,6 @@ def load_or_record(
     again: bool = False,
 ) -> Dataset:
     """Load the data set at `path`. Record it first if the file is missing, or if `again`.
-
-    An interrupted recording continues from the file beside it. Each trajectory has its own random generator, so the
-    data are the same as without the interruption.
 
     Raises:
         BadData: `again` would overwrite data that do not come from the simulator.
@@ -55,11 +48,11 @@ def load_or_record(
 
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
-    driven = _load_partial(part, robot, trajectories, seed, conditions)
+    driven = _load_partial(part, robot, collect.origin(seed, conditions))[:trajectories]
+    before = f"{len(driven)} of them recorded before" if driven else _duration(PACE * trajectories)
     console.print(
-        f"recording {robot.name} once, into {path}: {trajectories} trajectories, "
-        + (f"{len(driven)} of them recorded before" if driven else about(PACE * trajectories))
-        + ". You can interrupt it: the next call continues.",
+        f"recording {robot.name} once, into {path}: {trajectories} trajectories, {before}. You can interrupt it: the "
+        "next call continues.",
         markup=False,
     )
     rest = collect.record(robot, trajectories, seed, conditions, len(driven))
@@ -97,21 +90,18 @@ def _check_replaceable(path: Path, robot: Robot) -> None:
         )
 
 
-def _load_partial(part: Path, robot: Robot, trajectories: int, seed: int, conditions: Conditions) -> list[Trajectory]:
+def _load_partial(part: Path, robot: Robot, about: dict[str, str]) -> list[Trajectory]:
     """Return the trajectories of an interrupted recording with the same settings, or an empty list."""
-    if not part.exists():
-        return []
     try:
         partial = Dataset.load(part)
     except BadData:
         return []
-    if partial.robot.layout() != robot.layout() or partial.about != collect.origin(seed, conditions):
+    if partial.robot.layout() != robot.layout() or partial.about != about:
         return []
-    return [replace(t, before=None) for t in partial.trajectories[:trajectories]]  # each began at rest
+    return [replace(t, before=None) for t in partial.trajectories]  # each began at rest
 
 
-def about(seconds: float) -> str:
-    """Return a rough duration as text."""
+def _duration(seconds: float) -> str:
     return f"about {seconds / 60.0:.0f} min" if seconds > 90.0 else f"about {10 * math.ceil(seconds / 10.0)} s"
 
 
@@ -125,9 +115,7 @@ def data_for(robot: Robot) -> Dataset:
     """
     lockstep = robot.in_lockstep()
     data = load_or_record(lockstep)
-    if (
-        replace(data.robot, body=lockstep.body, limits=lockstep.limits, sight=lockstep.sight).layout()
-        != lockstep.layout()
-    ):
+    today = replace(data.robot, body=lockstep.body, limits=lockstep.limits, sight=lockstep.sight)
+    if today.layout() != lockstep.layout():
         raise BadData(f"{record_path(lockstep)} was recorded before the description of {robot.name} changed")
     return replace(data, robot=robot)
