@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
 
 from brakeline.deploy.data.certification import HELD_OUT, MAX_INFLATION
+from brakeline.deploy.data.input_delay import followed_inputs
 from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
@@ -67,35 +69,26 @@ def coverage(data: Dataset) -> Coverage:
     """Measure the coverage of a data set."""
     robot = data.robot
     names, inputs = column_names(robot)
-    driven = np.concatenate([t.inputs for t in data.trajectories])
-    states = np.concatenate([t.states for t in data.trajectories])
-    seen = [
-        _seen(name, robot.action[i], robot.action_low[i], robot.action_high[i], driven[:, i])
-        for i, name in enumerate(inputs)
-    ]
-    seen += [
-        _seen(names[k], robot.state[k], robot.action_low[i], robot.action_high[i], states[:, k])
-        for i, k in enumerate(robot.follows)
-        if k >= 0
-    ]
+    driven, states = (np.concatenate([getattr(t, part) for t in data.trajectories]) for part in ("inputs", "states"))
+    bounds = list(zip(robot.action_low, robot.action_high, strict=True))
+    units = [split(label)[1] for label in robot.action]
+    seen = [_seen(name, units[i], *bounds[i], driven[:, i]) for i, name in enumerate(inputs)]
+    followers = [_seen(names[k], split(robot.state[k])[1], *bounds[i], states[:, k]) for i, k in followed_inputs(robot)]
     rested = resting_periods_at_end(robot)
     stops = sum(len(stopping_distances(robot, t, rested)) for t in data.trajectories)
     begun = _begun(data)
-    braked = [
-        _seen(name, robot.action[i], robot.action_low[i], robot.action_high[i], begun[:, i])
-        for i, name in enumerate(inputs)
-        if robot.zero_at_rest[i] and len(begun)
-    ]
-    missing = _stops_missing(robot, stops, rested)
-    missing += [text for one in seen[: len(inputs)] for text in _unreached_bounds(one)]
-    missing += [text for one in braked for text in _unbraked_ranges(one)]
+    at_rest = [i for i, zero in enumerate(robot.zero_at_rest) if zero and len(begun)]
+    braked = [_seen(inputs[i], units[i], *bounds[i], begun[:, i]) for i in at_rest]
     plans, free = (len(windows(data, robot.horizon, kind)) for kind in (PLAN, FREE))
+    missing = _stops_missing(robot, stops, rested)
+    missing += [text for one in seen for text in _unreached_bounds(one)]
+    missing += [text for one in braked for text in _unbraked_ranges(one)]
     missing += _windows_missing(plans, free)
-    return Coverage(tuple(seen), stops, tuple(braked), plans, free, tuple(missing))
+    return Coverage((*seen, *followers), stops, tuple(braked), plans, free, tuple(missing))
 
 
-def _seen(name: str, label: str, low: float, high: float, values: Array) -> ValueRange:
-    return ValueRange(name, split(label)[1], low, high, float(values.min()), float(values.max()))
+def _seen(name: str, unit: str, low: float, high: float, values: Array) -> ValueRange:
+    return ValueRange(name, unit, low, high, float(values.min()), float(values.max()))
 
 
 def _begun(data: Dataset) -> Array:
@@ -127,23 +120,17 @@ def _stops_missing(robot: Robot, stops: int, rested: int) -> list[str]:
 
 
 def _unreached_bounds(one: ValueRange) -> list[str]:
-    found = []
     room = NEAR * (one.high - one.low)
-    if one.most < one.high - room:
-        found.append(f"{one.name} never above {one.most:.3g} {one.unit} (bound {one.high:g}): record this")
-    if one.least > one.low + room:
-        found.append(f"{one.name} never below {one.least:.3g} {one.unit} (bound {one.low:g}): record this")
-    return found
+    above = f"{one.name} never above {one.most:.3g} {one.unit} (bound {one.high:g}): record this"
+    below = f"{one.name} never below {one.least:.3g} {one.unit} (bound {one.low:g}): record this"
+    return [above] * (one.most < one.high - room) + [below] * (one.least > one.low + room)
 
 
 def _unbraked_ranges(one: ValueRange) -> list[str]:
-    found = []
     room = 0.25 * (one.high - one.low)
-    if one.most < one.high - room:
-        found.append(f"no braking above {max(one.most, 0.0):.2g} {one.unit} of {one.name}: record this")
-    if one.low < 0.0 and one.least > one.low + room:
-        found.append(f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: record this")
-    return found
+    above = f"no braking above {max(one.most, 0.0):.2g} {one.unit} of {one.name}: record this"
+    below = f"no braking below {min(one.least, 0.0):.2g} {one.unit} of {one.name}: record this"
+    return [above] * (one.most < one.high - room) + [below] * (one.low < 0.0 and one.least > one.low + room)
 
 
 def _windows_missing(plans: int, free: int) -> list[str]:
@@ -158,16 +145,16 @@ def _windows_missing(plans: int, free: int) -> list[str]:
     return []
 
 
-def recording_advice(statement: ValidationReport, data: Dataset) -> list[str]:
+def recording_advice(report: ValidationReport, data: Dataset) -> list[str]:
     """Return advice, in sentences, on how to bring the bound within the robot's limit and to bound turns on the spot.
 
     The list is empty if the bound is within the limit.
     """
-    return _turns_missing(statement, data.robot) + _too_loose(statement, data)
+    return _turns_missing(report, data.robot) + _too_loose(report, data)
 
 
-def _turns_missing(statement: ValidationReport, robot: Robot) -> list[str]:
-    if statement.mode != DIRECT or statement.in_place_windows or standing_limits(robot) is None:
+def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:
+    if report.mode != DIRECT or report.in_place_windows or standing_limits(robot) is None:
         return []
     return [
         "too few turns on the spot to bound them separately, so the filter keeps far away from obstacles: let the "
@@ -175,47 +162,40 @@ def _turns_missing(statement: ValidationReport, robot: Robot) -> list[str]:
     ]
 
 
-def _too_loose(statement: ValidationReport, data: Dataset) -> list[str]:
+def _too_loose(report: ValidationReport, data: Dataset) -> list[str]:
     """Return advice on a bound above the limit.
 
     More data of the same kind help only if the share of held-out plans that leave their sets is below the limit.
     """
-    limit, plans = data.robot.accept_bound, statement.windows
-    if statement.bound_plan <= limit:
+    limit, plans, violations = data.robot.accept_bound, report.windows, report.violations
+    if report.bound_plan <= limit:
         return []
-    bound = percent(statement.bound_plan)
+    bound = percent(report.bound_plan)
     bounded = f"at most {bound} of plans leave their sets (99 % confidence), and the limit is {percent(limit)}"
-    wanted = _plans_for(statement.violations, plans, limit)
+    wanted = _plans_for(violations, plans, limit)
     minutes = data.periods * data.robot.period / 60.0
-    more = math.inf if not plans or wanted is None else minutes * (wanted / plans - 1.0)
-    if not statement.violations:
-        how = f": record {math.ceil(more)} more minutes like these" if plans else ""
+    more = math.ceil(minutes * (wanted / plans - 1.0)) if plans and wanted is not None else 0
+    if not violations:
+        how = f": record {more} more minutes like these" if plans else ""
         return [
             f"{bounded}; to state the limit, {wanted} held-out plans without a violation are needed, and there are "
             f"{plans}{how}"
         ]
-    share = statement.violations / plans
-    left = f"{statement.violations} of {plans} held-out plans ({share:.1%})"
-    advice = [f"{bounded}; {left} left their sets: {_where(statement)}"]
-    if wanted is None:
-        advice.append(
-            f"more minutes like these do not help: the share of {share:.1%} is above the limit of {percent(limit)}"
-        )
-    else:
-        advice.append(
-            f"{math.ceil(more)} more minutes like these, {wanted} held-out plans, reach the limit only if no larger "
-            f"share than {share:.1%} of them leaves its sets"
-        )
-    driving = dict.fromkeys(one.regime for one in statement.leaving if one.part not in ABOUT_PARTS)
-    advice += [f"{regime}: {_remedy(data.robot, regime)}" for regime in driving]
-    parts = {one.part for one in statement.leaving}
-    advice += [text for part, text in ABOUT_PARTS.items() if part in parts]
-    advice.append(
-        f"or wider sets: `certify --until-held` widens each envelope {statement.excess:.2g} times, so that none of "
+    share = f"{violations / plans:.1%}"
+    driving = dict.fromkeys(one.regime for one in report.leaving if one.part not in ABOUT_PARTS)
+    parts = {one.part for one in report.leaving}
+    return [
+        f"{bounded}; {violations} of {plans} held-out plans ({share}) left their sets: {_where(report)}",
+        f"more minutes like these do not help: the share of {share} is above the limit of {percent(limit)}"
+        if wanted is None
+        else f"{more} more minutes like these, {wanted} held-out plans, reach the limit only if no larger share than "
+        f"{share} of them leaves its sets",
+        *(f"{regime}: {_remedy(data.robot, regime)}" for regime in driving),
+        *(text for part, text in ABOUT_PARTS.items() if part in parts),
+        f"or wider sets: `certify --until-held` widens each envelope {report.excess:.2g} times, so that none of "
         f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; with "
-        f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times"
-    )
-    return advice
+        f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times",
+    ]
 
 
 ABOUT_PARTS = {
@@ -229,26 +209,22 @@ def _plans_for(violations: int, plans: int, limit: float) -> int | None:
     if not violations:
         return plans_needed(limit)
     share = violations / plans
-    if share >= limit:
+    if share >= limit or upper_bound(math.ceil(share * MOST_PLANS), MOST_PLANS) > limit:
         return None
-    low, high = plans, plans
-    while upper_bound(math.ceil(share * high), high) > limit:
-        low, high = high, 2 * high
-        if high > MOST_PLANS:
-            return None
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if upper_bound(math.ceil(share * middle), middle) > limit else (low, middle)
-    return high
+    return (
+        plans
+        + 1
+        + bisect_left(range(plans + 1, MOST_PLANS), True, key=lambda n: upper_bound(math.ceil(share * n), n) <= limit)
+    )
 
 
-def _where(statement: ValidationReport) -> str:
+def _where(report: ValidationReport) -> str:
     """Describe the largest groups of violations, each with the number of plans in its regime."""
     shown = [
         f"{one.plans} by {one.part} while {one.regime} (of {one.of} plans there; up to {one.excess:.2g} × its bound)"
-        for one in statement.leaving[:MOST_SHOWN]
+        for one in report.leaving[:MOST_SHOWN]
     ]
-    rest = sum(one.plans for one in statement.leaving[MOST_SHOWN:])
+    rest = sum(one.plans for one in report.leaving[MOST_SHOWN:])
     return ", ".join(shown + ([f"{rest} elsewhere"] if rest else []))
 
 
@@ -259,14 +235,10 @@ def _remedy(robot: Robot, regime: str) -> str:
         " and ".join(name for name, moves in zip(inputs, robot.translates, strict=True) if moves == wanted)
         for wanted in (True, False)
     )
-    if regime == STANDING:
-        return "record standing between drives and after every stop (with wind, estimator drift)"
-    if regime == TURNING:
-        return f"record more turning on the spot and at low speed, or lower the bounds of {turning}"
-    if regime == FAST:
-        return (
-            f"record more driving above half of top speed, with changes of direction, or lower the bounds of {moving}"
-        )
-    if regime == BOTH:
-        return f"record more turning at speed, or lower the bounds of {moving} or {turning}"
-    return "record more slow driving, with starts and stops"
+    remedies = {
+        STANDING: "record standing between drives and after every stop (with wind, estimator drift)",
+        TURNING: f"record more turning on the spot and at low speed, or lower the bounds of {turning}",
+        FAST: f"record more driving above half of top speed and changes of direction, or lower the bounds of {moving}",
+        BOTH: f"record more turning at speed, or lower the bounds of {moving} or {turning}",
+    }
+    return remedies.get(regime, "record more slow driving, with starts and stops")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.deploy.data.coverage import Coverage
@@ -20,9 +19,11 @@ def draw_coverage(data: Dataset, covered: Coverage, path: Path) -> None:
     panels = 1 + robot.action_dim
     figure = Figure(figsize=(4.2 * panels, 4.4), layout="constrained")
     axes = figure.subplots(1, panels)
-    _plot_paths(axes[0], data)
+    for t in data.trajectories:
+        axes[0].plot(t.states[:, 0], t.states[:, 1], linewidth=0.7)
+    axes[0].set_aspect("equal", adjustable="datalim")
+    axes[0].set(xlabel=robot.state[0], ylabel=robot.state[1])
     for i, ax in enumerate(axes[1:]):
-        unit = split(robot.action[i])[1]
         follower = robot.follows[i]
         driven = np.concatenate([t.inputs[:, i] for t in data.trajectories])
         if follower >= 0:
@@ -34,16 +35,8 @@ def draw_coverage(data: Dataset, covered: Coverage, path: Path) -> None:
             ax.set_ylabel("periods")
         for bound in (robot.action_low[i], robot.action_high[i]):
             ax.axvline(bound, color="k", linewidth=0.8, linestyle="--")
-        ax.set_xlabel(f"{inputs[i]} [{unit}]")
+        ax.set_xlabel(f"{inputs[i]} [{split(robot.action[i])[1]}]")
     title = f"{robot.name}: {data.periods} periods, {covered.stops} stops"
     figure.suptitle("\n".join([title, *(f"missing: {text}" for text in covered.missing[:4])]), fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-
-
-def _plot_paths(ax: Axes, data: Dataset) -> None:
-    for t in data.trajectories:
-        ax.plot(t.states[:, 0], t.states[:, 1], linewidth=0.7)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel(data.robot.state[0])
-    ax.set_ylabel(data.robot.state[1])

@@ -69,18 +69,11 @@ def pretrain(robot: RobotWithTask, recipe: ModelConfig, each: Each = lambda: Non
     """
     started = time.perf_counter()
     if isinstance(recipe, SecasRecipe):
-        networks, settings, about = _secas(robot, recipe, each)
-        method = SECAS
+        method, (networks, settings, about) = SECAS, _secas(robot, recipe, each)
     else:
-        networks, settings, about = _sailr(robot, recipe, each)
-        method = SAILR
-    about |= {
-        "recipe": json.dumps(asdict(recipe)),
-        "samples": str(recipe.samples),
-        "arena": recipe.arena,
-        "seed": str(recipe.seed),
-        "seconds": f"{time.perf_counter() - started:.0f}",
-    }
+        method, (networks, settings, about) = SAILR, _sailr(robot, recipe, each)
+    about |= {"recipe": json.dumps(asdict(recipe)), "seconds": f"{time.perf_counter() - started:.0f}"}
+    about |= {name: str(getattr(recipe, name)) for name in ("samples", "arena", "seed")}
     return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
 
 

@@ -5,8 +5,8 @@ No filter protects these rollouts. Their collisions are part of the cost of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,46 +54,45 @@ class Costs:
     collisions: int
 
 
-@dataclass
 class _Drive:
     """A running environment that starts a new episode when one ends."""
 
-    env: Any
-    collisions: int = 0
-    observation: Any = None
-    info: dict[str, Any] = field(default_factory=dict)
-    episode: int = -1
-    ended: bool = True
+    def __init__(self, robot: RobotWithTask, arena: str, seed: int, each: Callable[[], object]) -> None:
+        self._env, self._each, self._episode = environment(robot, arena, SEED_OFFSET + seed), each, -1
+        self.observation: Any = None
+        self.info: dict[str, Any] = {}
+        self.ended, self.collisions = True, 0
 
     def ready(self) -> None:
+        """Begin an episode if the last one has ended."""
         if self.ended:
-            self.episode += 1
-            self.observation, self.info = self.env.reset(options={"episode_seed": self.episode})
+            self._episode += 1
+            self.observation, self.info = self._env.reset(options={"episode_seed": self._episode})
             self.ended = False
 
-    def step(self, action: Array) -> None:
-        self.observation, _, terminated, truncated, self.info = self.env.step(action)
+    def step(self, action: Array) -> Array:
+        """Drive one period, and return the input in force in it."""
+        self.observation, _, terminated, truncated, self.info = self._env.step(action)
         self.ended = terminated or truncated
         self.collisions += self.info["collision"]
+        self._each()
+        return np.asarray(self.info["input_in_force"])
 
 
 def transitions(
     robot: RobotWithTask, arena: str, samples: int, seed: int, each: Callable[[], object] = lambda: None
 ) -> Transitions:
     """Record `samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
-    drive = _Drive(environment(robot, arena, SEED_OFFSET + seed))
+    drive = _Drive(robot, arena, seed, each)
     policy = scripted("random", robot, np.random.default_rng((seed, 1)))
     constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
     while len(rows) < samples:
         drive.ready()
         seen, before = drive.observation, constraints(drive.observation, drive.info["state"])
-        drive.step(policy(seen, drive.info))
-        executed = np.asarray(drive.info["input_in_force"]) / robot.high()
+        executed = drive.step(policy(seen, drive.info)) / robot.high()
         rows.append((seen, executed, constraints(drive.observation, drive.info["state"]) - before))
-        each()
-    seen, inputs, changes = (np.array([row[i] for row in rows], float) for i in range(3))
-    return Transitions(seen, inputs, changes, drive.collisions)
+    return Transitions(*_columns(rows), drive.collisions)
 
 
 def costs(
@@ -111,34 +110,32 @@ def costs(
     The cost of a step is max(0, 1 − clearance/smoothing), with smoothing in m; after a collision it stays 1. Sums are
     discounted by γ and scaled by 1 − γ (Wagener et al. 2021, appendix D).
     """
-    drive = _Drive(environment(robot, arena, SEED_OFFSET + seed))
+    drive = _Drive(robot, arena, seed, each)
     rng = np.random.default_rng((seed, 2))
     drivers = [scripted(name, robot, rng) for name in POLICIES]
     braked: list[tuple[Any, float]] = []
     driven: list[tuple[Array, float, Any, bool]] = []
 
-    def cost() -> float:
-        return 1.0 if drive.info["collision"] else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / smoothing)
-
-    def take(action: Array) -> None:
+    def take(action: Array) -> float:
+        """Drive one period, and return its cost."""
         seen = drive.observation
-        drive.step(action)
-        pair = np.concatenate([seen, normalised_input(robot, np.asarray(drive.info["input_in_force"]))])
-        driven.append((pair, (1.0 - gamma) * cost(), drive.observation, bool(drive.info["collision"])))
-        each()
+        pair = np.concatenate([seen, normalised_input(robot, drive.step(action))])
+        collided = bool(drive.info["collision"])
+        cost = 1.0 if collided else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / smoothing)
+        driven.append((pair, (1.0 - gamma) * cost, drive.observation, collided))
+        return cost
 
     def stop() -> None:
         """Brake to a stop and store the cost-to-go of each state."""
         seen, spent = [], []
         for action in _braking(robot, np.asarray(drive.info["input_in_force"])):
             seen.append(drive.observation)
-            take(action)
-            spent.append(cost())
+            spent.append(take(action))
             if drive.ended:
                 break
-        to_go = 0.0
         if drive.info["collision"]:
             spent[-1] = 1.0 / (1.0 - gamma)
+        to_go = 0.0
         for observation, amount in zip(reversed(seen), reversed(spent), strict=True):
             to_go = amount + gamma * to_go
             braked.append((observation, (1.0 - gamma) * to_go))
@@ -148,17 +145,17 @@ def costs(
         policy: Policy = drivers[int(rng.integers(len(drivers)))]
         for _ in range(int(rng.integers(lead + 1))):
             if not drive.ended:
-                take(_varied(robot, policy(drive.observation, drive.info), rng))
+                action = policy(drive.observation, drive.info)
+                # Replace half of the actions by random ones, because the critics must rate any action.
+                take(action if rng.random() < 0.5 else rng.uniform(robot.low(), robot.high()))
         if not drive.ended:
             stop()
-    states, to_go = (np.array([row[i] for row in braked], float) for i in range(2))
-    pairs, step, after = (np.array([row[i] for row in driven], float) for i in range(3))
-    return Costs(states, to_go, pairs, step, after, np.array([row[3] for row in driven]), drive.collisions)
+    *columns, collided = _columns(driven)
+    return Costs(*_columns(braked), *columns, collided.astype(bool), drive.collisions)
 
 
-def _varied(robot: RobotWithTask, action: Array, rng: np.random.Generator) -> Array:
-    """Replace the action by a random one half of the time, because the critics must rate any action."""
-    return action if rng.random() < 0.5 else rng.uniform(robot.low(), robot.high())
+def _columns(rows: Sequence[tuple[Any, ...]]) -> list[Array]:
+    return [np.array(values, float) for values in zip(*rows, strict=True)]
 
 
 def _braking(robot: RobotWithTask, before: Array) -> Iterator[Array]:
