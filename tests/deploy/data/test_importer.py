@@ -24,8 +24,8 @@ def driven():
 
 
 @pytest.fixture(scope="module")
-def as_csv(driven, tmp_path_factory):
-    return write_csv(tmp_path_factory.mktemp("logs") / "drive.csv", *driven)
+def from_csv(driven, tmp_path_factory):
+    return import_sources([write_csv(tmp_path_factory.mktemp("logs") / "drive.csv", *driven)], porter()).data
 
 
 def same(one: Dataset, other: Dataset, within: float) -> None:
@@ -36,28 +36,19 @@ def same(one: Dataset, other: Dataset, within: float) -> None:
     assert one.chord_deviation == pytest.approx(other.chord_deviation, abs=within)
 
 
-@pytest.mark.parametrize("storage", StoragePlugin)
-def test_a_bag_and_a_csv_of_the_same_drive_are_the_same_data(driven, as_csv, tmp_path, storage):
-    bag = write_bag(tmp_path / "bag", *driven, storage=storage)
-    same(import_sources([as_csv], porter()).data, import_sources([bag], porter()).data, 1e-9)
-    if storage is StoragePlugin.MCAP:  # the file alone does, too
-        same(import_sources([as_csv], porter()).data, import_sources([bag / "bag.mcap"], porter()).data, 1e-9)
+SOURCES = {
+    "sqlite bag": (lambda folder, *drive: write_bag(folder / "bag", *drive), 1e-9),
+    "mcap bag": (lambda folder, *drive: write_bag(folder / "bag", *drive, storage=StoragePlugin.MCAP), 1e-9),
+    "mcap alone": (lambda folder, *drive: write_bag(folder / "b", *drive, storage=StoragePlugin.MCAP) / "b.mcap", 1e-9),
+    "parquet": (lambda folder, *drive: write_parquet(folder / "a.parquet", *drive), 1e-9),
+    "rover's log": (lambda folder, *drive: write_bin(folder / "a.bin", *drive), 1e-5),
+}
 
 
-def test_parquet_is_as_good_as_csv(driven, as_csv, tmp_path):
-    same(
-        import_sources([as_csv], porter()).data,
-        import_sources([write_parquet(tmp_path / "a.parquet", *driven)], porter()).data,
-        1e-9,
-    )
-
-
-def test_a_rovers_log_of_ardupilot_is_the_same_drive(driven, as_csv, tmp_path):
-    same(
-        import_sources([as_csv], porter()).data,
-        import_sources([write_bin(tmp_path / "a.bin", *driven)], porter()).data,
-        1e-5,
-    )
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_format_of_the_same_drive_is_the_same_data(driven, from_csv, tmp_path, source):
+    write, within = SOURCES[source]
+    same(from_csv, import_sources([write(tmp_path, *driven)], porter()).data, within)
 
 
 PUCK = {

@@ -121,30 +121,26 @@ def test_a_flight_drafts_what_flies(tmp_path, capsys, name):
     assert len(import_sources([log], robot).data.trajectories) > 0
 
 
+def log_of(path, *robots):
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="brakeline")
+        writer.add_metadata("robots", {robot.name: json.dumps(robot.description) for robot in robots})
+        writer.finish()
+    return path
+
+
 @pytest.mark.parametrize("name", ["ground", "quadrotor", "../examples/car/car.toml"])
 def test_a_log_of_a_run_carries_the_description(tmp_path, name):
     robot = robot_named(str(ROBOTS / name) if "/" in name else name)
-    log, path = tmp_path / "run.mcap", tmp_path / "found.toml"
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start(library="brakeline")
-        writer.add_metadata("robots", {robot.name: json.dumps(robot.description)})
-        writer.finish()
+    log, path = log_of(tmp_path / "run.mcap", robot), tmp_path / "found.toml"
     assert main(["robot", "new", str(path), "--from", str(log)]) == 0
     assert robot_named(str(path)).description == robot.description | {"name": "found"}
 
 
 def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
-    log = tmp_path / "run.mcap"
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start(library="brakeline")
-        texts = {name: json.dumps(robot_named(name).description) for name in ("ground", "quadrotor")}
-        writer.add_metadata("robots", texts)
-        writer.finish()
+    log = log_of(tmp_path / "run.mcap", robot_named("ground"), robot_named("quadrotor"))
     assert main(["robot", "new", str(tmp_path / "mine.toml"), "--from", str(log)]) == 1
-    assert "holds the robots ground, quadrotor: name the file after the one" in capsys.readouterr().err.replace(
-        "\n", " "
-    )
+    assert "holds the robots ground, quadrotor: name the file after" in " ".join(capsys.readouterr().err.split())
     assert main(["robot", "new", str(tmp_path / "quadrotor.toml"), "--from", str(log)]) == 0
     assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()
