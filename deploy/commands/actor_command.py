@@ -55,20 +55,14 @@ class ActorCommand:
         robot = robot_with_task(robot_address)
         if self.fleet:
             check_reservations(self.filtering.method)
-        settings = ActorSettings(
+        settings = options.settings_from(
+            ActorSettings,
+            self,
             bus=self.endpoints.bus(),
             robot=robot_address,
-            name=self.name,
-            number=self.number,
             robots=self.fleet or self.robots,
             fleet=self.fleet > 0,
-            seed=self.seed,
-            arena=self.arena,
             method=self.filtering.method,
-            penalty=self.penalty,
-            deadline=self.deadline,
-            mavlink=self.mavlink,
-            steps=self.steps,
         )
         propose = partial(policy_named, self.policy, robot) if self.policy else None
         conditions = self.physics.conditions()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from brakeline.deploy.commands.command_output import errors, print_json
-from brakeline.deploy.commands.common_options import Json, Seed
+from brakeline.deploy.commands.common_options import Json, Seed, settings_from
 from brakeline.deploy.run import autopilot_run, px4_simulation
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
@@ -73,33 +73,19 @@ class AutopilotCommand:
                 "a real PX4 flies one vehicle, by its own rules, and starts on the ground: leave out the option"
             )
         timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT["px4"]: self.setpoint_timeout}
-        settings = px4_simulation.HilSettings(
-            folder,
-            self.url,
-            self.arena,
-            self.seed,
-            SensorNoise(scale=self.sensors, gps_position=self.gps),
-            Wind(self.wind, gust=self.gust),
-            timeout | self.parameters,
-            self.truth,
-            self.speed,
-            self.seconds,
+        settings = settings_from(
+            px4_simulation.HilSettings,
+            self,
+            folder=folder,
+            noise=SensorNoise(scale=self.sensors, gps_position=self.gps),
+            wind=Wind(self.wind, gust=self.gust),
+            parameters=timeout | self.parameters,
         )
         return px4_simulation.fly(settings, self._print_px4_start)
 
     def _fly_simulated(self) -> ServerStats:
-        settings = autopilot_run.AutopilotSettings(
-            self.url,
-            self.rules,
-            self.vehicles,
-            self.arena,
-            self.seed,
-            self.airborne,
-            self.setpoint_timeout,
-            Wind(self.wind, gust=self.gust),
-            self.truth,
-            self.seconds,
-        )
+        wind = Wind(self.wind, gust=self.gust)
+        settings = settings_from(autopilot_run.AutopilotSettings, self, wind=wind)
         return autopilot_run.fly(settings, self._print_start)
 
     def _print_start(self, arena: Arena) -> None:

@@ -45,18 +45,9 @@ class BridgeSimCommand:
         """Simulate until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
         if not self.sim_time and (self.lockstep or self.factor != 1.0):
             raise ValueError("--factor and --lockstep need simulated time: give --sim-time too")
-        settings = BridgeSettings(
-            ros=RosSettings(self.router, () if self.router else self.listen, self.graph.domain, self.graph.namespace),
-            arena=self.arena,
-            seed=self.seed,
-            sim_time=self.sim_time,
-            factor=self.factor,
-            lockstep=self.lockstep,
-            timeout=self.timeout,
-            stamped=self.stamped,
-            seconds=self.seconds,
-            conditions=self.physics.conditions(),
-        )
+        listen = () if self.router else self.listen
+        ros = RosSettings(self.router, listen, self.graph.domain, self.graph.namespace)
+        settings = options.settings_from(BridgeSettings, self, ros=ros, conditions=self.physics.conditions())
         log_to_stderr("bridge-sim")
         with contextlib.ExitStack() as stack:
             bridge = Bridge(settings, stack.enter_context(open_bag(self.bag)))

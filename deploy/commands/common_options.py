@@ -9,7 +9,7 @@ import math
 import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import tyro
 
@@ -141,10 +141,8 @@ class FlightOptions(FlightSettings):
 
     def settings(self, url: str, arena: Arena) -> FlightSettings:
         """Return the settings of a flight over the link `url` in an arena."""
-        values = {item.name: getattr(self, item.name) for item in fields(FlightSettings)} | {"url": url}
-        if self.at_start:
-            values["origin"] = (*arena.start[:2], 0.0)
-        return FlightSettings(**values)
+        origin = (*arena.start[:2], 0.0) if self.at_start else self.origin
+        return settings_from(FlightSettings, self, url=url, origin=origin)
 
 
 @dataclass(frozen=True)
@@ -170,10 +168,7 @@ class BusOptions:
         from brakeline.messaging.bus import BusSettings
 
         if self.connect or self.listen:
-            keys = self.keys or default_keys()
-            return BusSettings(
-                connect=self.connect, listen=self.listen, keys=keys, insecure=self.insecure, metrics=self.metrics
-            )
+            return settings_from(BusSettings, self, keys=self.keys or default_keys())
         return replace(bus_of(LATEST), metrics=self.metrics)
 
 
@@ -202,6 +197,12 @@ class RunBusOptions:
         keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
         endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
         return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure, metrics=self.metrics)
+
+
+def settings_from(kind: type[T], options: object, **values: Any) -> T:
+    """Return settings of a dataclass `kind`: the fields that the options have too, and `values`, which come first."""
+    shared = {item.name for item in fields(cast("type[Any]", kind)) if hasattr(options, item.name)}
+    return kind(**{name: getattr(options, name) for name in shared} | values)
 
 
 def default_keys() -> Path | None:

@@ -50,16 +50,13 @@ class EvaluateCommand:
             if self.fleet:
                 raise ValueError("--render can't draw a fleet: leave out --render or --fleet")
         robot = robot_with_task(self.robot)
-        evaluation = Evaluation(
-            policy=self.policy,
+        evaluation = options.settings_from(
+            Evaluation,
+            self,
             method=self.filtering.method,
             model_config=self.filtering.model_config(),
             accept_bound=self.filtering.accept_bound,
-            arena=self.arena,
-            episodes=self.episodes,
-            seed=self.seed,
             conditions=self.physics.conditions(),
-            fleet=self.fleet,
         )
         if self.render is not None:
             self._draw(robot, evaluation, self.render)

@@ -85,22 +85,19 @@ class FlyCommand:
             raise ValueError(f"a {robot.kind} robot does not fly: name a robot with three position coordinates")
         robot = robot if robot.late else robot.in_real_time()
         flights = self._flights()
-        return RunConfig(
+        return options.settings_from(
+            RunConfig,
+            self,
             robots=(address_in_real_time(self.robot),),
             method=self.filtering.method,
             model_config=self.filtering.model_config(),
             accept_bound=self.filtering.accept_bound,
-            arena=self.arena,
             actors=len(flights),
             steps=max(1, round(60.0 * self.minutes / robot.period)),
-            seed=self.seed,
-            deadline=self.deadline,
-            practice=self.practice,
-            pictures=self.pictures,
             conditions=self.physics.conditions(),
             policy="" if self.policy == LEARN else self.policy,
             flights=flights,
-            autopilot=None if self.url else AutopilotConfig(self.rules, self.setpoint_timeout),
+            autopilot=None if self.url else options.settings_from(AutopilotConfig, self),
         )
 
     def _flights(self) -> tuple[FlightSettings, ...]:

@@ -81,23 +81,16 @@ class Ros2Command:
 
     def run(self) -> int:
         """Filter commands until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
-        settings = Ros2Settings(
-            robot=self.robot,
+        mount = PlanarPose(*self.mount) if self.mount else None
+        settings = options.settings_from(
+            Ros2Settings,
+            self,
             ros=RosSettings(self.router, domain=self.graph.domain, namespace=self.graph.namespace),
-            name=self.name,
-            topics=self.topics,
-            stamped=self.stamped,
-            sim_time=self.sim_time,
             lead=self.lead or (SERVICE_LEAD if self.connect else Ros2Settings.lead),
-            sensors=SensorSettings(
-                self.range_error,
-                self.zero_is_free,
-                PlanarPose(*self.mount) if self.mount else None,
-                self.odometry_frame,
-                self.base_frame if self.tf else "",
+            sensors=options.settings_from(
+                SensorSettings, self, mount=mount, base_frame=self.base_frame if self.tf else ""
             ),
             age_limits=self.fresh,
-            seconds=self.seconds,
         )
         log_to_stderr(self.name)
         with self._asker(settings) as asker, open_bag(self.bag) as bag, stop_on_signals(threading.Event()) as stop:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
@@ -51,7 +51,7 @@ class TrainCommand(RunConfig):
                 name = attached if equals else value
         if name not in EXPERIMENTS:
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
-        return cls(experiment=name, **_run_values(EXPERIMENTS[name]) | {"steps": 0})
+        return options.settings_from(cls, EXPERIMENTS[name], experiment=name, steps=0)
 
     def config(self) -> RunConfig:
         """Return the run's configuration. Raises ValueError if options contradict each other."""
@@ -66,17 +66,18 @@ class TrainCommand(RunConfig):
 
         if self.fleet:
             check_reservations(self.filtering.method)
-        values = _run_values(self) | {
-            "robots": tuple(address(name) for name in self.robots),
-            "method": self.filtering.method,
-            "model_config": self.filtering.model_config(),
-            "accept_bound": self.filtering.accept_bound,
-            "conditions": self.physics.conditions(),
-            "actors": 1 if self.deterministic else self.actors,
-            "robots_per_actor": self.fleet or self.robots_per_actor,
-            "steps": self.steps or self._default_steps(),
-        }
-        return RunConfig(**values)
+        return options.settings_from(
+            RunConfig,
+            self,
+            robots=tuple(address(name) for name in self.robots),
+            method=self.filtering.method,
+            model_config=self.filtering.model_config(),
+            accept_bound=self.filtering.accept_bound,
+            conditions=self.physics.conditions(),
+            actors=1 if self.deterministic else self.actors,
+            robots_per_actor=self.fleet or self.robots_per_actor,
+            steps=self.steps or self._default_steps(),
+        )
 
     def _default_steps(self) -> int:
         """Return the steps in the logs if nothing else teaches the learner, else the experiment's steps."""
@@ -92,10 +93,6 @@ class TrainCommand(RunConfig):
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
         return train(self.config(), folder, self.resume is not None, self.meeting, self.json)
-
-
-def _run_values(config: RunConfig) -> dict[str, Any]:
-    return {item.name: getattr(config, item.name) for item in fields(RunConfig)}
 
 
 def train(config: RunConfig, folder: Path, resume: bool, meeting: options.RunBusOptions, as_json: bool) -> int:

@@ -1,5 +1,7 @@
 """Test that no command uses a model set whose stated bound is above the robot's limit, unless you accept the bound."""
 
+import contextlib
+import io
 import json
 
 import pytest
@@ -25,6 +27,21 @@ def few(tmp_path_factory):
 CERTIFY = ("certify", "--robot", "ground", "--certificates", "residual", "--mode", "direct", "--use")
 
 
+@pytest.fixture(scope="module")
+def certified(few):
+    """The figures of `certify --use` with an accepted bound, and `file`: the model set that it writes."""
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        assert main([*CERTIFY, "--accept-bound", "0.5", "--json"]) == 0
+    return json.loads(output.getvalue()) | {"file": model_of(few).read_bytes()}
+
+
+@pytest.fixture
+def loose(certified, few):
+    """That model set, in use."""
+    model_of(few).write_bytes(certified["file"])
+
+
 def run(capsys, *words):
     status = main([str(word) for word in words])
     said = capsys.readouterr()
@@ -44,10 +61,8 @@ def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, capsys):
     assert said["bound_plan"] > 0.01 and "--accept-bound" in said["not_used"]
 
 
-def test_certify_use_writes_a_model_set_with_an_accepted_bound(few, capsys):
-    status, out, err = run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
-    assert status == 0 and "not put to use" not in err
-    assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{json.loads(out)['residual']['bound_plan']:.6g}"
+def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
+    assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{certified['residual']['bound_plan']:.6g}"
 
 
 @pytest.mark.parametrize(
@@ -59,16 +74,14 @@ def test_certify_use_writes_a_model_set_with_an_accepted_bound(few, capsys):
         "ros2 ground --seconds 1",
     ],
 )
-def test_each_command_that_drives_refuses_a_loose_model_set(words, few, capsys, tmp_path):
-    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+def test_each_command_that_drives_refuses_a_loose_model_set(words, loose, capsys, tmp_path):
     status, _, err = run(capsys, *words.format(out=tmp_path / "run").split())
     assert status == 1, err
     assert "of plans leave their tubes" in err and "is 1 %" in err and "--accept-bound 0." in err
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluate_uses_a_model_set_with_an_accepted_bound(few, capsys):
-    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+def test_evaluate_uses_a_model_set_with_an_accepted_bound(loose, capsys):
     words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--json")
     assert run(capsys, *words, "--accept-bound", 0.5)[0] == 0
     status, _, err = run(capsys, *words, "--accept-bound", 0.001)
@@ -78,8 +91,7 @@ def test_evaluate_uses_a_model_set_with_an_accepted_bound(few, capsys):
 
 
 @pytest.mark.parametrize("bound", [None, "nan", "a few"])
-def test_a_model_set_without_a_readable_bound_is_refused(bound, few, capsys):
-    run(capsys, *CERTIFY, "--accept-bound", 0.5, "--json")
+def test_a_model_set_without_a_readable_bound_is_refused(bound, loose, few, capsys):
     model = ModelSet.load(model_of(few))
     model.about.pop("bound_plan")
     model.about.update({} if bound is None else {"bound_plan": bound})
