@@ -27,7 +27,7 @@ def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType)
         print_json(figures)
         return
     for line in lines:
-        console.print(line, markup=False)
+        console.print(line, markup=not isinstance(line, str))
 
 
 def _plain(value: Any) -> Any:

@@ -27,34 +27,33 @@ def nominal_stopping_distance(robot: Robot) -> float:
 
 def remarks(robot: Robot) -> list[str]:
     """Return remarks on settings that are valid but probably not intended."""
-    found = []
-    distance = nominal_stopping_distance(robot)
-    if distance + robot.footprint > robot.sight:
-        found.append(
+    distance, no_standing = nominal_stopping_distance(robot), robot.horizon == robot.free_steps + robot.brake_steps
+    free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
+    candidates = (
+        (
+            distance + robot.footprint > robot.sight,
             f"sight: a stop from full speed takes about {distance:.2f} m and the body reaches {robot.footprint:.2f} m, "
-            f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving."
-        )
-    if robot.horizon == robot.free_steps + robot.brake_steps and RAMP in robot.stop:
-        found.append(
-            "plan.horizon: no period of standing after the ramp: a robot with lag still moves when the plan ends"
-        )
-    if any(index < 0 for index in robot.follows):
-        free = [robot.action[i] for i, index in enumerate(robot.follows) if index < 0]
-        found.append(f"state: no coordinate follows {', '.join(free)}: half-widths are reported for rest only")
-    return found
+            f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving.",
+        ),
+        (
+            no_standing and RAMP in robot.stop,
+            "plan.horizon: no period of standing after the ramp: a robot with lag still moves when the plan ends",
+        ),
+        (bool(free), f"state: no coordinate follows {', '.join(free)}: half-widths are reported for rest only"),
+    )
+    return [text for holds, text in candidates if holds]
 
 
 def summary(robot: Robot) -> dict[str, Any]:
     """Return the main figures of a description, as JSON values."""
+    rules = zip(robot.action, robot.action_low, robot.action_high, robot.stop, strict=True)
     return {
         "name": robot.name,
         "period_s": robot.period,
         "state": list(robot.state),
         "inputs": {
             label: {"low": low, "high": high, "stop": list(rule) if isinstance(rule, tuple) else rule}
-            for label, low, high, rule in zip(
-                robot.action, robot.action_low, robot.action_high, robot.stop, strict=True
-            )
+            for label, low, high, rule in rules
         },
         "plan_s": robot.horizon * robot.period,
         "braking_s": robot.brake_steps * robot.period,
@@ -70,13 +69,11 @@ def summary(robot: Robot) -> dict[str, Any]:
 
 def draw_description(robot: Robot, path: Path) -> None:
     """Plot the body from above and the stop of each input, and write the image to `path`."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    figure, (body, plan) = pyplot.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    body, plan = figure.subplots(1, 2)
     for disc in robot.body:
         body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
     body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
@@ -91,4 +88,3 @@ def draw_description(robot: Robot, path: Path) -> None:
     plan.set(xlabel="time [s]", ylabel="input", title="a plan from the largest inputs")
     plan.legend(fontsize="small")
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)

@@ -24,11 +24,9 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     inputs = ["# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more."]
     inputs += [*map(_input, schema.inputs)] if schema.inputs else [f"# Inputs {UNKNOWN}: these come from the template."]
     zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
+    period = f"period = {schema.period:g} # s between decisions; the median time between input changes in the log"
     replacements = (
-        (
-            r"^period = .*",
-            f"period = {schema.period:g} # s between decisions: the median time of inputs in the log",
-        ),
+        (r"^period = .*", period),
         (r"^sight = .*", rf"\g<0>; {UNKNOWN}"),
         (r"^\[state\]\n(.+\n)+", "\n".join(["[state]", *states, ""])),
         (r"^\[input\]\n" + ("(.+\n)+" if schema.inputs else ""), "\n".join(["[input]", *inputs, ""])),
