@@ -28,8 +28,8 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     replacements = (
         (r"^period = .*", period),
         (r"^sight = .*", rf"\g<0>; {UNKNOWN}"),
-        (r"^\[state\]\n(.+\n)+", "\n".join(["[state]", *states, ""])),
-        (r"^\[input\]\n" + ("(.+\n)+" if schema.inputs else ""), "\n".join(["[input]", *inputs, ""])),
+        (r"^\[state\]\n(.+\n)+", _verbatim("[state]", *states)),
+        (r"^\[input\]\n" + ("(.+\n)+" if schema.inputs else ""), _verbatim("[input]", *inputs)),
         (r"^horizon = .*", f"horizon = {horizon}"),
         (r"^brake = .*", f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it"),
         (r"^\[\[body\]\]", rf"# The body {UNKNOWN}: measure it.\n\g<0>"),
@@ -39,6 +39,11 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
         template = re.sub(pattern, text, template, flags=re.MULTILINE)
     about = [f"# Inferred from {source}. Check every line: the log shows what the robot did, not what it can do."]
     return "\n".join((*about, *(f"# {note}" for note in schema.notes), template))
+
+
+def _verbatim(*lines: str) -> str:
+    """Return lines as a replacement for `re.sub`, which must not read the escapes in quoted names."""
+    return "".join(f"{line}\n" for line in lines).replace("\\", r"\\")
 
 
 def periods(schema: InferredSchema) -> tuple[int, int]:

@@ -1,11 +1,17 @@
-"""A model set that is widened until it holds what it was not made from."""
+"""Model sets that are widened until they hold the held-out plans, and the advice on a bound that is above the limit."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.certification import MAX_INFLATION, certify
+from brakeline.deploy.data.coverage import recording_advice
+from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
+from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.model.validation import upper_bound, validate
+from brakeline.safety.model.validation import most_violations, upper_bound, validate
+from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
 
 
@@ -15,12 +21,18 @@ def data():
     return record(trajectories=20, periods=150, seed=4)
 
 
+@pytest.fixture(scope="module")
+def widened(data):
+    """A model set without inflation, widened until it holds every held-out plan, and its validation report."""
+    return certify(data, ModelConfig(inflation=1.0), until_held=True)
+
+
 @pytest.mark.parametrize("kind", ["residual", "set-membership"])
-def test_it_is_as_wide_as_the_worst_of_the_held_out_plans_asks_for(data, kind):
+def test_it_is_as_wide_as_the_worst_of_the_held_out_plans_asks_for(data, widened, kind):
     model_config = ModelConfig(kind, inflation=1.0)
     narrow, before = certify(data, model_config)
     assert before.violations > 0 and before.excess > 1.0
-    wide, after = certify(data, model_config, until_held=True)
+    wide, after = widened if kind == "residual" else certify(data, model_config, until_held=True)
     assert after.violations == 0 and 0.9 < after.excess <= 1.0, "and no wider"
     assert wide.model_config.inflation > 1.0 and wide.version != narrow.version
     assert after.bound_plan == upper_bound(0, after.windows) < before.bound_plan
@@ -32,10 +44,93 @@ def test_what_holds_already_stays_as_it_is(data):
     assert certify(data, model_config, until_held=True)[0].version == certify(data, model_config)[0].version
 
 
-def test_what_comes_later_is_outside_no_more_often_than_is_stated(data):
+def test_what_comes_later_is_outside_no_more_often_than_is_stated(data, widened):
     """Drawn like the plans that it was widened by."""
-    model, statement = certify(data, ModelConfig(inflation=1.0), until_held=True)
+    model, statement = widened
     found = [validate(model, data, record(trajectories=6, periods=150, seed=seed)) for seed in range(20, 26)]
     outside, plans = sum(one.violations for one in found), sum(one.windows for one in found)
     assert plans > 300 and outside / plans < statement.bound_plan
     assert np.isclose(max(one.excess for one in found) > 1.0, outside > 0)
+
+
+@pytest.fixture(scope="module")
+def held(data):
+    """A statement without a violation in some dozens of plans."""
+    _, statement = certify(data, ModelConfig(), until_held=True)
+    assert statement.violations == 0 and statement.bound_plan > 0.01
+    return statement
+
+
+def test_without_violations_more_of_the_same_will_do(held, data):
+    (line,) = recording_advice(held, data)
+    minutes = data.periods * GROUND.period / 60.0
+    assert f"{np.ceil(minutes * (459 / held.windows - 1.0)):.0f} more minutes like these" in line
+    assert "459 held-out plans without a violation" in line
+
+
+def test_with_more_violations_than_the_limit_more_of_the_same_does_not_help(held, data):
+    left = ViolationGroup("position ahead", FAST, 20, 200, 3.0), ViolationGroup("heading", STANDING, 13, 100, 1.2)
+    bad = replace(held, windows=600, violations=33, bound_plan=upper_bound(33, 600), leaving=left)
+    said = "\n".join(recording_advice(bad, data))
+    assert "at most 8.1 % of plans" in said
+    assert "33 of 600 held-out plans" in said and "0 more minutes like these reach" not in said
+    assert "20 by position ahead while fast (of 200 plans there" in said and "13 by heading while standing" in said
+    assert "do not help: the share of 5.5% is above the limit of 1 %" in said
+    assert "lower the bounds of speed" in said and "record standing" in said and "--until-held" in said
+
+
+def test_with_few_violations_more_of_the_same_helps_on_a_condition(held, data):
+    few = replace(held, windows=600, violations=3, bound_plan=upper_bound(3, 600))
+    said = "\n".join(recording_advice(few, data))
+    assert few.bound_plan > 0.01 and "only if no larger share than 0.5% of them leaves" in said
+
+
+def test_a_statement_within_the_robots_own_limit_asks_for_nothing(held, data):
+    limit = 1.01 * held.bound_plan
+    assert not recording_advice(held, replace(data, robot=replace(GROUND, accept_bound=limit)))
+
+
+def test_how_it_drove_is_told_by_inputs_and_speeds():
+    speeds = [(0.0, 0.0), (0.25, 0.0), (0.0, 0.5), (0.25, 0.5), (0.05, 0.1)]
+    z = np.array([[v, w, v, w, v, w] for v, w in speeds])
+    assert list(regimes(GROUND, z)) == [STANDING, FAST, TURNING, BOTH, SLOW]
+    z[0, 0] = 0.2
+    assert regimes(GROUND, z)[0] == FAST, "it still rolls"
+    still = np.zeros((2, QUADROTOR.regressor_dim + 3))
+    still[1, -1] = -5.0
+    assert list(regimes(QUADROTOR, still)) == [STANDING, FAST]
+
+
+def test_where_it_left_its_sets_is_found(data):
+    """A robot whose wheels slip a little more, at speed, than in the data that the set was made from."""
+    slipping = record(trajectories=12, periods=150, seed=9, slip=0.05)
+    statement = validate(fit_model_set(data, ModelConfig()), data, slipping)
+    assert statement.violations == sum(one.plans for one in statement.leaving) > 0
+    most = statement.leaving[0]
+    assert most.part in ("position ahead", "speed") and most.regime in (FAST, BOTH) and most.excess > 1.0
+    assert most.plans <= most.of <= statement.windows
+
+
+@pytest.fixture(scope="module")
+def plain(data):
+    """The report of a model set that nothing widens, because no number of plans states its limit."""
+    return certify(replace(data, robot=replace(GROUND, accept_bound=1e-6)), ModelConfig(inflation=1.0))[1]
+
+
+@pytest.mark.parametrize("limit", [0.01, 0.05, 0.3])
+def test_sets_are_widened_only_as_far_as_the_limit_asks_for(data, plain, limit):
+    model, statement = certify(replace(data, robot=replace(GROUND, accept_bound=limit)), ModelConfig(inflation=1.0))
+    most = most_violations(statement.windows, limit)
+    if most < 0 or plain.violations <= most or plain.excess > MAX_INFLATION:
+        assert model.model_config.inflation == 1.0, (
+            "too few plans for the limit, or it holds already, or it takes too much"
+        )
+    else:
+        assert model.model_config.inflation > 1.0 and statement.violations == most and statement.bound_plan <= limit
+
+
+@pytest.mark.parametrize(("count", "most"), [(458, -1), (459, 0), (661, 0), (662, 1), (1283, 4)])
+def test_so_many_violations_are_within_the_limit(count, most):
+    assert most_violations(count, 0.01) == most
+    assert upper_bound(max(most, 0), count) <= 0.01 or most < 0
+    assert upper_bound(most + 1, count) > 0.01
