@@ -86,6 +86,10 @@ class ServiceOptions(FilterOptions):
 
     accept_bound: AcceptBound = None
 
+    def settings(self) -> dict[str, Any]:
+        """Return the values by the names that settings have for them."""
+        return {"method": self.method, "model_config": self.model_config(), "accept_bound": self.accept_bound}
+
 
 @dataclass(frozen=True)
 class PhysicsOptions:

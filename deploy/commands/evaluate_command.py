@@ -53,9 +53,7 @@ class EvaluateCommand:
         evaluation = options.settings_from(
             Evaluation,
             self,
-            method=self.filtering.method,
-            model_config=self.filtering.model_config(),
-            accept_bound=self.filtering.accept_bound,
+            **self.filtering.settings(),
             conditions=self.physics.conditions(),
         )
         if self.render is not None:

@@ -6,7 +6,6 @@ import struct
 import numpy as np
 import pyarrow
 import pyarrow.parquet
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -24,22 +23,19 @@ def write_parquet(path, time, values):
 def write_bag(path, time, values, storage=StoragePlugin.SQLITE3):
     """/odom with a header, /cmd_vel without; positions in the world, velocities of the body."""
     types = get_typestore(Stores.ROS2_HUMBLE)
-    kinds = types.types
-    vector, quaternion = kinds["geometry_msgs/msg/Vector3"], kinds["geometry_msgs/msg/Quaternion"]
-    point, pose, twist = (kinds[f"geometry_msgs/msg/{n}"] for n in ("Point", "Pose", "Twist"))
-    posed, twisted = (kinds[f"geometry_msgs/msg/{n}WithCovariance"] for n in ("Pose", "Twist"))
-    header, stamp = kinds["std_msgs/msg/Header"], kinds["builtin_interfaces/msg/Time"]
-    odometry, text = kinds["nav_msgs/msg/Odometry"], kinds["std_msgs/msg/String"]
-    none = np.zeros(36)
+
+    def kind(name):
+        return types.types[name.replace("/", "/msg/")]
+
+    vector, quaternion, point, pose, twist = (
+        kind(f"geometry_msgs/{name}") for name in ("Vector3", "Quaternion", "Point", "Pose", "Twist")
+    )
+    posed, twisted = (kind(f"geometry_msgs/{name}WithCovariance") for name in ("Pose", "Twist"))
+    odometry, text = kind("nav_msgs/Odometry"), kind("std_msgs/String")
+    header, stamp, none = kind("std_msgs/Header"), kind("builtin_interfaces/Time"), np.zeros(36)
     with Writer(path, version=9, storage_plugin=storage) as bag:
-        topics = {
-            name: bag.add_connection(name, kind, typestore=types)
-            for name, kind in (
-                ("/odom", odometry.__msgtype__),
-                ("/cmd_vel", twist.__msgtype__),
-                ("/chatter", text.__msgtype__),
-            )
-        }
+        kinds = {"/odom": odometry, "/cmd_vel": twist, "/chatter": text}
+        topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=types) for name, kind in kinds.items()}
 
         def write(topic, message, at):
             bag.write(topics[topic], at, types.serialize_cdr(message, message.__msgtype__))
@@ -48,28 +44,14 @@ def write_bag(path, time, values, storage=StoragePlugin.SQLITE3):
         last = None
         for t, (x, y, heading, v, w, speed, turn) in zip(time, values, strict=True):
             now = EPOCH + round(1e9 * t)
-            seconds, rest = divmod(now, 1_000_000_000)
             q = quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
-            moved = twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w))
-            place = posed(pose(point(x, y, 0.0), q), none)
-            message = odometry(header(stamp(seconds, rest), "odom"), "base_link", place, twisted(moved, none))
+            moved = twisted(twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w)), none)
+            stamped = header(stamp(*divmod(now, 1_000_000_000)), "odom")
+            message = odometry(stamped, "base_link", posed(pose(point(x, y, 0.0), q), none), moved)
             write("/odom", message, now + 3_000_000)  # received a little later
             if (speed, turn) != last or round(t / 0.02) % 5 == 0:
                 write("/cmd_vel", twist(vector(speed, 0.0, 0.0), vector(0.0, 0.0, turn)), now)
                 last = speed, turn
-    return path
-
-
-def write_tlog(path, time, values):
-    """A vehicle that is told velocities in the world: x, y, vx, vy in, NED out."""
-    link = mavlink.MAVLink(None, srcSystem=1)
-    with path.open("wb") as file:
-        for t, (x, y, vx, vy, ux, uy) in zip(time, values, strict=True):
-            ms = round(1000 * t)
-            local = link.local_position_ned_encode(ms, y, x, -1.0, vy, vx, 0.0)
-            told = link.set_position_target_local_ned_encode(ms, 1, 1, 1, 0x0DC7, 0, 0, 0, uy, ux, 0, 0, 0, 0, 0, 0)
-            for message in (local, told):
-                file.write(struct.pack(">Q", 1_760_000_000_000_000 + 1000 * ms) + message.pack(link))
     return path
 
 
@@ -101,30 +83,4 @@ def write_bin(path, time, values):
             write(11, kinds["IMU"][1], us, 0, 0.0, 0.0, -w, 0.0, 0.0, -9.8)
             write(12, "Qf", us, speed)
             write(13, "Qf", us, -math.degrees(turn))
-    return path
-
-
-def write_ulg(path, time, values):
-    """A quadrotor's log, as PX4 writes it, of x, y, vx, vy and the setpoints ux, uy."""
-    forms = {
-        "vehicle_local_position": (
-            "uint64_t timestamp;" + "".join(f"float {n};" for n in ["x", "y", "z", "vx", "vy", "vz"])
-        ),
-        "trajectory_setpoint": "uint64_t timestamp;float[3] velocity;",
-    }
-    with path.open("wb") as file:
-        file.write(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0))
-
-        def write(kind, payload):
-            file.write(struct.pack("<HB", len(payload), ord(kind)) + payload)
-
-        write("B", bytes(40))
-        for name, form in forms.items():
-            write("F", f"{name}:{form}".encode())
-        for number, name in enumerate(forms):
-            write("A", struct.pack("<BH", 0, number) + name.encode())
-        for t, (x, y, vx, vy, ux, uy) in zip(time, values, strict=True):
-            us = 1_000_000 + round(1e6 * t)
-            write("D", struct.pack("<HQ6f", 0, us, y, x, -1.0, vy, vx, 0.0))
-            write("D", struct.pack("<HQ3f", 1, us, uy, ux, 0.0))
     return path

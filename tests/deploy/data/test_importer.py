@@ -11,10 +11,9 @@ from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
-from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import _off_chord
-from tests.deploy.data.bags import write_bag, write_bin, write_parquet, write_tlog, write_ulg
+from tests.deploy.data.bags import write_bag, write_bin, write_parquet
 from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, porter, write_csv
 
 
@@ -49,35 +48,6 @@ SOURCES = {
 def test_every_format_of_the_same_drive_is_the_same_data(driven, from_csv, tmp_path, source):
     write, within = SOURCES[source]
     same(from_csv, import_sources([write(tmp_path, *driven)], porter()).data, within)
-
-
-PUCK = {
-    "name": "puck",
-    "period": 0.2,
-    "sight": 3.0,
-    "state": {
-        "x": {"unit": "m", "role": "position", "error": 0.01},
-        "y": {"unit": "m", "role": "position", "error": 0.01},
-        "vx": {"unit": "m/s", "error": 0.05, "follows": "ux"},
-        "vy": {"unit": "m/s", "error": 0.05, "follows": "uy"},
-    },
-    "input": {"ux": {"unit": "m/s", "low": -1, "high": 1}, "uy": {"unit": "m/s", "low": -1, "high": 1}},
-    "plan": {"horizon": 3, "brake": 1},
-    "body": [{"at": [0.0, 0.0], "radius": 0.1}],
-}
-
-
-@pytest.mark.parametrize("write, ending", [(write_tlog, "tlog"), (write_ulg, "ulg")])
-def test_a_flight_in_ned_is_read_in_enu(tmp_path, write, ending):
-    rng = np.random.default_rng(2)
-    time = 0.05 * np.arange(2000)
-    u = np.repeat(rng.uniform(-1, 1, (500, 2)), 4, 0)  # each for a period
-    position = np.cumsum(np.vstack([np.zeros(2), 0.05 * u[:-1]]), 0)
-    seen = np.hstack([position, u, u])
-    robot = robot_from_description(PUCK)
-    data = import_sources([write(tmp_path / f"a.{ending}", time, seen)], robot).data
-    csv = write_csv(tmp_path / "a.csv", time, seen, ("x", "y", "vx", "vy", "ux", "uy"))
-    same(import_sources([csv], robot).data, data, 1e-4)
 
 
 # --- periods out of columns --------------------------------------------------------------------------------------
