@@ -60,7 +60,6 @@ Pictures = Annotated[
     ),
 ]
 Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
-VehicleUrl = "udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT"
 
 
 @dataclass(frozen=True)
