@@ -4,46 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 
 import numpy as np
 
-from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.learner.rival_networks import FitConfig, fit_cost, fit_linear
+from brakeline.deploy.data.rival_rollouts import Each, SailrRecipe, SecasRecipe, costs, transitions
+from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import SAILR
 from brakeline.safety.rivals.secas import SECAS
-
-Each = Callable[[], object]
-
-
-@dataclass(frozen=True)
-class SecasRecipe:
-    """Configuration of SECAS. Dalal et al. use one hidden layer of 10 units, Adam at 1e-4, 1000 random episodes."""
-
-    samples: int = 40_000
-    arena: str = "default"
-    seed: int = 20_261
-    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(64, 64)))
-    margin: float = 0.1  # m added to the footprint: the bound C, tuned
-
-
-@dataclass(frozen=True)
-class SailrRecipe:
-    """Configuration of SAILR. Wagener et al. use three layers of 256, Adam at 1e-3, γ 0.99, smoothing 0.5, η 0.08."""
-
-    samples: int = 80_000
-    arena: str = "default"
-    seed: int = 20_262
-    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(256, 256, 256), epochs=10))
-    gamma: float = 0.99
-    smoothing: float = 0.5  # m of clearance
-    threshold: float = 0.08  # η, tuned
-    lead: int = 5  # largest number of periods before braking
-
 
 ModelConfig = SecasRecipe | SailrRecipe
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
@@ -78,7 +49,7 @@ def pretrain(robot: RobotWithTask, recipe: ModelConfig, each: Each = lambda: Non
 
 
 def _secas(robot: RobotWithTask, recipe: SecasRecipe, each: Each) -> Made:
-    data = transitions(robot, recipe.arena, recipe.samples, recipe.seed, each)
+    data = transitions(robot, recipe, each)
     g, errors = fit_linear(data.observation, data.action, data.change, recipe.fit, recipe.seed)
     about = {
         "collisions": str(data.collisions),
@@ -90,7 +61,7 @@ def _secas(robot: RobotWithTask, recipe: SecasRecipe, each: Each) -> Made:
 def _sailr(robot: RobotWithTask, recipe: SailrRecipe, each: Each) -> Made:
     """Fit V to the cost-to-go of braking, then Q of each step to the larger V after it."""
     gamma = recipe.gamma
-    data = costs(robot, recipe.arena, recipe.samples, recipe.seed, gamma, recipe.smoothing, recipe.lead, each)
+    data = costs(robot, recipe, each)
     v, v_error = fit_cost(robot, data.braked, data.braked_cost, 2, recipe.fit, recipe.seed)
     after = np.array([1.0 / (1.0 + np.exp(-v(x).astype(float).max())) for x in data.after])
     cost = np.where(data.collided, 1.0, np.minimum(data.step_cost + gamma * after, 1.0))

@@ -6,13 +6,14 @@ No filter protects these rollouts. Their collisions are part of the cost of the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.learner.rival_networks import FitConfig
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.braking import brake
 from brakeline.safety.rivals.sailr import normalised_input
@@ -20,10 +21,36 @@ from brakeline.safety.rivals.secas import Constraints
 from brakeline.sim.scripted_policies import Policy, scripted
 
 Array = NDArray[np.float64]
+Each = Callable[[], object]
 
 SEED_OFFSET = 5_000_000  # added to the seed, so that training and evaluation use other episodes
 POLICIES = ("random", "greedy", "adversary")  # for rollouts that end with braking
 STANDING = 2  # periods to observe after the input is zero
+
+
+@dataclass(frozen=True)
+class SecasRecipe:
+    """Configuration of SECAS. Dalal et al. use one hidden layer of 10 units, Adam at 1e-4, 1000 random episodes."""
+
+    samples: int = 40_000
+    arena: str = "default"
+    seed: int = 20_261
+    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(64, 64)))
+    margin: float = 0.1  # m added to the footprint: the bound C, tuned
+
+
+@dataclass(frozen=True)
+class SailrRecipe:
+    """Configuration of SAILR. Wagener et al. use three layers of 256, Adam at 1e-3, γ 0.99, smoothing 0.5, η 0.08."""
+
+    samples: int = 80_000
+    arena: str = "default"
+    seed: int = 20_262
+    fit: FitConfig = field(default_factory=lambda: FitConfig(hidden=(256, 256, 256), epochs=10))
+    gamma: float = 0.99
+    smoothing: float = 0.5  # m of clearance
+    threshold: float = 0.08  # η, tuned
+    lead: int = 5  # largest number of periods before braking
 
 
 @dataclass(frozen=True)
@@ -57,8 +84,9 @@ class Costs:
 class _Drive:
     """A running environment that starts a new episode when one ends."""
 
-    def __init__(self, robot: RobotWithTask, arena: str, seed: int, each: Callable[[], object]) -> None:
-        self._env, self._each, self._episode = environment(robot, arena, SEED_OFFSET + seed), each, -1
+    def __init__(self, robot: RobotWithTask, recipe: SecasRecipe | SailrRecipe, each: Each) -> None:
+        self._env = environment(robot, recipe.arena, SEED_OFFSET + recipe.seed)
+        self._each, self._episode = each, -1
         self.observation: Any = None
         self.info: dict[str, Any] = {}
         self.ended, self.collisions = True, 0
@@ -79,15 +107,13 @@ class _Drive:
         return np.asarray(self.info["input_in_force"])
 
 
-def transitions(
-    robot: RobotWithTask, arena: str, samples: int, seed: int, each: Callable[[], object] = lambda: None
-) -> Transitions:
+def transitions(robot: RobotWithTask, recipe: SecasRecipe, each: Each = lambda: None) -> Transitions:
     """Record `samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
-    drive = _Drive(robot, arena, seed, each)
-    policy = scripted("random", robot, np.random.default_rng((seed, 1)))
+    drive = _Drive(robot, recipe, each)
+    policy = scripted("random", robot, np.random.default_rng((recipe.seed, 1)))
     constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
-    while len(rows) < samples:
+    while len(rows) < recipe.samples:
         drive.ready()
         seen, before = drive.observation, constraints(drive.observation, drive.info["state"])
         executed = drive.step(policy(seen, drive.info)) / robot.high()
@@ -95,23 +121,14 @@ def transitions(
     return Transitions(*_columns(rows), drive.collisions)
 
 
-def costs(
-    robot: RobotWithTask,
-    arena: str,
-    samples: int,
-    seed: int,
-    gamma: float,
-    smoothing: float,
-    lead: int,
-    each: Callable[[], object] = lambda: None,
-) -> Costs:
+def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) -> Costs:
     """Record about `samples` steps: repeatedly drive up to `lead` periods, then brake to a stop.
 
     The cost of a step is max(0, 1 − clearance/smoothing), with smoothing in m; after a collision it stays 1. Sums are
     discounted by γ and scaled by 1 − γ (Wagener et al. 2021, appendix D).
     """
-    drive = _Drive(robot, arena, seed, each)
-    rng = np.random.default_rng((seed, 2))
+    drive, gamma = _Drive(robot, recipe, each), recipe.gamma
+    rng = np.random.default_rng((recipe.seed, 2))
     drivers = [scripted(name, robot, rng) for name in POLICIES]
     braked: list[tuple[Any, float]] = []
     driven: list[tuple[Array, float, Any, bool]] = []
@@ -121,7 +138,7 @@ def costs(
         seen = drive.observation
         pair = np.concatenate([seen, normalised_input(robot, drive.step(action))])
         collided = bool(drive.info["collision"])
-        cost = 1.0 if collided else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / smoothing)
+        cost = 1.0 if collided else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / recipe.smoothing)
         driven.append((pair, (1.0 - gamma) * cost, drive.observation, collided))
         return cost
 
@@ -140,10 +157,10 @@ def costs(
             to_go = amount + gamma * to_go
             braked.append((observation, (1.0 - gamma) * to_go))
 
-    while len(driven) < samples:
+    while len(driven) < recipe.samples:
         drive.ready()
         policy: Policy = drivers[int(rng.integers(len(drivers)))]
-        for _ in range(int(rng.integers(lead + 1))):
+        for _ in range(int(rng.integers(recipe.lead + 1))):
             if not drive.ended:
                 action = policy(drive.observation, drive.info)
                 # Replace half of the actions by random ones, because the critics must rate any action.

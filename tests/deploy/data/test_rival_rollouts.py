@@ -11,7 +11,7 @@ from tests.robots import GROUND
 
 
 def test_transitions_are_whole_scaled_and_the_same_again():
-    one, same, other = (transitions(GROUND, "default", 400, seed) for seed in (1, 1, 2))
+    one, same, other = (transitions(GROUND, SecasRecipe(samples=400, seed=seed)) for seed in (1, 1, 2))
     assert one.observation.shape == (400, 26) and one.action.shape == (400, 2) and one.change.shape == (400, 6)
     assert np.array_equal(one.change, same.change) and not np.array_equal(one.change, other.change)
     assert (np.abs(one.action) <= 1.0).all() and (one.action[:, 0] >= 0).all()
@@ -20,7 +20,7 @@ def test_transitions_are_whole_scaled_and_the_same_again():
 
 
 def test_costs_are_of_braking_to_the_end():
-    found = costs(GROUND, "default", 3000, 1, gamma=0.99, smoothing=0.5, lead=5)
+    found = costs(GROUND, SailrRecipe(samples=3000, seed=1))
     assert found.collisions > 0 and found.collided.sum() == found.collisions
     for cost in (found.braked_cost, found.step_cost):
         assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()
