@@ -3,24 +3,28 @@
 import contextlib
 import io
 import json
+from dataclasses import replace
 
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.deploy.data import simulated_recording
+from brakeline.deploy.data.data_paths import record_path
 from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.messaging.robot_description import read_robot
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory):
-    """A data folder with some minutes of driving, and the model set that `certify --use` makes of them."""
+def few(data_folder, tmp_path_factory):
+    """A data folder with some minutes of driving: the first trajectories of the session's recording."""
     folder = tmp_path_factory.mktemp("few")
+    data = Dataset.load(record_path(GROUND))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BRAKELINE_DATA", str(folder))
-        simulated_recording.load_or_record(GROUND, trajectories=24)
+        (folder / "ground").mkdir()
+        replace(data, trajectories=data.trajectories[:24]).save(record_path(GROUND))
         yield folder
 
 

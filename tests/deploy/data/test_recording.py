@@ -169,17 +169,18 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
     drive = simulated_recording.collect.record
 
     def interrupted(*given):
-        yield from itertools.islice(drive(*given), 5)
+        yield from itertools.islice(drive(*given), 2)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(simulated_recording.collect, "record", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            simulated_recording.load_or_record(GROUND)
+            simulated_recording.load_or_record(GROUND, trajectories=4)
     assert not data_paths.record_path(GROUND).exists()
-    assert "recording ground once" in (told := capsys.readouterr().err) and "kept 5 of 12" in told
-    whole = simulated_recording.load_or_record(GROUND)
-    assert elsewhere[-1][-1] == 5, "only what was missing is driven"
+    assert "recording ground once" in (told := capsys.readouterr().err) and "kept 2 of 4" in told
+    whole = simulated_recording.load_or_record(GROUND, trajectories=4)
+    assert elsewhere[-1][-1] == 2, "only what was missing is driven"
     assert {path.name for path in data_paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
-    fresh = simulated_recording.load_or_record(GROUND, data_paths.record_path(GROUND).with_name("fresh.safetensors"))
+    again = data_paths.record_path(GROUND).with_name("fresh.safetensors")
+    fresh = simulated_recording.load_or_record(GROUND, again, trajectories=4)
     assert whole.digest() == fresh.digest(), "the same data as in one go"
