@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.deploy.data.sources.quantity_names import column_names, split
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.sources.source_table import Array, Series, Table
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
-Series = tuple[Array, Array]  # time in s and values (T,)
 Span = tuple[float, float]  # begin and end in s
 
 GAP = 1.5  # times the usual time between two samples: a larger one is a gap

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from brakeline.messaging.robot import Array, Robot
+from brakeline.deploy.data.sources.source_table import Series
+from brakeline.messaging.robot import Robot
 
-Series = tuple[Array, Array]
 STEPS_PER_PERIOD = 10  # resolution of the delay, if the source is sampled that often
 MAX_DELAY = 3.0  # periods
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from brakeline.errors import NoSource
 
 Array = NDArray[np.float64]
+Series = tuple[Array, Array]  # time in s and values (T,)
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Table:
     run: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     rank: int = 0  # among tables with the same quantity, the lowest is used
 
-    def series(self, column: str, run: int) -> tuple[Array, Array]:
+    def series(self, column: str, run: int) -> Series:
         """Return times and values of a column in one run, without missing values.
 
         Raises:
