@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.deploy.data.sources.source_table import Array, Series, Table
@@ -13,6 +14,7 @@ from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
 Span = tuple[float, float]  # begin and end in s
+Indices = NDArray[np.signedinteger]
 
 GAP = 1.5  # times the usual time between two samples: a larger one is a gap
 JUMP = 2.0  # times the fastest motion: faster is a jump
@@ -71,7 +73,7 @@ def gap_free_recordings(
     return recordings, [f"{count} {what}" for what, count in counts.items() if count]
 
 
-def _gaps(time: Array, period: float, name: str) -> Array:
+def _gaps(time: Array, period: float, name: str) -> Indices:
     """Return the indices of the samples before gaps. Raises NoSource if there are too few samples."""
     apart = np.diff(time)
     usual = float(np.median(apart))
@@ -82,7 +84,7 @@ def _gaps(time: Array, period: float, name: str) -> Array:
     return np.flatnonzero(apart > max(GAP * usual, 0.5 * period))
 
 
-def _jumps(robot: Robot, states: list[Series]) -> dict[int, Array]:
+def _jumps(robot: Robot, states: list[Series]) -> dict[int, Indices]:
     """Return for each coordinate of the pose the indices of the samples before a motion faster than the robot's."""
     fastest = {"m/s": 0.0, "rad/s": 0.0}
     for label, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True):
@@ -100,10 +102,10 @@ def _jumps(robot: Robot, states: list[Series]) -> dict[int, Array]:
     return torn
 
 
-def _uncut(time: Array, cuts: Array, hold: float = 0.0) -> list[Span]:
+def _uncut(time: Array, cuts: Indices, hold: float = 0.0) -> list[Span]:
     """Return the spans of a series that is cut after the samples `cuts`; its values are valid for `hold` s."""
-    starts, ends = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(time) - 1]])
-    return [(float(time[i]), float(time[j]) + hold) for i, j in zip(starts.astype(int), ends.astype(int), strict=True)]
+    starts, ends = [0, *(cuts + 1)], [*cuts, len(time) - 1]
+    return [(float(time[i]), float(time[j]) + hold) for i, j in zip(starts, ends, strict=True)]
 
 
 def _common(spans: Sequence[list[Span]]) -> list[Span]:

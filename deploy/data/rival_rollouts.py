@@ -118,7 +118,8 @@ def transitions(robot: RobotWithTask, recipe: SecasRecipe, each: Each = lambda: 
         seen, before = drive.observation, constraints(drive.observation, drive.info["state"])
         executed = drive.step(policy(seen, drive.info)) / robot.high()
         rows.append((seen, executed, constraints(drive.observation, drive.info["state"]) - before))
-    return Transitions(*_columns(rows), drive.collisions)
+    seen, inputs, changes = _columns(rows)
+    return Transitions(seen, inputs, changes, drive.collisions)
 
 
 def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) -> Costs:
@@ -167,8 +168,9 @@ def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) 
                 take(action if rng.random() < 0.5 else rng.uniform(robot.low(), robot.high()))
         if not drive.ended:
             stop()
-    *columns, collided = _columns(driven)
-    return Costs(*_columns(braked), *columns, collided.astype(bool), drive.collisions)
+    states, to_go = _columns(braked)
+    pairs, step, after, collided = _columns(driven)
+    return Costs(states, to_go, pairs, step, after, collided.astype(bool), drive.collisions)
 
 
 def _columns(rows: Sequence[tuple[Any, ...]]) -> list[Array]:
