@@ -171,7 +171,7 @@ def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
 
 
 def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_path):
-    figures("collect", "--trajectories", 1, "--out", tmp_path / "few.safetensors")
+    figures("collect", "--trajectories", 2, "--out", tmp_path / "few.safetensors")
     words = ("certify", tmp_path / "few.safetensors", "--mode", "direct", "--certificates", "residual", "--json")
     status, out, err = command(*words)
     assert status == 1 and "at least" in err
