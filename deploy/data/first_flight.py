@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
-from brakeline.deploy.data.excitation import manoeuvre
+from brakeline.deploy.data.excitation import limit_slew, random_target
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.errors import BadData, FlightEnded, Unsupported
 from brakeline.messaging.robot import Robot
@@ -72,10 +72,20 @@ class Box:
 
 
 def draw_manoeuvre(robot: Robot, share: float, before: Array, rng: np.random.Generator) -> list[Array]:
-    """Draw a manoeuvre that ends at rest, within `share` of the bounds: inputs (3,)."""
-    low, high = (tuple(share * bound) for bound in (robot.low(), robot.high()))
-    slower = replace(robot.in_lockstep(), free_steps=1, action_low=low, action_high=high)
-    return [*manoeuvre(slower, rng, before), np.zeros(robot.action_dim)]
+    """Draw a manoeuvre: random targets, each held or left at once, then a plan like the filter's: inputs (3,).
+
+    Its lead-in is shorter than that of `excitation`, so that some minutes of flight have enough plans.
+    """
+    inputs = [before]
+    for _ in range(rng.integers(4)):
+        target = share * random_target(robot, rng)
+        for _ in range(rng.integers(1, 4 if rng.random() < 0.6 else 12)):
+            inputs.append(limit_slew(robot, inputs[-1], target))
+    chosen = limit_slew(robot, inputs[-1], share * random_target(robot, rng))
+    waiting = replace(robot.in_lockstep(), free_steps=1)
+    inputs += list((waiting.plan_matrix() @ chosen).reshape(waiting.horizon, -1))
+    standing = rng.integers(3) if rng.random() < 0.9 else 12
+    return inputs[1:] + [np.zeros(robot.action_dim)] * int(standing)
 
 
 def mirror_inwards(inputs: list[Array], state: Array, box: Box, period: float, rng: np.random.Generator) -> list[Array]:
