@@ -15,6 +15,8 @@ from brakeline.safety.model.model_config import check_reservations
 
 @dataclass(frozen=True)
 class ActorCommand:
+    """The options of `brakeline actor`."""
+
     robot: options.Robot = "ground"
     endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
     filtering: options.Unprefixed[options.FilterOptions] = field(default_factory=options.FilterOptions)

@@ -17,6 +17,8 @@ from brakeline.logs.report import show, show_episode
 
 @dataclass(frozen=True)
 class AnalyseCommand:
+    """The options of `brakeline analyse`."""
+
     logs: Logs = (LATEST,)
     html: Path | None = None
     """Write a report to this file: one page that needs no network."""

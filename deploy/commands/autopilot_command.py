@@ -22,6 +22,8 @@ from brakeline.sim.wind import Wind
 
 @dataclass(frozen=True)
 class AutopilotCommand:
+    """The options of `brakeline autopilot`."""
+
     url: str = "udpout:127.0.0.1:14540"
     """Link to serve MAVLink on: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT. PX4's simulator sends to UDP port
     14540; ArduPilot's listens on TCP port 5760."""

@@ -17,6 +17,8 @@ from brakeline.messaging.stop_signals import stop_on_signals
 
 @dataclass(frozen=True)
 class BridgeSimCommand:
+    """The options of `brakeline bridge-sim`."""
+
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Act as the Zenoh router at these endpoints."""
     router: tuple[str, ...] = ()

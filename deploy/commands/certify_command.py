@@ -36,6 +36,8 @@ DIVERGENT = 100.0  # m, half-width of a stop that is wider than any arena
 
 @dataclass(frozen=True)
 class CertifyCommand:
+    """The options of `brakeline certify`."""
+
     data: Annotated[Path | None, tyro.conf.Positional] = None
     """A data set, or a log (file or run folder), of which the last steps count. Defaults to the data set in use of
     --robot."""

@@ -21,6 +21,8 @@ from brakeline.safety.model.stated_bound import accepted_bound, refusal
 
 @dataclass(frozen=True)
 class CollectCommand:
+    """The options of `brakeline collect`."""
+
     robot: options.Robot = "ground"
     trajectories: int | None = None
     """Trajectories to record, each of 300 control periods. Defaults to as many as the plans of the robot need."""

@@ -36,6 +36,8 @@ QUICK = Path("runs/quick")
 
 @dataclass(frozen=True)
 class CompareCommand:
+    """The options of `brakeline compare`."""
+
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
     """Robots to compare the methods on."""
     seeds: tuple[int, ...] = SEEDS

@@ -11,6 +11,8 @@ from brakeline.deploy.run.run_config import EXPERIMENTS
 
 @dataclass(frozen=True)
 class DemoCommand:
+    """The options of `brakeline demo`."""
+
     steps: int = EXPERIMENTS["demo"].steps
     """Training steps."""
     seed: Seed = 0

@@ -16,6 +16,8 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 @dataclass(frozen=True)
 class EvaluateCommand:
+    """The options of `brakeline evaluate`."""
+
     robot: options.Robot = "ground"
     policy: str = "astar"
     """Policy to evaluate: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,

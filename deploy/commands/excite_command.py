@@ -16,6 +16,8 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 @dataclass(frozen=True)
 class ExciteCommand:
+    """The options of `brakeline excite`."""
+
     robot: Robot = "ground"
     keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
     """Region that the robot stays in: least x, least y, greatest x, greatest y [m]. Each run starts in its middle,

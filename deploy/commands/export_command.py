@@ -14,6 +14,8 @@ from brakeline.messaging.task import robot_with_task
 
 @dataclass(frozen=True)
 class ExportCommand:
+    """The options of `brakeline export`."""
+
     logs: Logs = (LATEST,)
     csv: Path | None = None
     """Write each step as a line of this CSV file."""

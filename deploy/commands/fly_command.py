@@ -25,6 +25,8 @@ TIMING_PREFIXES = ("periods ", "lateness", "worst", "link", "true", "estimate") 
 
 @dataclass(frozen=True)
 class FlyCommand:
+    """The options of `brakeline fly`."""
+
     robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
     """Robot that flies: a name, or the path of a robot description (.toml)."""
     minutes: float = 10.0

@@ -24,6 +24,8 @@ from brakeline.messaging.robot import robot_named
 
 @dataclass(frozen=True)
 class ImportCommand:
+    """The options of `brakeline import`."""
+
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Logs to import: CSV, Parquet, ROS 2 bags, .bin and .tlog of ArduPilot, .ulg of PX4, own runs (docs/data.md)."""
     robot: str = "ground"

@@ -21,6 +21,8 @@ from brakeline.safety.service.signature import KEY as SIGNING_KEY
 
 @dataclass(frozen=True)
 class KeysCommand:
+    """The options of `brakeline keys`."""
+
     folder: Annotated[Path, tyro.conf.Positional] = Path("keys")
     """Folder of the keys. The command makes it if it does not exist."""
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()

@@ -13,6 +13,8 @@ from brakeline.messaging.task import address
 
 @dataclass(frozen=True)
 class LearnerCommand:
+    """The options of `brakeline learner`."""
+
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     out: Path = Path("runs/learner")

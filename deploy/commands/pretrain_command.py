@@ -20,6 +20,8 @@ from brakeline.safety.rivals.pretrained import Pretrained
 
 @dataclass(frozen=True)
 class PretrainCommand:
+    """The options of `brakeline pretrain`."""
+
     method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
     """The rival method."""
     robot: Robot = "ground"

@@ -33,6 +33,8 @@ OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW
 
 @dataclass(frozen=True)
 class QueryCommand:
+    """The options of `brakeline query`."""
+
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     state: tuple[float, ...] = ()

@@ -16,6 +16,8 @@ from brakeline.logs.segment_rotation import Rotation
 
 @dataclass(frozen=True)
 class RecorderCommand:
+    """The options of `brakeline recorder`."""
+
     log: Annotated[Path, tyro.conf.Positional] = Path("runs/run.mcap")
     """Log file to write (.mcap). If the file exists, the recorder writes the next one of the same log."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)

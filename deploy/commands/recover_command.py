@@ -17,6 +17,8 @@ from brakeline.logs.reader import find
 
 @dataclass(frozen=True)
 class RecoverCommand:
+    """The options of `brakeline recover`."""
+
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays beside it as
     *.mcap.damaged."""

@@ -31,6 +31,8 @@ DIFFERENT = 1  # exit status: decisions differ by more than rounding although yo
 
 @dataclass(frozen=True)
 class ReplayCommand:
+    """The options of `brakeline replay`."""
+
     logs: Logs = (LATEST,)
     certificate: Certificate | None = None
     """Decide with this error bound instead, fitted to the data set in use or to --data."""

@@ -21,6 +21,8 @@ from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 @dataclass(frozen=True)
 class RobotCommand:
+    """The options of `brakeline robot`."""
+
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
     """new writes a description with comments, check lists all mistakes in one, show prints what follows from it."""
     file: Annotated[str, tyro.conf.Positional]

@@ -40,6 +40,8 @@ class GraphOptions:
 
 @dataclass(frozen=True)
 class Ros2Command:
+    """The options of `brakeline ros2`."""
+
     robot: options.Robot = "ground"
     router: tuple[str, ...] = (ROUTER,)
     """Endpoints of the router of rmw_zenoh, as Zenoh writes them."""

@@ -9,6 +9,8 @@ from brakeline.deploy.commands.common_options import BusOptions, Unprefixed
 
 @dataclass(frozen=True)
 class RouterCommand:
+    """The options of `brakeline router`."""
+
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     name: str = "router"
     """Name of the router on the bus. Each router needs its own."""

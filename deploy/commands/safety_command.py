@@ -15,6 +15,8 @@ from brakeline.messaging.task import robot_maybe_with_task
 
 @dataclass(frozen=True)
 class SafetyCommand:
+    """The options of `brakeline safety`."""
+
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
     """Robots to serve: names, or paths of robot descriptions (.toml)."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)

@@ -17,6 +17,8 @@ from brakeline.messaging.topics import HEALTH, LEARNER
 
 @dataclass(frozen=True)
 class StatusCommand:
+    """The options of `brakeline status`."""
+
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     wait: float = 1.5
     """Time to listen [s]. Each living process publishes its health once a second."""

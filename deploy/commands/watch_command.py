@@ -25,6 +25,8 @@ INBOX_SIZE = 20_000  # samples; the oldest of more are not shown, so that no pub
 
 @dataclass(frozen=True)
 class WatchCommand:
+    """The options of `brakeline watch`."""
+
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     host: str = "127.0.0.1"
     """Address to serve at. Only this machine can watch, unless you give an address that others reach."""
