@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console, RenderableType
 
 from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.logs.json_values import finite
 
 # The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
 console = Console(highlight=False, soft_wrap=True)
@@ -18,7 +18,13 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 def print_json(figures: dict[str, Any]) -> None:
     """Print one JSON object on stdout. Numbers that are not finite become null, paths become text."""
-    print(json.dumps(_plain(figures)))
+    print(json.dumps(finite(figures), default=_path_text))
+
+
+def _path_text(value: object) -> str:
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"JSON holds no {type(value).__name__}")
 
 
 def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType) -> None:
@@ -28,16 +34,6 @@ def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType)
         return
     for line in lines:
         console.print(line, markup=not isinstance(line, str))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, Path):
-        return str(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def print_counts(figures: dict[str, float], as_json: bool) -> None:
