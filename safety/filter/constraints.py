@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,7 +21,7 @@ from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_
 from brakeline.safety.filter.kernels import halfspace_kernels, tube_kernels
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.qp import ConstraintRows, ObstacleRows
-from brakeline.safety.filter.reachable_tube import Tube
+from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
 from brakeline.safety.filter.recovery import escape_direction
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import OtherReservations, ReservationRows, reservation_half_spaces
@@ -31,6 +32,7 @@ from brakeline.safety.perception import scan_free_space as seen
 
 Array = NDArray[np.float64]
 
+EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
 ASIDE = 0.5  # m beyond all plans: what a range image is looked at for, and so the largest margin that it tells
 
 
@@ -41,13 +43,14 @@ class _Disc:
     Attributes:
         at (d,): its center in the robot's frame. radius [m].
         swing [m]: error of its position due to the error of the measured heading.
-        position (N, d, nz): linear maps from regressors to its displacements. layout: builds its rows.
+        position (N, d, nz), offset (N, d): affine maps from regressors to its displacements. layout: builds its rows.
     """
 
     at: Array
     radius: float
     swing: float
     position: Array
+    offset: Array
     layout: ObstacleRows
 
     @cached_property
@@ -56,17 +59,22 @@ class _Disc:
         return bool(self.at.any() or self.swing)
 
 
-def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
+def _discs(robot: Robot, tube: Tube, known: list[_Disc] | None = None) -> list[_Disc]:
+    """Return the discs of the body in a tube. known: the same discs in a tube with the same sets."""
     d, found = robot.position_dim, []
     after = len(extra_coordinates(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
-    for disc in robot.body:
-        position, directions, swing = tube.position, tube.directions, 0.0
+    for i, disc in enumerate(robot.body):
+        position, offset, directions, swing = tube.position, tube.offset, tube.directions, 0.0
         if disc.arm and robot.heading is not None:
-            position, directions = tube.more[:, after : after + d], tube.more_directions[:, after : after + d]
+            of = slice(after, after + d)
+            position, offset, directions = tube.more[:, of], tube.more_offset[:, of], tube.more_directions[:, of]
             swing = disc.arm * robot.measurement_bound[robot.heading]
             after += d
-        whole = np.ascontiguousarray(position)
-        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, whole, ObstacleRows(position, directions)))
+        if known is None:
+            layout = ObstacleRows(position, offset, directions)
+        else:
+            layout = known[i].layout.around(position, offset)
+        found.append(_Disc(np.asarray(disc.at), disc.radius, swing, np.ascontiguousarray(position), offset, layout))
     return found
 
 
@@ -79,6 +87,7 @@ class LocalMap:
         near: obstacles within reach. moving: moving obstacles that may come within reach.
         beyond [m]: the distance below which the request names no further obstacle, at most the sensor's range.
         unseen: space that a scan does not show to be free. other_reservations: those of other robots.
+        widening: factor that the request puts on every set (docs/method.md §15).
     """
 
     start: Array
@@ -89,6 +98,7 @@ class LocalMap:
     moving: MovingObstacles | None = None
     unseen: seen.OccupiedCells | shades.OccludedRegions | None = None
     other_reservations: OtherReservations | None = None
+    widening: float = 1.0
 
     @property
     def parked(self) -> LocalMap:
@@ -118,12 +128,13 @@ def turning_extent(robot: Robot, tube: Tube) -> float:
     in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
     state = robot.state_at_inputs(in_place)
     z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+    tube = tube.at(z)
     sizes = tube.magnitudes(z)
     L, d = tube.generators, robot.position_dim
     directions = np.random.default_rng(0).normal(size=(64, d))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     width = np.abs(directions[:, None, None, :] @ tube.directions)[:, :, 0] @ sizes[:L]
-    drift = np.abs((directions[:, None, None, :] @ tube.position)[:, :, 0] @ z)
+    drift = np.abs((directions[:, None, None, :] @ tube.position)[:, :, 0] @ z + directions @ tube.offset.T)
     return float((width + drift).max() + sizes[L:].max())
 
 
@@ -160,20 +171,18 @@ class TubeConstraints:
         if robot.position_dim == 3:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
+        self.widening = 1.0
         self.discs = _discs(robot, tube)
-        free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
-        self._spans = np.abs(tube.directions)
+        self._free = free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
         whole = np.ascontiguousarray
-        W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
-        parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, whole(self._spans)
-        self._filled = parts  # arguments of the kernels that are the same for all requests
+        self._spans, self._W_free = whole(np.abs(tube.directions)), whole(np.abs(tube.W[:, -free:]))
         self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0
-        self._reached = *self._sized, whole(tube.position), whole(tube.directions)
+        self._directions = whole(tube.directions)
         first, n = model.first, robot.state_dim
+        self._first = tube.first if len(tube.first) else np.zeros(n)
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self._regressor = model.first_regressor
-        self.boxes = ReservationRows(tube.position, tube.directions)
         self.limits = StateLimits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
@@ -185,7 +194,44 @@ class TubeConstraints:
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.clearance_margin
         self.reach = min(wanted, robot.sight) if reach is None else reach
-        self.far = wanted > robot.sight
+        self.far = wanted > robot.sight or isinstance(tube, RolloutTube)  # interval arithmetic bounds no rollout
+
+    def at(self, z: Array, widening: float = 1.0) -> TubeConstraints:
+        """Return the constraints with a tube that is exact for regressors z (nz,) and has affine centers.
+
+        widening: factor on every set of the tube, at least 1 (docs/method.md §15).
+        """
+        tube = self.tube.at(z)
+        if tube is self.tube and widening == self.widening:
+            return self
+        other = copy(self)
+        for name in ("_reached", "_filled", "_boxes"):
+            other.__dict__.pop(name, None)
+        other.widening = widening
+        if tube is not self.tube:
+            other.tube, other._first = tube, tube.first
+            other.discs = _discs(self.robot, tube, self.discs)
+            if self.limits is not None:
+                other.limits = self.limits.around(tube)
+        return other
+
+    @cached_property
+    def _reached(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
+        """The arguments of the kernels that are the same for all requests."""
+        tube = self.tube
+        return *self._sized, np.ascontiguousarray(tube.position), tube.offset, self._directions, self.widening
+
+    @cached_property
+    def _filled(self) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, float]:
+        """The arguments of `filled_by_plans` that are the same for all requests."""
+        tube, whole = self.tube, np.ascontiguousarray
+        position, moved = whole(tube.position), whole(np.abs(tube.position[..., -self._free :]))
+        sizes = whole(tube.W), self._W_free, whole(tube.M), tube.m_0
+        return *sizes, position, tube.offset, moved, self._spans, self.widening
+
+    @cached_property
+    def _boxes(self) -> ReservationRows:
+        return ReservationRows(self.tube.position, self.tube.offset, self.tube.directions)
 
     # --- what is known before any request ---------------------------------------------------------------------
 
@@ -206,7 +252,7 @@ class TubeConstraints:
         """Return a distance [m] from the measured position that no tube, with the body, exceeds.
 
         It comes from interval arithmetic over the range of all regressors, so it is loose for error bounds with many
-        rows W.
+        rows W. For a rollout it is an estimate from extreme regressors; the filter checks the extent of each plan.
         """
         robot, F = self.robot, self.robot.free_steps
         low = np.concatenate([domain[0], np.tile(robot.low(), F)])
@@ -214,6 +260,9 @@ class TubeConstraints:
         z = np.maximum(np.abs(low), np.abs(high))
         sizes = tube.M @ (np.abs(tube.W) @ z) + tube.m_0
         way = np.abs(tube.position) @ z + np.abs(tube.directions) @ sizes[: tube.generators]
+        if isinstance(self.tube, RolloutTube):
+            extremes = np.random.default_rng(0).integers(0, 2, (EXTREMES, len(low)))
+            way += np.abs(self.tube.outputs(np.where(extremes, high, low))[0]).max(0)
         return float(np.linalg.norm(way, axis=1).max() + self.body + sizes[tube.generators :].max())
 
     def extent(self, z: Array) -> float:
@@ -267,10 +316,12 @@ class TubeConstraints:
     def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.PlanBoxes:
         """Return boxes, world, that contain the discs' centers under every plan after z_0, with room to spare."""
         z = np.concatenate([z_0, inputs[0]])
-        return shades.PlanBoxes(
-            halfspace_kernels.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn),
-            self.robot.horizon * self.robot.period,
-        )
+        if isinstance(self.tube, RolloutTube):  # a verified plan does not leave the reach, and no box of it is smaller
+            aside = self.reach + self._beside
+            boxes = np.tile(np.stack([start - aside, start + aside])[:, None], (1, self.robot.horizon + 1, 1))
+        else:
+            boxes = halfspace_kernels.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn)
+        return shades.PlanBoxes(boxes, self.robot.horizon * self.robot.period)
 
     def _unseen(self, scan: Scan, start: Array) -> seen.OccupiedCells | None:
         """Return the cells that a scan does not show to be free, within reach or able to come there during a plan."""
@@ -286,7 +337,12 @@ class TubeConstraints:
     def predict(self, local_map: LocalMap, z: Array) -> Prediction:
         """Return the predicted set of the next measured state, all coordinates (docs/method.md §2)."""
         center, half = tube_kernels.next_state(
-            *self._next, self._regressor(z), np.ascontiguousarray(local_map.start), local_map.turn
+            *self._next,
+            self._regressor(z),
+            self._first,
+            self.widening,
+            np.ascontiguousarray(local_map.start),
+            local_map.turn,
         )
         if self.robot.heading is not None:
             center[self.robot.heading] += local_map.heading
@@ -318,7 +374,7 @@ class TubeConstraints:
             start, measured = local_map.start, self.measured
             if disc.aside:
                 start, measured = start + local_map.turn @ disc.at, measured + disc.swing
-            ends = tube_kernels.places(disc.position, z, start, local_map.turn)
+            ends = tube_kernels.places(disc.position, disc.offset, z, start, local_map.turn)
             beside = []
             if len(local_map.near) or local_map.unseen is None:
                 beside.append(half_spaces(local_map.near, start, ends, disc.radius, measured))
@@ -353,12 +409,17 @@ class TubeConstraints:
         """
         planes = planes or self.planes(local_map, z)
         discs = zip(self.discs, planes, strict=True)
-        parts = [disc.layout.rows(self._turned(plane.normals, local_map), plane.offsets) for disc, plane in discs]
+        parts = [
+            disc.layout.rows(self._turned(plane.normals, local_map), plane.offsets, self.widening)
+            for disc, plane in discs
+        ]
         return stack_rows(parts + self._further(local_map, z))
 
     def slack(self, local_map: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
         """Return `bound - support` (rows,) of the same rows."""
         sizes = tube_kernels.magnitudes(*self._sized, z)
+        if self.widening != 1.0:
+            sizes *= self.widening
         found = [
             disc.layout.slack(self._turned(plane.normals, local_map), plane.offsets, sizes, z)
             for disc, plane in zip(self.discs, planes or self.planes(local_map, z), strict=True)
@@ -377,9 +438,9 @@ class TubeConstraints:
             nominal = local_map.start + self.tube.centers(z) @ local_map.turn.T
             body = self.robot.footprint
             kept = reservation_half_spaces(local_map.other_reservations, local_map.start, nominal, body, self.measured)
-            parts.append(self.boxes.rows(*kept, local_map.turn))
+            parts.append(self._boxes.rows(*kept, local_map.turn, self.widening))
         if self.limits is not None:
-            parts.append(self.limits.rows(local_map.start, local_map.heading, local_map.turn))
+            parts.append(self.limits.rows(local_map.start, local_map.heading, local_map.turn, self.widening))
         return parts
 
     def worst_of(

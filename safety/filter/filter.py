@@ -12,6 +12,7 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter_ns
@@ -21,13 +22,14 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.filter.blocking_constraint import BlockingConstraint
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes
 from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.plan_inputs import PlanInputs
 from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows, QPBuilder
 from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
+from brakeline.safety.filter.reachable_tube import RolloutTube
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import (
     ADJUSTED,
@@ -49,6 +51,7 @@ from brakeline.safety.perception.scan_free_space import shows_free
 
 Array = NDArray[np.float64]
 
+LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -86,6 +89,15 @@ class _Candidate:
     constraints: TubeConstraints
     continues: bool = False
     for_clearance: bool = False
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    """Rows of a plan's surroundings, with the tube and the half-spaces that they come from."""
+
+    constraints: TubeConstraints
+    rows: ConstraintRows
+    planes: list[Planes]
 
 
 class Filter:
@@ -157,11 +169,15 @@ class Filter:
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
         return float(self._constraints_for(z).tube.half_widths(z)[-1].max())
 
-    def _constraints_for(self, z: Array) -> TubeConstraints:
-        """Return the constraints for the plan with regressors z: those of plans in place, or those of all plans."""
+    def _turns_in_place(self, z: Array) -> bool:
+        """Return whether the plan with regressors z belongs to those in place, which have their own tube."""
+        return self.in_place is not None and tube_kernels.within(z, self.in_place[0])
+
+    def _constraints_for(self, z: Array, widening: float = 1.0) -> TubeConstraints:
+        """Return the constraints for the plan with regressors z: of plans in place, or of all plans; exact for z."""
         if self.in_place is not None and tube_kernels.within(z, self.in_place[0]):
-            return self.in_place[1]
-        return self.constraints
+            return self.in_place[1].at(z, widening)
+        return self.constraints.at(z, widening)
 
     # --- one decision ------------------------------------------------------------------------------------------
 
@@ -194,7 +210,8 @@ class Filter:
         if blind:
             record.reason = blind
         elif in_domain:
-            candidate = self._search(local_map, z_0, proposal, record)
+            committed = request.plan[self.robot.committed_steps : self.robot.free_steps].ravel()
+            candidate = self._search(local_map, z_0, proposal, committed, record)
         else:
             record.reason = "the state is outside the domain that was recorded"
         if candidate is None:
@@ -203,46 +220,105 @@ class Filter:
                 candidate = self._recovered(request, local_map, z_0) or candidate
         return self._decision(request, local_map, candidate, record)
 
-    def _search(self, local_map: LocalMap, z_0: Array, proposal: Array, record: _Record) -> _Candidate | None:
-        """Return the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal."""
+    def _search(
+        self, local_map: LocalMap, z_0: Array, proposal: Array, committed: Array, record: _Record
+    ) -> _Candidate | None:
+        """Return the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal.
+
+        committed: free inputs of the committed plan.
+        """
         z = self.inputs.regressors(z_0, proposal)
         if local_map.empty and not self.constraints.far and self.constraints.limits is None:
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, self.reach, True, self._constraints_for(z))
-        constraints = self._constraints_for(z)
+            constraints = self._constraints_for(z, local_map.widening)
+            return _Candidate(ALLOWED, self.inputs.plan(z), z, self.reach, True, constraints)
+        constraints, general = self._constraints_for(z, local_map.widening), self.constraints.at(z, local_map.widening)
         planes = constraints.planes(local_map, z)
         slack = constraints.slack(local_map, z, planes)
         margin = constraints.least(slack, z)
+        allowed = _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
         # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
-        if margin >= (max(self.clearance_margin, 0.0) if constraints is self.constraints else 0.0):
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-        rows = self.constraints.rows(local_map, z, planes)
+        if margin >= (0.0 if self._turns_in_place(z) else max(self.clearance_margin, 0.0)):
+            return allowed
+        rows = general.rows(local_map, z, planes)
         if constraints.least(slack - self.clearance_margin * rows.keep, z, self.clearance_margin) >= 0.0:
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-        kept = self._with_clearance_margin(rows, z_0, proposal)
-        if margin >= 0.0 and self.constraints.margin(kept, z) >= 0.0:
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
+            return allowed
+        proposed = _Linearized(general, rows, planes)
+        kept = self._with_clearance_margin(local_map, proposed, z_0, proposal)
+        if margin >= 0.0 and general.margin(kept, z) >= 0.0:
+            return allowed
         record.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
         kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
         record.blocked_by = constraints.worst_of(local_map, z, slack, planes, kept_off)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.
         adjusted = None
-        for choice in (kept, rows):
-            if choice is rows and margin >= 0.0:
-                return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-            if not np.isfinite(choice.bound).all():
-                break
-            candidate = self._closest(choice, z_0, proposal, record)
-            if candidate is not None and self.constraints.margin(choice, candidate) >= 0.0:
-                plan, room = self.inputs.plan(candidate), self.constraints.margin(rows, candidate)
-                adjusted = _Candidate(
-                    ADJUSTED, plan, candidate, room, True, self.constraints, for_clearance=margin >= 0.0
-                )
+        for with_clearance in (True, False):
+            if not with_clearance and margin >= 0.0:
+                return allowed
+            starts = self._starting_points(local_map, proposed, z_0, committed)
+            found = (self._solve(local_map, start, z_0, proposal, with_clearance, record) for start in starts)
+            adjusted = next((candidate for candidate in found if candidate is not None), None)
+            if adjusted is not None:
+                adjusted = replace(adjusted, for_clearance=margin >= 0.0)
                 break
         adjusted = self._turned_only(local_map, z_0, proposal, adjusted) or adjusted
         if adjusted is None:
             record.reason += "; no verified input was found"
         return adjusted
+
+    def _starting_points(
+        self, local_map: LocalMap, proposed: _Linearized, z_0: Array, committed: Array
+    ) -> Iterator[_Linearized]:
+        """Yield the proposal; for a rollout also the committed plan and the strongest braking, linearised.
+
+        A linear tube has the same rows everywhere.
+        """
+        yield proposed
+        if not isinstance(self.tube, RolloutTube):
+            return
+        stop = self.inputs.regressors(z_0, self.inputs.nothing)
+        for z in (np.concatenate([z_0, self.inputs.within(committed, z_0[-self.robot.action_dim :])]), stop):
+            constraints = self.constraints.at(z, local_map.widening)
+            planes = constraints.planes(local_map, z)
+            yield _Linearized(constraints, constraints.rows(local_map, z, planes), planes)
+
+    def _solve(
+        self,
+        local_map: LocalMap,
+        start: _Linearized,
+        z_0: Array,
+        proposal: Array,
+        with_clearance: bool,
+        record: _Record,
+    ) -> _Candidate | None:
+        """Return the verified plan closest to the proposal, or None (docs/method.md §4, §13).
+
+        The QP is linear in the inputs; a rollout is not. If its answer is not verified, the filter linearises the
+        rollout there and solves the QP again.
+        """
+        at = start
+        for _ in range(LINEARIZATIONS):
+            choice = self._with_clearance_margin(local_map, at, z_0, proposal) if with_clearance else at.rows
+            if not np.isfinite(choice.bound).all():
+                return None
+            z = self._closest(choice, z_0, proposal, record)
+            if z is None:
+                return None
+            exact = at.constraints.at(z, local_map.widening)
+            if exact is at.constraints:  # a linear tube: the rows hold everywhere
+                if exact.margin(choice, z) < 0.0:
+                    return None
+                return _Candidate(ADJUSTED, self.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
+            planes = exact.planes(local_map, z)
+            rows = exact.rows(local_map, z, planes)
+            at = _Linearized(exact, rows, planes)
+            margin, needed = exact.margin(rows, z), 0.0
+            if with_clearance:
+                kept = self._with_clearance_margin(local_map, at, z_0, proposal)
+                needed = exact.least(kept.bound[: len(rows.bound)] - rows.support(exact.tube, z), z)
+            if margin >= 0.0 and needed >= 0.0:
+                return _Candidate(ADJUSTED, self.inputs.plan(z), z, margin, True, exact)
+        return None
 
     def _turned_only(
         self, local_map: LocalMap, z_0: Array, proposal: Array, adjusted: _Candidate | None
@@ -260,6 +336,7 @@ class Filter:
             adjusted is not None and self._off(adjusted.z, proposal) <= self._off(z, proposal)
         ):
             return None
+        constraints = constraints.at(z, local_map.widening)
         margin, for_clearance = constraints.margin_in(local_map, z), adjusted is not None and adjusted.for_clearance
         if margin < 0.0:
             return None
@@ -282,19 +359,23 @@ class Filter:
         free = self.inputs.within(self.builder.inputs(solution.x), z_0[-self.robot.action_dim :])
         return np.concatenate([z_0, free])
 
-    def _with_clearance_margin(self, rows: ConstraintRows, z_0: Array, proposal: Array) -> ConstraintRows:
+    def _with_clearance_margin(
+        self, local_map: LocalMap, at: _Linearized, z_0: Array, proposal: Array
+    ) -> ConstraintRows:
         """Tighten the rows by the clearance margin.
 
         Where turning in place would not keep the margin, two rows take the place of one: the row for free space alone,
         and a row that forbids inputs that move the robot nearer than the strongest braking does.
         """
-        before = z_0[-len(proposal) :]
+        rows, before = at.rows, z_0[-len(proposal) :]
         in_place = self.inputs.limited(np.where(self.standing, proposal, self.inputs.nothing), before)
         stay = self.inputs.regressors(z_0, in_place)
-        if self._constraints_for(stay) is not self.constraints:  # turns have their own tube: room to stand is enough
+        if self._turns_in_place(stay):  # turns have their own tube: room to stand is enough
             stay = self.inputs.regressors(z_0, self.inputs.limited(self.inputs.nothing, before))
         kept_off = self.clearance_margin * rows.keep
-        inside = rows.support(self.tube, stay) > rows.bound - kept_off
+        staying = at.constraints.at(stay, local_map.widening)
+        there = rows if staying is at.constraints else staying.rows(local_map, stay, at.planes)
+        inside = there.support(self.tube, stay) > there.bound - kept_off
         bound = np.where(inside, rows.bound, rows.bound - kept_off)
         if not inside.any():
             return ConstraintRows(rows.gradient, rows.spread, bound, rows.keep)
@@ -326,13 +407,13 @@ class Filter:
         chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if record.contained and vouched:
-            constraints = self._constraints_for(as_committed)
+            constraints = self._constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
             return _Candidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
         for z in (as_committed, brake):
-            constraints = self._constraints_for(z)
+            constraints = self._constraints_for(z, local_map.widening)
             margin = constraints.margin_in(local_map, z)
             if in_domain and margin >= 0.0:
                 return _Candidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
@@ -360,10 +441,11 @@ class Filter:
             seeming = 2.0 * float(np.linalg.norm(self.constraints.measured)) + (
                 self.clearance_margin if self.constraints.stays else 0.0
             )
-        if self._constraints_for(stand).margin_in(parked, stand) >= -seeming:
+        if self._constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
             return None
-        planes = self.constraints.planes(local_map, stand, leaving=True)
-        rows = self.constraints.rows(local_map, stand, planes)
+        constraints = self.constraints.at(stand, local_map.widening)
+        planes = constraints.planes(local_map, stand, leaving=True)
+        rows = constraints.rows(local_map, stand, planes)
         if not np.isfinite(rows.bound).all():  # an obstacle that is just touched, or NaN, has no known side
             return None
         standing = rows.support(self.tube, stand) - rows.bound
@@ -385,14 +467,15 @@ class Filter:
             z = self.inputs.regressors(z_0, self.inputs.limited(turn_towards(robot, local_map.heading, away), before))
             # A turn moves only the discs beside the measured position; they must not come nearer to anything.
             rows_of_disc = [rows_each * len(disc.normals) for disc in planes]
-            aside = np.repeat([disc.aside for disc in self.constraints.discs], rows_of_disc)
+            aside = np.repeat([disc.aside for disc in constraints.discs], rows_of_disc)
             swung = np.flatnonzero(aside)
             turned = standing[swung] + rows.gradient[swung] @ (z - stand)
             if not harmless(turned[None], standing[swung])[0]:
                 return None
         else:
             return None
-        return _Candidate(RECOVERING, self.inputs.plan(z), z, self.constraints.margin(rows, z), False, self.constraints)
+        margin, constraints = constraints.margin(rows, z), self.constraints.at(z, local_map.widening)
+        return _Candidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
 
     def _decision(self, request: Request, local_map: LocalMap, candidate: _Candidate, record: _Record) -> Decision:
         z, constraints = candidate.z, candidate.constraints
@@ -439,7 +522,8 @@ class Filter:
         self, constraints: TubeConstraints, start: Array, centers: Array, half: Array, z: Array
     ) -> Reservation:
         """Return the reservation of a tube with centers and half-widths (N, d), world, and regressors z."""
-        *chord_deviations, stopping_distance = constraints.tube.magnitudes(z)[constraints.tube.generators :]
+        lengths = constraints.widening * constraints.tube.magnitudes(z)[constraints.tube.generators :]
+        *chord_deviations, stopping_distance = lengths
         chord_deviations[-1] = max(chord_deviations[-1], stopping_distance)
         centers, half = np.vstack([start, centers]), np.vstack([constraints.measured, half])
         return Reservation.of(centers, half, self.robot.footprint + np.array(chord_deviations))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 ROW_TIGHTENING = 1e-6  # m by which the QP's rows are tighter, so that a rounded answer passes the exact check
 REGULARIZATION = 1e-4  # ε: weight of all other variables; with much less the solver needs thousands of iterations
@@ -45,9 +47,9 @@ class ObstacleRows:
     with the chord deviation of the period, and one for the last end with the stopping distance.
     """
 
-    def __init__(self, position: Array, directions: Array) -> None:
-        """Gather the parts of a tube. position (N, d, nz), directions (N, d, L): of the disc's center."""
-        N, d, nz = position.shape
+    def __init__(self, position: Array, offset: Array, directions: Array) -> None:
+        """Gather the parts of a tube: position (N, d, nz), offset (N, d), directions (N, d, L) of the disc's center."""
+        N, d, _ = position.shape
         L = directions.shape[2]
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
         ends = np.concatenate([at_start, at_end, [N]])
@@ -56,15 +58,27 @@ class ObstacleRows:
         most = int(used.sum(axis=1).max(initial=0))
         period = np.concatenate([at_start, at_start, [N - 1]])
         extra = L + np.concatenate([at_start, at_start, [N]])  # the chord deviations, then the stopping distance
-        end_maps = np.ascontiguousarray(np.concatenate([np.zeros((1, d, nz)), position])[ends])
         columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
         end_directions = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
-        self.parts = period, end_maps, end_directions, columns, extra
+        self.ends, self.period = ends, period
+        self.sets: tuple[Array, Index, Index] = end_directions, columns, extra
+        self.maps = self._maps(position, offset)
         self.sizes = L + N + 1
 
-    def rows(self, normals: Array, offsets: Array) -> ConstraintRows:
+    def _maps(self, position: Array, offset: Array) -> tuple[Array, Array]:
+        still = np.zeros((1, *position.shape[1:]))
+        return np.concatenate([still, position])[self.ends], np.concatenate([still[..., 0], offset])[self.ends]
+
+    def around(self, position: Array, offset: Array) -> ObstacleRows:
+        """Return the same rows around other centers."""
+        other = copy(self)
+        other.maps = self._maps(position, offset)
+        return other
+
+    def rows(self, normals: Array, offsets: Array, widening: float) -> ConstraintRows:
         """Return rows for half-spaces `a·p <= b` in the robot's frame, a (n, N, d), b (n, N)."""
-        gradient, spread, bound = halfspace_kernels.rows(normals, offsets, *self.parts, self.sizes)
+        parts = self.period, *self.maps, *self.sets
+        gradient, spread, bound = halfspace_kernels.rows(normals, offsets, *parts, self.sizes, widening)
         return ConstraintRows(gradient, spread, bound, np.ones(len(bound)))
 
     def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
@@ -72,7 +86,8 @@ class ObstacleRows:
 
         This is faster than building the rows: there may be hundreds, each as wide as the tube has generators.
         """
-        return halfspace_kernels.slack(normals, offsets, *self.parts, sizes, z)
+        parts = self.period, *self.maps, *self.sets
+        return halfspace_kernels.slack(normals, offsets, *parts, sizes, z)
 
 
 class QPBuilder:

@@ -1,19 +1,24 @@
 """The reachable tube of a plan, with its matrices stacked over the horizon when the model set is loaded.
 
-There are two ways to stack error bounds (docs/method.md §2): `stack_direct` has a predictor for each number of periods,
-and `stack_recursive` is the recursion of Lemma 2.
+There are three ways to stack error bounds (docs/method.md §2, §13): `stack_direct` has a predictor for each number of
+periods, `stack_recursive` is the recursion of Lemma 2, and `stack_rollout` rolls one learned period out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.error_bounds import ErrorBound
+
+if TYPE_CHECKING:
+    from brakeline.safety.model.one_step import Arguments, OneStep
 
 Array = NDArray[np.float64]
 
@@ -22,18 +27,19 @@ Array = NDArray[np.float64]
 class Tube:
     """The sets that contain the measured position at the end of each period i = 1..N, for regressors z.
 
-        p_i ∈ p_0 + R(θ_0) ( P_i z + Σ_l m_l(z) D_{i,l} [-1, 1] ),     m(z) = M |W z| + m_0
+        p_i ∈ p_0 + R(θ_0) ( P_i z + c_i + Σ_l m_l(z) D_{i,l} [-1, 1] ),     m(z) = M |W z| + m_0
 
-    so the support in a direction is linear in z and |W z| (docs/method.md §2, equation 2).
+    so the support in a direction is affine in z and |W z| (docs/method.md §2, equation 2).
 
     Attributes:
-        position (N, d, nz): P.
+        position (N, d, nz): P. offset (N, d): c, zero for a linear predictor.
         directions (N, d, L): D.
         W (q, nz): W.
         M (L+N+1, q), m_0 (L+N+1,): rows for the L generators, then the N chord deviations β_k, then the stopping
             distance σ.
-        more (N, r, nz), more_directions (N, r, L): the same for other predicted coordinates, which a limit or a
-            further disc of the body needs.
+        more (N, r, nz), more_directions (N, r, L), more_offset (N, r): the same for other predicted coordinates, which
+            a limit or a further disc of the body needs.
+        first (n,): what a predictor that is not linear adds to the prediction of all coordinates after one period.
     """
 
     position: Array
@@ -43,6 +49,13 @@ class Tube:
     m_0: Array
     more: Array
     more_directions: Array
+    offset: Array
+    more_offset: Array
+    first: Array = field(default_factory=lambda: np.zeros(0))
+
+    def at(self, z: Array) -> Tube:
+        """Return a tube that equals this one for regressors z (nz,), with centers that are affine in z."""
+        return self
 
     @property
     def horizon(self) -> int:
@@ -53,8 +66,12 @@ class Tube:
         return int(self.directions.shape[2])
 
     def centers(self, z: Array) -> Array:
-        """Return the centers P_i z (N, d) for one z (nz,)."""
-        return np.asarray(self.position @ z)
+        """Return the centers P_i z + c_i (N, d) for one z (nz,)."""
+        return np.asarray(self.position @ z + self.offset)
+
+    def outputs(self, z: Array) -> tuple[Array, Array]:
+        """Return the centers (T, N, d), and those of the other predicted coordinates (T, N, r), for all z (T, nz)."""
+        return np.moveaxis(self.position @ z.T, -1, 0), np.moveaxis(self.more @ z.T, -1, 0)
 
     def magnitudes(self, z: Array) -> Array:
         """Return m(z) (..., L+N+1) for regressors z (..., nz)."""
@@ -93,7 +110,71 @@ def stack_direct(
     m_0 = np.concatenate([m0 for _, _, m0 in atoms])
     W, M = _merged(W, M[rows])
     centers, directions = np.stack([c.C[coordinates] for c in steps]), directions[:, :, useful]
-    return Tube(centers[:, :d], directions[:, :d], W, M, m_0[rows], centers[:, d:], directions[:, d:])
+    return _tube(centers, directions, W, M, m_0[rows], d)
+
+
+def _tube(centers: Array, directions: Array, W: Array, M: Array, m_0: Array, d: int) -> Tube:
+    """Return a tube with linear centers (N, d + r, nz) and directions (N, d + r, L), position first."""
+    still = np.zeros(centers.shape[:2])
+    of_position = centers[:, :d], directions[:, :d]
+    return Tube(*of_position, W, M, m_0, centers[:, d:], directions[:, d:], still[:, :d], still[:, d:])
+
+
+@dataclass(frozen=True)
+class RolloutTube(Tube):
+    """A tube around the rollout of one learned period (docs/method.md §13). Its own linear centers are zero.
+
+    Attributes:
+        robot, one_step: the predictor, and the robot that it is about.
+        inputs_of (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs.
+        kept (r,): indices of the coordinates in `more`.
+    """
+
+    robot: Robot = field(kw_only=True)
+    one_step: OneStep = field(kw_only=True)
+    inputs_of: Array = field(kw_only=True)
+    kept: tuple[int, ...] = field(kw_only=True)
+
+    @cached_property
+    def _arguments(self) -> Arguments:
+        return self.one_step.arguments(self.robot)
+
+    def at(self, z: Array) -> Tube:
+        """Linearise the rollout at z: the centers are exact there, and affine everywhere."""
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        outputs, gradient = rollout_kernels.linearized(*self._arguments, z, self.inputs_of)
+        offset, d, kept = outputs - gradient @ z, self.position.shape[1], list(self.kept)
+        n = self.robot.state_dim
+        return Tube(
+            np.ascontiguousarray(gradient[:, :d]),
+            self.directions,
+            self.W,
+            self.M,
+            self.m_0,
+            gradient[:, kept],
+            self.more_directions,
+            offset[:, :d],
+            offset[:, kept],
+            outputs[0, :n],
+        )
+
+    def centers(self, z: Array) -> Array:
+        """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""
+        return np.asarray(self.outputs(z[None])[0][0])
+
+    def outputs(self, z: Array) -> tuple[Array, Array]:
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        found = rollout_kernels.rollouts(*self._arguments, np.ascontiguousarray(z @ self.inputs_of.T))
+        return found[..., : self.position.shape[1]], found[..., list(self.kept)]
+
+
+def stack_rollout(linear: Tube, robot: Robot, one_step: OneStep, inputs_of: Array, more: Sequence[int]) -> RolloutTube:
+    """Return the tube around a rollout, with the sets of a tube that was stacked from zero predictors."""
+    fields = {name: getattr(linear, name) for name in Tube.__dataclass_fields__}
+    whole = np.ascontiguousarray(inputs_of, dtype=float)
+    return RolloutTube(**fields, robot=robot, one_step=one_step, inputs_of=whole, kept=tuple(more))
 
 
 @dataclass(frozen=True)
@@ -198,7 +279,7 @@ def stack_recursive(
     M = _block_diagonal([M, *(m for _, m, _ in extra)])
     W, M = _merged(W, M)
     m_0, stack_rows, d = np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), np.stack(centers), position_dim
-    return Tube(stack_rows[:, :d], directions[:, :d], W, M, m_0, stack_rows[:, d:], directions[:, d:])
+    return _tube(stack_rows, directions, W, M, m_0, d)
 
 
 def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:

@@ -137,10 +137,11 @@ class ReservationRows:
     period occur once more with the stopping distance.
     """
 
-    def __init__(self, position: Array, directions: Array) -> None:
-        """Position (N, d, nz), directions (N, d, L): the tube's."""
+    def __init__(self, position: Array, offset: Array, directions: Array) -> None:
+        """Position (N, d, nz), offset (N, d), directions (N, d, L): the tube's."""
         N, d, nz = position.shape
         self._position = np.concatenate([np.zeros((1, d, nz)), position])
+        self._offset = np.concatenate([np.zeros((1, d)), offset])
         self._directions = np.concatenate([np.zeros((1, d, directions.shape[2])), directions])
         choices = np.array(list(product((0, 1), repeat=d)))  # (2^d, d)
         self.period = np.repeat([*range(N), N - 1], len(choices))  # (R,)
@@ -148,22 +149,21 @@ class ReservationRows:
         self._extra = np.eye(N + 1)[np.repeat(np.arange(N + 1), len(choices))]
         self._axis = np.arange(d)
 
-    def rows(self, normals: Array, offsets: Array, turn: Array) -> ConstraintRows:
+    def rows(self, normals: Array, offsets: Array, turn: Array, widening: float) -> ConstraintRows:
         """Return rows for half-spaces `a·p <= b` relative to the robot's position, a (n, N, d) in the world, b (n, N).
 
-        turn (d, d): rotation from the robot's frame to the world.
+        turn (d, d): rotation from the robot's frame to the world. widening: factor on the sets.
         """
         n = len(normals)
         center = (turn @ self._position)[self._end, self._axis]  # (R, d, nz)
+        known = (self._offset @ turn.T)[self._end, self._axis]  # (R, d)
         half = np.abs(turn @ self._directions)[self._end, self._axis]  # (R, d, L)
         normals = normals[:, self.period]  # (n, R, d)
         gradient = np.einsum("nrd,rdz->nrz", normals, center).reshape(n * len(self.period), -1)
         spread = np.einsum("nrd,rdl->nrl", np.abs(normals), half).reshape(len(gradient), -1)
-        extra = np.tile(self._extra, (n, 1))
+        extra, bound = np.tile(self._extra, (n, 1)), offsets[:, self.period] - np.einsum("nrd,rd->nr", normals, known)
         from brakeline.safety.filter.qp import (
             ConstraintRows,  # here, since a client keeps reservations but needs no solver
         )
 
-        return ConstraintRows(
-            gradient, np.hstack([spread, extra]), offsets[:, self.period].ravel(), np.ones(len(gradient))
-        )
+        return ConstraintRows(gradient, widening * np.hstack([spread, extra]), bound.ravel(), np.ones(len(gradient)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,27 +35,38 @@ class StateLimits:
         if robot.heading is not None:
             self.turn = weights[:, robot.heading]
         kept = [i for i in extra_coordinates(robot) if i < n]
-        other = weights[:, kept]
-        which = [extra_coordinates(robot).index(i) for i in kept]
-        maps = np.concatenate([tube.more, tube.more_directions], axis=2)[:, which]
-        self.rest = np.einsum("cr,nrz->ncz", other, maps).reshape(N, self.count, maps.shape[2])
-        self.path = np.concatenate([tube.position, tube.directions], axis=2)  # (N, d, nz + L)
-        self.nz, self.extra = tube.position.shape[2], np.eye(N + 1)
+        self.other, self.which = weights[:, kept], [extra_coordinates(robot).index(i) for i in kept]
+        self.nz, self.extra, self.ends = tube.position.shape[2], np.eye(N + 1), np.append(np.arange(N), N - 1)
+        self._around(tube)
 
-    def rows(self, start: Array, heading: float, turn: Array) -> ConstraintRows:
-        """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world."""
-        N = len(self.path)
-        both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L)
-        bound = self.most - self.place @ start - self.turn * heading
+    def _around(self, tube: Tube) -> None:
+        """Gather the maps of a tube: columns for z, for the generators, and for the constant."""
+        N = tube.horizon
+        maps = np.concatenate([tube.more, tube.more_directions, tube.more_offset[..., None]], axis=2)[:, self.which]
+        self.rest = np.einsum("cr,nrz->ncz", self.other, maps).reshape(N, self.count, maps.shape[2])
+        self.path = np.concatenate([tube.position, tube.directions, tube.offset[..., None]], axis=2)
+
+    def around(self, tube: Tube) -> StateLimits:
+        """Return the limits of the same robot around another tube."""
+        other = copy(self)
+        other._around(tube)
+        return other
+
+    def rows(self, start: Array, heading: float, turn: Array, widening: float) -> ConstraintRows:
+        """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world.
+
+        widening: factor on the sets.
+        """
+        both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L + 1)
+        both = both[self.ends]
+        bound = self.most - self.place @ start - self.turn * heading - both[..., -1]
         way = np.linalg.norm(self.place, axis=1)
-        ends = np.concatenate([np.arange(N), [N - 1]])
-        both = both[ends]
         # The chord deviation of every period, and the stopping distance at the last end.
         extra = self.extra[:, None, :] * way[None, :, None]
         gradient = both[..., : self.nz].reshape(-1, self.nz)
-        spread = np.concatenate([np.abs(both[..., self.nz :]), extra], axis=2)
+        spread = widening * np.concatenate([np.abs(both[..., self.nz : -1]), extra], axis=2)
         count = len(gradient)
-        return ConstraintRows(gradient, spread.reshape(count, -1), np.tile(bound, N + 1), np.zeros(count))
+        return ConstraintRows(gradient, spread.reshape(count, -1), bound.ravel(), np.zeros(count))
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:

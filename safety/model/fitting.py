@@ -74,7 +74,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
     if kind == PLAN:
         stopping_distance = _stopping_distance_of_plans(whole, model_config)
     else:
-        stopping_distance = np.zeros(nz), _stopping_distance_of_stops(data, model_config)
+        stopping_distance = np.zeros(nz), stopping_distance_of_stops(data, model_config)
     known = windows(data, 1).z[:, : robot.regressor_dim]
     domain = np.stack([known.min(0), known.max(0)])
     about = data.about | {"data": data.digest(), "periods": str(data.periods)}
@@ -146,7 +146,7 @@ def _stopping_distance_of_plans(whole: Windows, model_config: ModelConfig) -> tu
     return envelope(np.abs(whole.z[still]), whole.stopping_distance[still], model_config.inflation)
 
 
-def _stopping_distance_of_stops(data: Dataset, model_config: ModelConfig) -> float:
+def stopping_distance_of_stops(data: Dataset, model_config: ModelConfig) -> float:
     """Return one bound [m] of the stopping distance for all plans.
 
     It comes from all times at which the inputs had been those of a stop for as long as at the end of a plan.

@@ -16,13 +16,15 @@ from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import FORMER_LAYOUTS, REAL_TIME_SUFFIX, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
-from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive
+from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN
 from brakeline.safety.model.model_config import MODES as MODES
+from brakeline.safety.model.model_config import ONE_STEP as ONE_STEP
 from brakeline.safety.model.model_config import RECURSION as RECURSION
 from brakeline.safety.model.model_config import ModelConfig as ModelConfig
+from brakeline.safety.model.one_step import OneStep
 from brakeline.safety.model.tensor_file import content, pack, unpack
 from brakeline.safety.model.turning_in_place import InPlace
 from brakeline.safety.model.windows import plan_regressor_map
@@ -40,7 +42,8 @@ class ModelSet:
     """The predictors of a robot with all their error bounds; its version is a hash of the content.
 
     Attributes:
-        steps: in mode direct, bound k is about k+1 periods from z; in mode recursion, about period k from z_k.
+        steps: in the modes direct and one-step, bound k is about k+1 periods from z; in mode recursion, about period k
+            from z_k. In mode one-step they have no predictor (zeros): `one_step` predicts.
         chord_deviations: N rows, β_k(z). stopping_distance: one row, σ(z). In files: "bulges" and "latch".
     """
 
@@ -55,6 +58,7 @@ class ModelSet:
     layout: str = ""  # layout of the robot, for model sets older than descriptions in files
     stands: int = 0  # periods after which a plan has brought the robot to a stand; 0: at its end
     in_place: InPlace | None = None  # predictors for plans in place, if the data support them
+    one_step: OneStep | None = None  # the predictor of mode one-step
 
     @property
     def moving(self) -> int:
@@ -69,7 +73,7 @@ class ModelSet:
     def first_regressor(self, z: Array) -> Array:
         """Return the regressor of `first` from z (..., nz): [...; input in force; first input]."""
         robot = self.robot
-        if self.model_config.mode == DIRECT:
+        if self.model_config.mode != RECURSION:
             return z if self.model_config.windows == PLAN else z @ plan_regressor_map(robot).T
         reg, m = len(robot.regressor), robot.action_dim
         missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
@@ -101,9 +105,9 @@ class ModelSet:
         """Raise BadModel unless every array has the size that robot and mode require."""
         robot = self.robot
         nz = regressors(robot, self.model_config)
-        one = nz if self.model_config.mode == DIRECT else robot.state_dim - robot.position_dim + 2 * robot.action_dim
+        one = nz if self.model_config.mode != RECURSION else robot.state_dim - robot.position_dim + 2 * robot.action_dim
         n = robot.state_dim
-        if self.model_config.mode == DIRECT:
+        if self.model_config.mode != RECURSION:
             n += robot.position_dim * sum(disc.arm > 0.0 for disc in robot.body)
         expected = [(step, n, one) for step in self.steps]
         if self.in_place is not None:
@@ -117,6 +121,12 @@ class ModelSet:
                 raise BadModel(
                     f"the model set's arrays are not those of a {robot.name} robot in mode {self.model_config.mode}"
                 )
+        if (self.one_step is not None) != (self.model_config.mode == ONE_STEP):
+            raise BadModel(f"a model set of mode {ONE_STEP} has a predictor of one period, and no other has one")
+        if self.one_step is not None:
+            if self.model_config.windows != FREE or any(step.C.any() for step in self.steps):
+                raise BadModel(f"a model set of mode {ONE_STEP} is of free driving and predicts by its rollout alone")
+            self.one_step.check(robot)
         if self.domain.shape != (2, robot.regressor_dim) or (self.domain[0] > self.domain[1]).any():
             raise BadModel("the model set's domain is none")
         box = np.zeros((2, robot.regressor_dim + robot.action_dim)) if self.in_place is None else self.in_place.box
@@ -137,9 +147,13 @@ class ModelSet:
         if plans and self.model_config.windows == FREE:
             T = plan_regressor_map(self.robot)
             chord_deviations, stopping_distance = chord_deviations.through(T), stopping_distance.through(T)
-            steps = [step.through(T) for step in steps] if self.model_config.mode == DIRECT else steps
-        if self.model_config.mode == DIRECT:
-            return stack_direct(steps, d, chord_deviations, stopping_distance, more)
+            steps = [step.through(T) for step in steps] if self.model_config.mode != RECURSION else steps
+        if self.model_config.mode != RECURSION:
+            tube = stack_direct(steps, d, chord_deviations, stopping_distance, more)
+            if self.one_step is None:
+                return tube
+            inputs_of = plan_regressor_map(self.robot) if plans else np.eye(regressors(self.robot, self.model_config))
+            return stack_rollout(tube, self.robot, self.one_step, inputs_of, more)
         how = recursion_maps(self.robot, plans or self.model_config.windows == PLAN)
         return stack_recursive(steps, how, d, chord_deviations, stopping_distance, more=more)
 
@@ -159,6 +173,8 @@ class ModelSet:
         if self.in_place is not None:
             named |= {f"{IN_PLACE}{k}": c for k, c in enumerate(self.in_place.steps)}
             more |= {BOX: self.in_place.box}
+        if self.one_step is not None:
+            more |= self.one_step.tensors()
         return {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS} | more
 
     def encode(self) -> bytes:
@@ -190,6 +206,7 @@ class ModelSet:
                 names += [f"{IN_PLACE}{k}" for k in range(robot.horizon)]
             bounds = {name: ErrorBound(*(tensors[f"{name}.{t}"] for t in TENSORS)) for name in names}
             more = tensors["domain"], tensors["basis"], dict(about["about"])
+            one_step = OneStep.of_tensors(tensors) if model_config.mode == ONE_STEP else None
             stands = int(about.get("stands", 0))
         except (KeyError, TypeError, ValueError, UnknownRobot) as error:
             raise BadModel(f"no model set: {error!r}") from error
@@ -208,7 +225,7 @@ class ModelSet:
             in_place = InPlace(tuple(bounds[f"{IN_PLACE}{k}"] for k in range(robot.horizon)), tensors[BOX])
         chord_deviations, stopping_distance = bounds["bulges"], bounds["latch"]
         model = ModelSet(
-            robot, model_config, steps, chord_deviations, stopping_distance, *more, layout, stands, in_place
+            robot, model_config, steps, chord_deviations, stopping_distance, *more, layout, stands, in_place, one_step
         )
         model._check_sizes()
         if model.version != about.get("version"):

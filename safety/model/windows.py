@@ -128,13 +128,13 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
     before = np.vstack([earlier, t.inputs])[start]
     z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen])
     y = displacement(robot, t.states[start], t.states[start + k])
-    off, travel = _ways(robot, t)
+    off, travel = ways(robot, t)
     chord_deviation = (off + data.chord_deviation)[start + k - 1]
     stopping_distance = travel[np.minimum(start + k, len(t.inputs))]
     return Windows(z, y, chord_deviation, stopping_distance, np.column_stack([np.full(len(start), number), start]))
 
 
-def _ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+def ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
     """Return the chord deviation of each period and the stopping distance from each sample on.
 
     The result is cached for each trajectory, since windows of all lengths need it.
@@ -252,7 +252,7 @@ def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
     lasted = np.zeros(len(still) + 1, dtype=int)
     for i, rests in enumerate(still):
         lasted[i + 1] = lasted[i] + 1 if rests else 0
-    travel = _ways(robot, t)[1]
+    travel = ways(robot, t)[1]
     return np.asarray(travel[(lasted == rested) & ~np.isnan(travel)])
 
 

@@ -1,9 +1,11 @@
 """The filter's compiled kernels in plain NumPy: each function has the name and the arguments of its kernel."""
 
+from itertools import pairwise
+
 import numpy as np
 
 
-def rows(normals, offsets, period, end_maps, end_directions, columns, extra, sizes):
+def rows(normals, offsets, period, end_maps, end_offset, end_directions, columns, extra, sizes, widening):
     """`halfspace_kernels.rows`."""
     n, ends = len(normals), len(period)
     a = normals[:, period]  # (n, E, d)
@@ -13,13 +15,14 @@ def rows(normals, offsets, period, end_maps, end_directions, columns, extra, siz
     for end in range(ends):
         spread[:, end, columns[end]] = along[:, end]
         spread[:, end, extra[end]] = 1.0
-    return gradient.reshape(n * ends, -1), spread.reshape(n * ends, -1), offsets[:, period].ravel()
+    bound = offsets[:, period] - np.einsum("ned,ed->ne", a, end_offset)
+    return gradient.reshape(n * ends, -1), widening * spread.reshape(n * ends, -1), bound.ravel()
 
 
-def slack(normals, offsets, period, end_maps, end_directions, columns, extra, magnitudes, z):
+def slack(normals, offsets, period, end_maps, end_offset, end_directions, columns, extra, magnitudes, z):
     """`halfspace_kernels.slack`."""
-    parts = normals, offsets, period, end_maps, end_directions, columns, extra
-    gradient, spread, bound = rows(*parts, len(magnitudes))
+    parts = normals, offsets, period, end_maps, end_offset, end_directions, columns, extra
+    gradient, spread, bound = rows(*parts, len(magnitudes), 1.0)
     return bound - gradient @ z - spread @ magnitudes
 
 
@@ -48,13 +51,15 @@ def reachable(low, high, change, before):
     return 0.5 * (least + most).ravel(), 0.5 * (most - least).ravel()
 
 
-def filled_by_plans(W, W_free, M, m_0, position, position_free, directions, z, radius, beside, start, turn):
+def filled_by_plans(
+    W, W_free, M, m_0, position, offset, position_free, directions, widening, z, radius, beside, start, turn
+):
     """`halfspace_kernels.filled_by_plans`."""
     generators = directions.shape[2]
-    sizes = M @ (np.abs(W @ z) + W_free @ radius) + m_0
+    sizes = widening * (M @ (np.abs(W @ z) + W_free @ radius) + m_0)
     half = beside + sizes[generators:].max() + position_free @ radius + directions @ sizes[:generators]  # (N, d)
     half = half @ np.abs(turn).T
-    middle = start + position @ z @ turn.T
+    middle = start + (position @ z + offset) @ turn.T
     middle, half = np.vstack([start, middle]), np.vstack([half[0], half])
     return np.stack([middle - half, middle + half])
 
@@ -70,29 +75,29 @@ def magnitudes(W_t, M_t, m_0, z):
     return M_t.T @ np.abs(W_t.T @ z) + m_0
 
 
-def places(position, z, start, turn):
+def places(position, offset, z, start, turn):
     """`tube_kernels.places`."""
-    return start + position @ z @ turn.T
+    return start + (position @ z + offset) @ turn.T
 
 
-def sets(W_t, M_t, m_0, position, directions, z, start, turn, measured):
+def sets(W_t, M_t, m_0, position, offset, directions, widening, z, start, turn, measured):
     """`tube_kernels.sets`."""
-    sizes = magnitudes(W_t, M_t, m_0, z)[: directions.shape[2]]
-    return places(position, z, start, turn), measured + np.abs(turn @ directions) @ sizes
+    sizes = widening * magnitudes(W_t, M_t, m_0, z)[: directions.shape[2]]
+    return places(position, offset, z, start, turn), measured + np.abs(turn @ directions) @ sizes
 
 
-def extent(W_t, M_t, m_0, position, directions, z, body):
+def extent(W_t, M_t, m_0, position, offset, directions, widening, z, body):
     """`tube_kernels.extent`."""
-    sizes, generators = magnitudes(W_t, M_t, m_0, z), directions.shape[2]
-    corner = np.abs(position @ z) + np.abs(directions) @ sizes[:generators]
+    sizes, generators = widening * magnitudes(W_t, M_t, m_0, z), directions.shape[2]
+    corner = np.abs(position @ z + offset) + np.abs(directions) @ sizes[:generators]
     return np.linalg.norm(corner, axis=1).max() + body + sizes[generators:].max()
 
 
-def next_state(C, W_t, M_t, kappa_t, w, widths, z, start, turn):
+def next_state(C, W_t, M_t, kappa_t, w, widths, z, first, widening, start, turn):
     """`tube_kernels.next_state`."""
-    center = C @ z
+    center = first + C @ z
     center[: len(start)] = start + turn @ center[: len(start)]
-    return center, widths @ (magnitudes(W_t, M_t, w, z) + kappa_t.T @ np.abs(z))
+    return center, widening * widths @ (magnitudes(W_t, M_t, w, z) + kappa_t.T @ np.abs(z))
 
 
 def hildreth_active_set(h, g, A, b, steps):
@@ -119,3 +124,33 @@ def clip_to_bounds(wanted, before, low, high, slew):
 def regressors_of_braking(z_0, braking, action):
     """`plan_inputs.regressors_of_braking`."""
     return np.concatenate([z_0, (braking * action).ravel()])
+
+
+def rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, z):
+    """`rollout_kernels.rollouts`."""
+    r, found = len(others), []
+    for window in z:
+        s, plan, p, angle, rows = window[:r], window[r:].reshape(-1, inputs), np.zeros(d), 0.0, []
+        for before, u in pairwise(plan):
+            v = np.concatenate([s, u, before])
+            bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
+            y = C @ np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
+            turn = np.eye(d)
+            turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+            p, s, row = p + turn @ y[:d], y[others], y.copy()
+            if heading >= 0:
+                angle += y[heading]
+                row[heading] = angle
+                turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+            row[:d] = p
+            rows.append(np.concatenate([row, *(p + turn @ arm - arm for arm in arms)]))
+        found.append(rows)
+    return np.array(found)
+
+
+def linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T):
+    """`rollout_kernels.linearized`: the gradient by central differences."""
+    parts, step = (C, scale, saturations, terms, others, heading, arms, d, inputs), 1e-6
+    ends = [rollouts(*parts, ((z + sign * step * np.eye(len(z))) @ T.T)) for sign in (1.0, -1.0)]
+    gradient = (ends[0] - ends[1]) / (2.0 * step)
+    return rollouts(*parts, (T @ z)[None])[0], np.moveaxis(gradient, 0, -1)

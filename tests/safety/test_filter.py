@@ -9,7 +9,7 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter import filter as filter_module
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
-from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.filter import Filter, _Linearized
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
@@ -100,7 +100,8 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         scene = ready.constraints.local_map(ask, z_0, ready.builder.reachable(ask.input_in_force))
         proposal = ready.inputs.limited(ask.action, ask.input_in_force)
         rows = ready.constraints.rows(scene, np.concatenate([z_0, proposal]))
-        kept = ready._with_clearance_margin(rows, z_0, proposal)
+        at = _Linearized(ready.constraints, rows, ready.constraints.planes(scene, np.concatenate([z_0, proposal])))
+        kept = ready._with_clearance_margin(scene, at, z_0, proposal)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:

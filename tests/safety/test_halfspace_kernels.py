@@ -21,7 +21,8 @@ def a_tube(rng: np.random.Generator, d: int, own: bool = True) -> Tube:
     magnitudes = np.abs(rng.normal(size=(L + N + 1, q)))
     nothing = np.zeros((N, 0, nz)), np.zeros((N, 0, L))
     m_0 = np.abs(rng.normal(size=L + N + 1))
-    return Tube(rng.normal(size=(N, d, nz)), directions, rng.normal(size=(q, nz)), magnitudes, m_0, *nothing)
+    constant = rng.normal(size=(N, d)), np.zeros((N, 0))
+    return Tube(rng.normal(size=(N, d, nz)), directions, rng.normal(size=(q, nz)), magnitudes, m_0, *nothing, *constant)
 
 
 def supports(tube: Tube, normals: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -44,12 +45,12 @@ def test_rows_and_slack_agree_with_the_definition(d: int, seed: int) -> None:
     tube = a_tube(rng, d, own=bool(seed % 2))
     normals, offsets = rng.normal(size=(4, tube.horizon, d)), rng.normal(size=(4, tube.horizon))
     z = rng.normal(size=tube.W.shape[1])
-    layout = ObstacleRows(tube.position, tube.directions)
-    rows = layout.rows(normals, offsets)
-    expected = supports(tube, normals, z)
-    assert rows.support(tube, z).reshape(expected.shape) == pytest.approx(expected, abs=1e-9)
-    left = layout.slack(normals, offsets, tube.magnitudes(z), z)
-    assert left == pytest.approx(rows.bound - rows.support(tube, z), abs=1e-9)
+    layout = ObstacleRows(tube.position, tube.offset, tube.directions)
+    rows = layout.rows(normals, offsets, 1.0)
+    period = [*range(tube.horizon), *range(tube.horizon), tube.horizon - 1]
+    expected = (offsets[:, period] - supports(tube, normals, z)).ravel()
+    assert rows.bound - rows.support(tube, z) == pytest.approx(expected, abs=1e-9)
+    assert layout.slack(normals, offsets, tube.magnitudes(z), z) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("what", ["normals", "offsets", "z"])
@@ -62,7 +63,7 @@ def test_nan_in_any_input_leaves_no_slack(what: str) -> None:
         "z": rng.normal(size=tube.W.shape[1]),
     }
     told[what].flat[0] = np.nan
-    layout, z = ObstacleRows(tube.position, tube.directions), told["z"]
+    layout, z = ObstacleRows(tube.position, tube.offset, tube.directions), told["z"]
     left = layout.slack(told["normals"], told["offsets"], tube.magnitudes(z), z)
     assert np.isnan(left).any()
 
@@ -106,7 +107,7 @@ def test_no_plan_leaves_the_boxes_of_all_plans(d: int, seed: int) -> None:
     whole = np.ascontiguousarray
     W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
     spans = np.abs(tube.directions)
-    parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), moved, spans
+    parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), tube.offset, moved, spans, 1.0
     low, high = filled_by_plans(*parts, z, radius, beside, start, turn)
     assert low.shape == (tube.horizon + 1, d)
     for share in rng.uniform(-1.0, 1.0, (50, free)):

@@ -4,7 +4,7 @@ A tube has E = 2N + 1 *ends* for each half-space of an obstacle: the start and t
 the plan once more. The arguments that describe them come from `qp.ObstacleRows`:
 
     period (E,): the period whose half-space holds at the end
-    end_maps (E, d, nz): linear maps from regressors z to the position at the end
+    end_maps (E, d, nz), end_offset (E, d): affine maps from regressors z to the position at the end
     end_directions (E, d, K), columns (E, K): generators that are not zero there, and their indices among all L
     extra (E,): index of the magnitude that is added in all directions: a chord deviation or the stopping distance
 
@@ -24,19 +24,21 @@ Index = NDArray[np.int64]
 
 @compiled(
     "Tuple((f8[:,::1], f8[:,::1], f8[::1]))"
-    "(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], i8)"
+    "(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[:,::1], i8[::1], i8, f8)"
 )
 def rows(
     normals: Array,
     offsets: Array,
     period: Index,
     end_maps: Array,
+    end_offset: Array,
     end_directions: Array,
     columns: Index,
     extra: Index,
     sizes: int,
+    widening: float,
 ) -> tuple[Array, Array, Array]:
-    """Return the rows (3) of half-spaces with normals a (n, N, d) and offsets b (n, N).
+    """Return the rows (3) of half-spaces with normals a (n, N, d) and offsets b (n, N). widening: factor on the sets.
 
     Returns:
         Gradient (n·E, nz), spread (n·E, sizes) and bound (n·E,).
@@ -48,23 +50,28 @@ def rows(
             row, normal = i * ends + e, normals[i, period[e]]
             bound[row] = offsets[i, period[e]]
             for axis in range(d):
+                bound[row] -= normal[axis] * end_offset[e, axis]
                 for j in range(nz):
                     gradient[row, j] += normal[axis] * end_maps[e, axis, j]
             for k in range(columns.shape[1]):
                 along = 0.0
                 for axis in range(d):
                     along += normal[axis] * end_directions[e, axis, k]
-                spread[row, columns[e, k]] = abs(along)
-            spread[row, extra[e]] = 1.0
+                spread[row, columns[e, k]] = abs(along) * widening
+            spread[row, extra[e]] = widening
     return gradient, spread, bound
 
 
-@compiled("f8[::1](f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8[::1], f8[::1])")
+@compiled(
+    "f8[::1]"
+    "(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8[::1], f8[::1])"
+)
 def slack(
     normals: Array,
     offsets: Array,
     period: Index,
     end_maps: Array,
+    end_offset: Array,
     end_directions: Array,
     columns: Index,
     extra: Index,
@@ -80,6 +87,7 @@ def slack(
     for e in range(ends):
         reached, at = np.full(n, sizes[extra[e]]), np.zeros(3)
         for axis in range(d):
+            at[axis] = end_offset[e, axis]
             for j in range(len(z)):
                 at[axis] += end_maps[e, axis, j] * z[j]
             for i in range(n):
@@ -186,8 +194,8 @@ def reachable(low: Array, high: Array, change: Array, before: Array) -> tuple[Ar
 
 
 @compiled(
-    "f8[:,:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1],"
-    " f8[::1], f8[::1], f8[:,::1])"
+    "f8[:,:,::1](f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:], f8[:,:,::1], f8[:,:,::1], f8, f8[::1],"
+    " f8[::1], f8[::1], f8[::1], f8[:,::1])"
 )
 def filled_by_plans(
     W: Array,
@@ -195,8 +203,10 @@ def filled_by_plans(
     M: Array,
     m_0: Array,
     position: Array,
+    offset: Array,
     position_free: Array,
     directions: Array,
+    widening: float,
     z: Array,
     radius: Array,
     beside: Array,
@@ -205,9 +215,10 @@ def filled_by_plans(
 ) -> Array:
     """Return corners (2, N+1, d), lower and upper, world, of boxes that contain all plans now and at each period's end.
 
-    W, M, m_0, position: of the tube. W_free, position_free: absolute values of their columns for the free inputs;
-    directions (N, d, L): absolute values of the tube's. The free inputs of a plan are within `radius` (F·m,) of those
-    in z. Each box is wider by beside (d,) and by the largest chord deviation or stopping distance.
+    W, M, m_0, position, offset: of the tube. W_free, position_free: absolute values of their columns for the free
+    inputs; directions (N, d, L): absolute values of the tube's; widening: factor on its sets. The free inputs of a plan
+    are within `radius` (F·m,) of those in z. Each box is wider by beside (d,) and by the largest chord deviation or
+    stopping distance.
     """
     (N, d, L), q = directions.shape, len(W)
     atoms, sizes = np.empty(q), m_0.copy()
@@ -221,11 +232,12 @@ def filled_by_plans(
     for k in range(len(sizes)):
         for i in range(q):
             sizes[k] += M[k, i] * atoms[i]
+        sizes[k] *= widening
     chord_deviation = sizes[L:].max()
     center_of, half, boxes = np.empty(d), np.empty(d), np.zeros((2, N + 1, d))
     for k in range(N):
         for axis in range(d):
-            center_of[axis], half[axis] = 0.0, beside[axis] + chord_deviation
+            center_of[axis], half[axis] = offset[k, axis], beside[axis] + chord_deviation
             for j in range(len(z)):
                 center_of[axis] += position[k, axis, j] * z[j]
             for j in range(len(radius)):

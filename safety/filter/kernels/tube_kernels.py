@@ -45,14 +45,14 @@ def magnitudes(W_t: Array, M_t: Array, m_0: Array, z: Array) -> Array:
     return sizes
 
 
-@compiled("f8[:,::1](f8[:,:,::1], f8[::1], f8[::1], f8[:,::1])")
-def places(position: Array, z: Array, start: Array, turn: Array) -> Array:
-    """Return the nominal positions (N, d) at the periods' ends, world: start + turn P_i z."""
+@compiled("f8[:,::1](f8[:,:,::1], f8[:,:], f8[::1], f8[::1], f8[:,::1])")
+def places(position: Array, offset: Array, z: Array, start: Array, turn: Array) -> Array:
+    """Return the nominal positions (N, d) at the periods' ends, world: start + turn (P_i z + c_i)."""
     (N, d, nz), moved = position.shape, np.empty(position.shape[1])
     nominal = np.empty((N, d))
     for k in range(N):
         for axis in range(d):
-            moved[axis] = 0.0
+            moved[axis] = offset[k, axis]
             for j in range(nz):
                 moved[axis] += position[k, axis, j] * z[j]
         for axis in range(d):
@@ -64,14 +64,16 @@ def places(position: Array, z: Array, start: Array, turn: Array) -> Array:
 
 @compiled(
     "Tuple((f8[:,::1], f8[:,::1]))"
-    "(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1])"
+    "(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:], f8[:,:,::1], f8, f8[::1], f8[::1], f8[:,::1], f8[::1])"
 )
 def sets(
     W_t: Array,
     M_t: Array,
     m_0: Array,
     position: Array,
+    offset: Array,
     directions: Array,
+    widening: float,
     z: Array,
     start: Array,
     turn: Array,
@@ -79,7 +81,7 @@ def sets(
 ) -> tuple[Array, Array]:
     """Return centers and half-widths (N, d), world, of boxes that contain the true positions at the periods' ends.
 
-    measured (d,): half-widths of the position's measurement error.
+    measured (d,): half-widths of the position's measurement error. widening: factor on the tube's sets.
     """
     (N, d, L), sizes = directions.shape, magnitudes(W_t, M_t, m_0, z)
     half, along = np.empty((N, d)), np.empty(L)
@@ -91,46 +93,68 @@ def sets(
                 for i in range(L):
                     along[i] += part * span[i]
             for i in range(L):
-                half[k, axis] += abs(along[i]) * sizes[i]
-    return places(position, z, start, turn), half
+                half[k, axis] += abs(along[i]) * sizes[i] * widening
+    return places(position, offset, z, start, turn), half
 
 
-@compiled("f8(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8)")
-def extent(W_t: Array, M_t: Array, m_0: Array, position: Array, directions: Array, z: Array, body: float) -> float:
+@compiled("f8(f8[:,::1], f8[:,::1], f8[::1], f8[:,:,::1], f8[:,:], f8[:,:,::1], f8, f8[::1], f8)")
+def extent(
+    W_t: Array,
+    M_t: Array,
+    m_0: Array,
+    position: Array,
+    offset: Array,
+    directions: Array,
+    widening: float,
+    z: Array,
+    body: float,
+) -> float:
     """Return the distance [m] from the start that no point of a body of radius `body` [m] exceeds in the tube."""
     (N, d, L), sizes, farthest = directions.shape, magnitudes(W_t, M_t, m_0, z), 0.0
     for k in range(N):
         square = 0.0
         for axis in range(d):
-            moved, width = 0.0, 0.0
+            moved, width = offset[k, axis], 0.0
             for j in range(len(z)):
                 moved += position[k, axis, j] * z[j]
             for i in range(L):
                 width += abs(directions[k, axis, i]) * sizes[i]
-            square += (abs(moved) + width) ** 2
+            square += (abs(moved) + widening * width) ** 2
         farthest = max(farthest, square)
-    return math.sqrt(farthest) + body + float(sizes[L:].max())
+    return math.sqrt(farthest) + body + widening * float(sizes[L:].max())
 
 
 @compiled(
     "Tuple((f8[::1], f8[::1]))"
-    "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[:,::1])"
+    "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8[::1], f8[:,::1])"
 )
 def next_state(
-    C: Array, W_t: Array, M_t: Array, kappa_t: Array, w: Array, widths: Array, z: Array, start: Array, turn: Array
+    C: Array,
+    W_t: Array,
+    M_t: Array,
+    kappa_t: Array,
+    w: Array,
+    widths: Array,
+    z: Array,
+    first: Array,
+    widening: float,
+    start: Array,
+    turn: Array,
 ) -> tuple[Array, Array]:
     """Return center and half-widths (n,) of the predicted set: bound (1) for one period, position in the world.
 
-    C (n, nz), W, M, kappa, w (g,): of the error bound; widths (n, g): absolute values of its generators.
+    C (n, nz), W, M, kappa, w (g,): of the error bound; widths (n, g): absolute values of its generators. first (n,):
+    prediction of a predictor that is not linear, or zeros. widening: factor on the set.
     """
     n, d, sizes = len(C), len(start), magnitudes(W_t, M_t, w, z)
     _add_product(kappa_t, np.abs(z), sizes)
     center, half, moved = np.zeros(n), np.zeros(n), np.zeros(d)
     for i in range(n):
+        center[i] = first[i]
         for j in range(len(z)):
             center[i] += C[i, j] * z[j]
         for j in range(len(sizes)):
-            half[i] += widths[i, j] * sizes[j]
+            half[i] += widths[i, j] * sizes[j] * widening
     for axis in range(d):
         for other in range(d):
             moved[axis] += turn[axis, other] * center[other]

@@ -1,0 +1,135 @@
+"""Predict one period from data, and roll the prediction out over a plan (docs/method.md §13).
+
+A robot that drives and turns moves by the product of speed and turn rate. A map that is linear in the inputs cannot
+represent this product, so its error bound must cover it. Here, one learned period is composed by geometry that holds
+exactly:
+
+    [Δp; Δθ; s⁺] = C φ(s, u, u₋)        p ← p + R(θ) Δp,   θ ← θ + Δθ,   s ← s⁺
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.errors import BadModel
+from brakeline.messaging.robot import Robot
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Arguments = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
+
+TENSOR = "one_step."  # prefix of the names in a file
+WIDTHS = (0.2, 0.5)  # of saturating features, as shares of the largest recorded difference of input and speed
+
+
+@dataclass(frozen=True)
+class Features:
+    """The features φ of one period: products of up to three primitives (see `rollout_kernels`).
+
+    Attributes:
+        scale (v,): units of the variables v = [s; u; input of the period before].
+        saturations (E, 3): [a, b, width] of each primitive tanh((v_a - v_b) / width).
+        terms (F, 3): indices of the primitives in each product. Index 0 is the constant 1.
+    """
+
+    scale: Array
+    saturations: Array
+    terms: Index
+
+    def __call__(self, v: Array) -> Array:
+        """Return the features (T, F) of variables v (T, v)."""
+        columns = [np.ones(len(v)), *(v / self.scale).T]
+        columns += [np.tanh((v[:, int(a)] - v[:, int(b)]) / width) for a, b, width in self.saturations]
+        p = np.stack(columns)
+        return np.asarray((p[self.terms[:, 0]] * p[self.terms[:, 1]] * p[self.terms[:, 2]]).T)
+
+
+def features_for(robot: Robot, v: Array, degree: int, lags: int, saturating: bool) -> Features:
+    """Return all monomials up to a degree, with saturating features if wanted.
+
+    Args:
+        robot: the robot.
+        v (T, v): recorded variables. They set the scales.
+        degree: the highest degree of the monomials, 1 to 3.
+        lags: 1 to use the input of the period before, 0 to leave it out.
+        saturating: add tanh of the difference of each input and the speed that follows it. An autopilot that limits
+            its acceleration answers like this.
+    """
+    count = len(robot.regressor) + robot.action_dim * (1 + lags)
+    scale = np.abs(v).max(0)
+    scale[scale <= 0.0] = 1.0
+    rows: list[tuple[float, float, float]] = []
+    if saturating:
+        for i, index in enumerate(robot.follows):
+            if index in robot.regressor:
+                a, b = len(robot.regressor) + i, robot.regressor.index(index)
+                most = float(np.abs(v[:, a] - v[:, b]).max())
+                rows += [(a, b, share * most) for share in WIDTHS if most > 0.0]
+    products = (c for n in range(degree + 1) for c in combinations_with_replacement(range(1, count + 1), n))
+    terms = [(*c, *(0,) * (3 - len(c))) for c in products]
+    terms += [(1 + v.shape[1] + e, 0, 0) for e in range(len(rows))]
+    return Features(scale, np.array(rows).reshape(-1, 3), np.array(terms, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class OneStep:
+    """The predictor of one period.
+
+    Attributes:
+        C (n, F): outputs from features: displacement and change of heading in the robot's own frame, and the other
+            coordinates after the period.
+        features: φ.
+    """
+
+    C: Array
+    features: Features
+
+    def tensors(self) -> dict[str, Array]:
+        """Return the arrays of the predictor by their names in a model set's file."""
+        f = self.features
+        return {TENSOR + "C": self.C, TENSOR + "scale": f.scale, TENSOR + "saturations": f.saturations} | {
+            TENSOR + "terms": f.terms.astype(float)
+        }
+
+    @staticmethod
+    def of_tensors(tensors: dict[str, Array]) -> OneStep:
+        """Return the predictor that a model set's file holds; KeyError without one."""
+        C, scale, saturations, terms = (tensors[TENSOR + name] for name in ("C", "scale", "saturations", "terms"))
+        return OneStep(C, Features(scale, saturations, terms.astype(np.int64)))
+
+    def check(self, robot: Robot) -> None:
+        """Check the sizes and indices of a predictor that comes from a file.
+
+        Raises:
+            BadModel: an array does not fit the robot, or an index is out of range.
+        """
+        f, variables = self.features, len(robot.regressor) + 2 * robot.action_dim
+        primitives = 1 + variables + len(f.saturations)
+        good = f.scale.shape == (variables,) and (f.scale > 0.0).all() and f.saturations.ndim == 2
+        good = good and f.terms.ndim == 2 and f.terms.shape[1] == 3 and f.saturations.shape[1] == 3
+        good = good and self.C.shape == (robot.state_dim, len(f.terms)) and len(f.terms) > 0
+        good = good and f.terms.min() >= 0 and f.terms.max() < primitives
+        pairs = f.saturations[:, :2]
+        good = good and bool((pairs >= 0).all() and (pairs < variables).all() and (f.saturations[:, 2] > 0.0).all())
+        if not good:
+            raise BadModel(f"the predictor of one period does not fit {robot.name}")
+
+    def rollouts(self, robot: Robot, z: Array) -> Array:
+        """Return the outputs (T, N, n + d·discs) for windows z (T, r + N·m), as `predicted_outputs` has them."""
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        return rollout_kernels.rollouts(*self.arguments(robot), np.ascontiguousarray(z))
+
+    def arguments(self, robot: Robot) -> Arguments:
+        """Return the arguments of the kernels that are the same for every plan."""
+        f, d = self.features, robot.position_dim
+        heading = -1 if robot.heading is None else robot.heading
+        arms = [disc.at for disc in robot.body if disc.arm > 0.0 and heading >= 0]
+        others, centers = np.array(robot.regressor, dtype=np.int64), np.array(arms, dtype=float).reshape(-1, d)
+        whole = np.ascontiguousarray
+        predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(f.terms)
+        return *predictor, others, heading, centers, d, robot.action_dim

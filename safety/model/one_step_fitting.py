@@ -1,0 +1,303 @@
+"""Fit a one-step predictor to recorded driving, and bound the error of its rollouts (docs/method.md §13).
+
+Every recorded period fits the predictor, and every window of a plan's length calibrates the bound: the recording is
+cut into folds, and a predictor that did not see a fold predicts the windows in it (cross-conformal calibration).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.errors import BadData, ErrorBoundError
+from brakeline.messaging.robot import Robot
+from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound, envelope
+from brakeline.safety.model.fitting import stopping_distance_of_stops
+from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
+from brakeline.safety.model.model_set import ModelSet, extra_coordinates
+from brakeline.safety.model.one_step import Features, OneStep, features_for
+from brakeline.safety.model.windows import displacement, predicted_outputs, ways
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+FOLDS = 5
+DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
+FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
+SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
+MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameters
+CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
+LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
+QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Recorded driving, cut into folds.
+
+    Attributes:
+        v (P, v), y (P, n), period_fold (P,): all periods: variables [s; u; input of the period before] and outputs.
+        z (T, nz), after (T, N, n + d·discs), chords (T, N), fold (T,), start (T, 2): all windows of N periods that lie
+            in one fold: regressors, outputs after each period, chord deviations [m], trajectory and first period.
+    """
+
+    v: Array
+    y: Array
+    period_fold: Index
+    z: Array
+    after: Array
+    chords: Array
+    fold: Index
+    start: Index
+
+
+def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
+    """Cut recorded driving into periods and windows, each with its fold.
+
+    With many trajectories, a fold consists of whole trajectories; otherwise, of one block of each trajectory.
+
+    Raises:
+        BadData: a fold holds no window; the message says how much driving is missing.
+    """
+    robot, N = data.robot, data.robot.horizon
+    whole = len(data.trajectories) >= 4 * folds
+    parts: list[tuple[NDArray[Any], ...]] = []
+    for number, t in enumerate(data.trajectories):
+        periods = len(t.inputs)
+        block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
+        parts.append((*_periods(robot, t), block, *_windows(data, t, number, block)))
+    names = ("v", "y", "period_fold", "z", "after", "chords", "fold", "start")
+    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    samples = Samples(**dict(zip(names, columns, strict=True)))
+    if len(np.unique(samples.fold)) < folds:
+        needed = 4 * folds * N * robot.period / 60.0
+        raise BadData(f"too little driving to calibrate with: record at least {needed:.1f} minutes")
+    return samples
+
+
+def _before(robot: Robot, t: Trajectory) -> Array:
+    """Return the input in force at each period's start (T, m)."""
+    first = np.zeros(robot.action_dim) if t.before is None else t.before
+    return np.vstack([first, t.inputs[:-1]])
+
+
+def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, _before(robot, t)])
+    return v, displacement(robot, t.states[:-1], t.states[1:])
+
+
+def _windows(data: Dataset, t: Trajectory, number: int, block: Index) -> tuple[Array, Array, Array, Index, Index]:
+    robot, N = data.robot, data.robot.horizon
+    start = np.arange(max(len(t.inputs) - N + 1, 0))
+    start = start[block[start] == block[start + N - 1]]
+    at = start[:, None] + np.arange(N)
+    measured, inputs = t.states[start][:, list(robot.regressor)], t.inputs[at].reshape(len(at), -1)
+    z = np.hstack([measured, _before(robot, t)[start], inputs])
+    ends = [displacement(robot, t.states[start], t.states[start + k]) for k in range(1, N + 1)]
+    after = [predicted_outputs(robot, end) for end in ends]
+    chords = (ways(robot, t)[0] + data.chord_deviation)[at]
+    return z, np.stack(after, 1), chords, block[start], np.column_stack([np.full(len(start), number), start])
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A family of features, and its out-of-fold error.
+
+    Attributes:
+        error [m]: the 99 % quantile of the distance between predicted and measured position, over all windows and
+            periods, each predicted without its fold.
+        features: number of features.
+    """
+
+    degree: int
+    lags: int
+    saturating: bool
+    ridge: float
+    error: float
+    features: int
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """Ridge regressions on all folds, or on all but one, from their second moments: gram (K, F, F), cross (K, F, n)."""
+
+    features: Features
+    gram: Array
+    cross: Array
+
+    @staticmethod
+    def of(features: Features, s: Samples) -> _Regression:
+        phi, folds = features(s.v), range(int(s.period_fold.max()) + 1)
+        parts = [(phi[s.period_fold == i], s.y[s.period_fold == i]) for i in folds]
+        return _Regression(features, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts]))
+
+    def fit(self, ridge: float, without: int = -1) -> OneStep:
+        used = [i for i in range(len(self.gram)) if i != without]
+        gram, cross = self.gram[used].sum(0), self.cross[used].sum(0)
+        weights = ridge * np.diag(gram) + 1e-12 * gram[0, 0]
+        weights[0] = 0.0  # not of the constant
+        return OneStep(np.linalg.solve(gram + np.diag(weights), cross).T, self.features)
+
+    def out_of_fold(self, robot: Robot, s: Samples, ridge: float) -> Array:
+        """Return the errors (T, N, n + d·discs) of all windows, each predicted without its fold."""
+        found = np.empty_like(s.after)
+        for i in range(len(self.gram)):
+            held = s.fold == i
+            found[held] = s.after[held] - self.fit(ridge, without=i).rollouts(robot, s.z[held])
+        return found
+
+
+def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regression]:
+    """Choose degree, lags, saturating features and ridge by the out-of-fold error.
+
+    Returns:
+        The choice, all candidates from the best to the worst, and the regression of the choice.
+    """
+    found: list[tuple[Candidate, _Regression]] = []
+    for degree, lags, saturating in product(DEGREES, LAGS, (False, True)):
+        features = features_for(robot, s.v, degree, lags, saturating)
+        count = len(features.terms)
+        few = degree > 1 and len(s.v) < FEWEST_PERIODS_A_FEATURE * count
+        if few or (saturating and not len(features.saturations)):
+            continue
+        regression = _Regression.of(features, s)
+        for ridge in RIDGES:
+            off = regression.out_of_fold(robot, s, ridge)[..., : robot.position_dim]
+            error = float(np.quantile(np.linalg.norm(off, axis=-1), QUANTILE))
+            found.append((Candidate(degree, lags, saturating, ridge, error, count), regression))
+    found = [pair for pair in found if np.isfinite(pair[0].error)]
+    least = min(c.error for c, _ in found)
+    good = [pair for pair in found if pair[0].error <= SIMPLER * least]
+    chosen, regression = min(good, key=lambda pair: (pair[0].features, pair[0].error))
+    return chosen, sorted((c for c, _ in found), key=lambda c: c.error), regression
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Half-widths κ_k·|z| + w_k of the predicted coordinates after each period, up to a factor.
+
+    Attributes:
+        kappa (N, n', nz), w (N, n'): n' coordinates.
+    """
+
+    kappa: Array
+    w: Array
+
+    def widths(self, z: Array) -> Array:
+        """Return half-widths (T, N, n') for regressors z (T, nz)."""
+        return np.asarray(np.einsum("knj,tj->tkn", self.kappa, np.abs(z), optimize=True) + self.w)
+
+    @staticmethod
+    def around(robot: Robot, z: Array, errors: Array) -> Shape:
+        """Return the tightest shape on average that holds all errors (T, N, n').
+
+        The half-width after k periods grows with the speeds, the input in force and the mean of the k inputs: with a
+        slope for each input, minutes of driving would not determine it.
+        """
+        (count, N, n), known, m = errors.shape, robot.regressor_dim, robot.action_dim
+        kappa, w, inputs = np.zeros((N, n, z.shape[1])), np.zeros((N, n)), np.abs(z[:, known:]).reshape(count, -1, m)
+        for k in range(N):
+            used = np.hstack([np.abs(z[:, :known]), inputs[:, : k + 1].mean(1)])
+            for i in range(n):
+                slopes, w[k, i] = envelope(used, np.abs(errors[:, k, i]), 1.0)
+                kappa[k, i, :known] = slopes[:known]
+                kappa[k, i, known : known + (k + 1) * m] = np.tile(slopes[known:], k + 1) / (k + 1)
+        return Shape(kappa, w)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the predictor of one period was chosen, and how far its sets had to be widened.
+
+    Attributes:
+        chosen, candidates: the choice, and all candidates from the best to the worst.
+        factor: the largest out-of-fold score: the final shape is scaled by it.
+        scores, first_scores (T,): the score of every window, and of its first period, divided by the factor: at most 1.
+        samples: the recorded driving.
+    """
+
+    chosen: Candidate
+    candidates: tuple[Candidate, ...]
+    factor: float
+    scores: Array
+    first_scores: Array
+    samples: Samples
+
+
+def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Calibration]:
+    """Fit a model set of mode one-step to recorded driving of any kind.
+
+    The score of a window is the largest ratio of an error to a shape. Predictor and shape come from the other folds.
+
+    Raises:
+        BadData: there is too little driving, or too few stops; the message says what to record.
+        ErrorBoundError: the robot stops by feedback, so its plans are no affine map of the inputs.
+    """
+    robot = data.robot
+    if robot.feedback:
+        raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
+    s = samples_of(data)
+    chosen, candidates, regression = choose(robot, s)
+    scores, first_scores = _scores(robot, s, regression, chosen.ridge)
+    factor = max(float(scores.max()), 1.0)
+    one_step = regression.fit(chosen.ridge)
+    shape = _shape(robot, s.z, s.after - one_step.rollouts(robot, s.z), s.chords)
+    n = s.after.shape[2]
+    kappa, w, nz = factor * shape.kappa, factor * shape.w, s.z.shape[1]
+    steps = tuple(_bound(kappa[k, :n], w[k, :n]) for k in range(robot.horizon))
+    stopping = stopping_distance_of_stops(data, model_config)
+    known = s.v[:, [*range(len(robot.regressor)), *range(len(robot.regressor) + robot.action_dim, s.v.shape[1])]]
+    model = ModelSet(
+        robot,
+        replace(model_config, mode=ONE_STEP, windows=FREE, certificate=RESIDUAL),
+        steps,
+        _bound(kappa[:, n], w[:, n]),
+        _bound(np.zeros((1, nz)), np.array([stopping])),
+        np.stack([known.min(0), known.max(0)]),
+        np.eye(nz),
+        data.about | {"data": data.digest(), "periods": str(data.periods)},
+        one_step=one_step,
+    )
+    return model, Calibration(chosen, tuple(candidates), factor, scores / factor, first_scores / factor, s)
+
+
+def _bound(kappa: Array, w: Array) -> ErrorBound:
+    n, nz = kappa.shape
+    return ErrorBound(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
+
+
+def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
+    """Return the shape of the errors, and of the chord deviations as a further coordinate."""
+    some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
+    shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2))
+    shape.kappa[:, -1] *= CHORD_INFLATION
+    least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
+    shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], least)
+    return shape
+
+
+def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> tuple[Array, Array]:
+    """Return the scores of all windows, and of their first periods, each from the folds that it is not in."""
+    scores, first = np.zeros(len(s.z)), np.zeros(len(s.z))
+    used = [*range(robot.position_dim), *extra_coordinates(robot)]
+    for i in range(len(regression.gram)):
+        held = s.fold == i
+        one_step = regression.fit(ridge, without=i)
+        errors = s.after - one_step.rollouts(robot, s.z)
+        shape = _shape(robot, s.z[~held], errors[~held], s.chords[~held])
+        widths = shape.widths(s.z[held])
+        shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
+        first[held] = shares[:, 0, :-1].max(1)
+        scores[held] = np.maximum(shares[..., [*used, -1]].max((1, 2)), first[held])
+    return scores, first
+
+
+def _shares(errors: Array, widths: Array) -> Array:
+    """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(errors > 0.0, errors / widths, 0.0)
