@@ -22,11 +22,12 @@ from brakeline.errors import Unsupported
 from brakeline.logs.console_tables import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
+from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
-from brakeline.safety.model.model_set import MODES, ModelConfig, ModelSet
+from brakeline.safety.model.model_set import MODES, ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
 from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, ValidationReport
 from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
@@ -41,10 +42,12 @@ class CertifyCommand:
     data: Annotated[Path | None, tyro.conf.Positional] = None
     """A data set, or a log (file or run folder), of which the last steps count. Defaults to the data set in use of
     --robot."""
-    certificates: tuple[str, ...] = KINDS
-    """Error bounds to validate (see docs/certificates.md)."""
-    mode: options.Mode | None = None
-    """Prediction mode to validate. Defaults to both."""
+    certificates: tuple[str, ...] = ()
+    """Error bounds of the linear modes to validate (see docs/certificates.md). Defaults to all of them if you give
+    --mode direct or recursion."""
+    mode: Literal["one-step", "direct", "recursion"] | None = None
+    """Prediction mode to validate: one-step rolls out one learned period. Defaults to one-step, or to direct and
+    recursion if you give --certificates. A robot that stops by feedback has no mode one-step."""
     windows: Literal["plan", "free", "auto"] = "auto"
     """Driving to fit and validate on: plan for plans as the filter makes them, free for any, auto for any if there are
     too few plans."""
@@ -75,9 +78,9 @@ class CertifyCommand:
         models: list[tuple[ModelSet, ValidationReport]] = []
         results: dict[str, Any] = {}
         notes: list[str] = []
-        modes = (self.mode,) if self.mode else MODES
-        with under_way("certifying", len(self.certificates) * len(modes)) as advance:
-            for kind, mode in product(self.certificates, modes):
+        forms = self._forms(robot)
+        with under_way("certifying", len(forms)) as advance:
+            for kind, mode in forms:
                 advance(0, f"certifying {kind}, {mode}")
                 try:
                     config = ModelConfig(kind, mode)
@@ -108,6 +111,16 @@ class CertifyCommand:
             self._publish(models[0][0], data)
         return int(not models or any("not_used" in row for modes in results.values() for row in modes.values()))
 
+    def _forms(self, robot: Robot) -> list[tuple[str, str]]:
+        """Return the pairs of error bound and mode to validate."""
+        mode = self.mode
+        if mode is None and not self.certificates:
+            mode = "direct" if robot.feedback else "one-step"
+            return [(RESIDUAL, mode)]
+        if mode == ONE_STEP:
+            return [(RESIDUAL, mode)]
+        return list(product(self.certificates or KINDS, (mode,) if mode else MODES))
+
     def _put_to_use(self, model: ModelSet, data: Dataset) -> dict[str, str]:
         """Save the model set if you give --use, or return and print the reason why it may not be used."""
         if not (self.use or self.publish):
@@ -125,6 +138,9 @@ class CertifyCommand:
 
     def _print(self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], data: Dataset) -> None:
         console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
+        for _, report in models:
+            if report.groups:
+                console.print(group_table(report))
         lines = [bounds_in_words(models[0][1], data.robot.period)] if models else []
         lines += dict.fromkeys((*notes, *filter(None, (widening(report) for _, report in models))))
         lines += [f"missing: {text}" for text in recording_advice(models[0][1], data)] if models else []
@@ -169,6 +185,8 @@ class CertifyCommand:
 def widening(report: ValidationReport) -> str:
     """Say that envelopes are wider than usual, and why. Empty if they are not."""
     usual = ModelConfig().inflation
+    if report.mode == ONE_STEP:
+        return ""
     if report.inflation <= usual * 1.001 or report.inflation == ModelConfig().of_minutes().inflation:
         return ""
     return (
@@ -210,6 +228,14 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
         f"average; at least one in up to {s.bound_episode:.0%} of episodes, if steps are independent",
         f"  an hour of driving ({round(HOUR / period):,} steps): at most {s.outside_hour:.3g} steps outside on average",
     ]
+    if s.chosen is not None and s.marginal is not None:
+        lines += [
+            f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap)",
+            f"  predictor: monomials up to degree {s.chosen.degree}, {s.chosen.lags} earlier input, "
+            + ("with" if s.chosen.saturating else "without")
+            + f" saturating features: {s.chosen.features} features; 99 % of positions within "
+            f"{1e3 * s.chosen.error:.3g} mm, out of fold",
+        ]
     if s.in_place_windows:
         lines.append(
             f"  a turn on the spot: at most {s.bound_in_place:.2%} of {s.in_place_windows} such plans leave their tube "
@@ -220,6 +246,20 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
         "The bounds hold for driving like the recorded driving; more held-out plans make them tighter.",
     ]
     return "\n".join(lines)
+
+
+def group_table(report: ValidationReport) -> StackingTable:
+    """Return the statement of a validation report by kind of driving (docs/method.md §14)."""
+    table = StackingTable(title="by kind of driving")
+    table.add_column("driving")
+    for column in ("windows", "plans", "violations", "on average", "≤ per plan", "largest error"):
+        table.add_column(column, justify="right")
+    for group in report.groups:
+        counts = str(group.windows), str(group.plans), str(group.violations)
+        shares = f"{group.marginal:.2%}", f"{group.bound:.2%}", f"{group.excess:.0%} of its set"
+        table.add_row(group.name, *counts, *shares)
+    table.caption = "windows may overlap, plans do not; bounds at 99 % confidence"
+    return table
 
 
 def width(metres: float) -> str:

@@ -27,7 +27,7 @@ LATEST = Path("runs/latest")
 T = TypeVar("T")
 Unprefixed = Annotated[T, tyro.conf.OmitArgPrefixes]
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
-Mode = Literal["direct", "recursion"]
+Mode = Literal["auto", "one-step", "direct", "recursion"]
 Method = Literal["ddpc", "secas", "sailr", "none"]
 
 Robot = Annotated[
@@ -70,9 +70,10 @@ class FilterOptions:
     """Filter method: ddpc (this project's own), secas or sailr (the rivals), or none for no filter."""
     certificate: Certificate = "residual"
     """Error bound of the model set (see docs/certificates.md)."""
-    mode: Mode = "direct"
-    """Prediction mode: direct uses one predictor for each step of the plan, recursion repeats the paper's one-step
-    model."""
+    mode: Mode = "auto"
+    """Prediction mode: one-step rolls out one learned period, direct uses one linear predictor for each period of the
+    plan, recursion repeats the paper's linear model, and auto takes the model set that was last put to use (one-step or
+    direct)."""
 
     def model_config(self) -> ModelConfig:
         """Return the configuration of the model set that the options select."""

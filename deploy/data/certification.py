@@ -10,8 +10,15 @@ import numpy as np
 from brakeline.errors import BadData, ErrorBoundError, Unsupported
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import fit_model_set
-from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.model.validation import Array, ValidationReport, most_violations, validate_plans
+from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.one_step_fitting import fit_one_step
+from brakeline.safety.model.validation import (
+    Array,
+    ValidationReport,
+    most_violations,
+    validate_one_step,
+    validate_plans,
+)
 from brakeline.safety.model.windows import FREE, PLAN
 
 HELD_OUT = 0.3  # share of the trajectories that the validation uses
@@ -23,7 +30,10 @@ PLAN_HINT = " (in a plan window the robot brakes as the filter does: a chosen in
 
 
 def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
-    """Fit a model set to 70 % of the trajectories and validate it on the held-out ones.
+    """Fit a model set and validate it on driving that it was not fitted to.
+
+    Mode one-step predicts every window without its fold (cross-conformal calibration, docs/method.md §13). The other
+    modes fit 70 % of the trajectories and validate the result on the held-out ones.
 
     If the bound is above the robot's limit (`accept_bound`), widen the envelopes by the smallest factor that brings it
     within the limit (split conformal prediction, docs/method.md §12). The number of violations that the limit allows
@@ -42,6 +52,10 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
     Raises:
         BadData, ErrorBoundError: the data do not support a model set; the message gives the reason.
     """
+    if model_config.mode == ONE_STEP:
+        model, calibration = fit_one_step(data, model_config)
+        report = validate_one_step(model, calibration)
+        return _stated(model, report, data), report
     fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
     model = fit_model_set(fitted, model_config)
     report, scores = validate_plans(model, fitted, held_out)
@@ -55,11 +69,16 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         model_config = replace(model_config, inflation=model_config.inflation * factor * (1.0 + ROUNDING))
         model = fit_model_set(fitted, model_config)
         report, scores = validate_plans(model, fitted, held_out)
+    return _stated(model, report, data), report
+
+
+def _stated(model: ModelSet, report: ValidationReport, data: Dataset) -> ModelSet:
+    """Return the model set with the main figures of its validation in `about`."""
     figures = {name: getattr(report, name) for name in ("bound_step", "bound_plan", "bound_episode", "outside_hour")}
     about = {name: f"{value:.6g}" for name, value in figures.items()}
     about |= {"windows": str(report.windows), "violations": str(report.violations)}
-    about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{model_config.inflation:.6g}"}
-    return replace(model, about=model.about | about), report
+    about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{report.inflation:.6g}"}
+    return replace(model, about=model.about | about)
 
 
 def certify_supported(
@@ -80,7 +99,8 @@ def certify_supported(
         Unsupported: no kind of windows supports a model set.
     """
     reasons: dict[str, str] = {}
-    for kind in (PLAN, FREE) if windows == AUTO else (windows,):
+    free_only = model_config.mode == ONE_STEP  # it needs no plans, and plans are driving like any other
+    for kind in (FREE,) if free_only else (PLAN, FREE) if windows == AUTO else (windows,):
         try:
             model, report = certify(data, replace(model_config, windows=kind), until_held)
         except (BadData, ErrorBoundError) as error:

@@ -9,11 +9,12 @@ data/<robot>/models/<version>.safetensors           every version a service has 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from brakeline.messaging.robot import TASK_SEPARATOR, Robot
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.model.model_config import DDPC, ModelConfig
+from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT, ONE_STEP, ModelConfig
 
 
 def data_root() -> Path:
@@ -27,8 +28,16 @@ def record_path(robot: Robot) -> Path:
 
 
 def model_path(robot: Robot, model_config: ModelConfig) -> Path:
-    """Return the path of the model set in use with this error bound and mode."""
-    return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
+    """Return the path of the model set in use with this error bound and mode.
+
+    Mode `AUTO` gives the newer one of the modes one-step and direct, and direct if there is none.
+    """
+    if model_config.mode != AUTO:
+        return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
+    direct, one_step = (model_path(robot, replace(model_config, mode=mode)) for mode in (DIRECT, ONE_STEP))
+    if not one_step.exists() or (direct.exists() and direct.stat().st_mtime > one_step.stat().st_mtime):
+        return direct
+    return one_step
 
 
 def method_path(robot: Robot, method: str, model_config: ModelConfig) -> Path:

@@ -12,6 +12,7 @@ RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE = "residual", "set-membership", "matri
 KINDS = (RESIDUAL, SET_MEMBERSHIP, MATRIX_ZONOTOPE)  # of error bounds
 ONE_STEP, DIRECT, RECURSION = "one-step", "direct", "recursion"
 MODES = (DIRECT, RECURSION)  # of predictors that are linear in the inputs
+AUTO = "auto"  # the mode of the model set that was last put to use
 PLAN, FREE = "plan", "free"
 WINDOWS = (PLAN, FREE)
 DDPC, SECAS, SAILR = "ddpc", "secas", "sailr"
@@ -32,8 +33,8 @@ class ModelConfig:
     def __post_init__(self) -> None:
         if self.certificate not in KINDS:
             raise ValueError(f"no certificate is called {self.certificate!r}; there are: {', '.join(KINDS)}")
-        if self.mode not in (ONE_STEP, *MODES):
-            raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join((ONE_STEP, *MODES))}")
+        if self.mode not in (AUTO, ONE_STEP, *MODES):
+            raise ValueError(f"no mode is called {self.mode!r}; there are: {', '.join((AUTO, ONE_STEP, *MODES))}")
         if self.windows not in WINDOWS:
             raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < math.inf:

@@ -143,6 +143,13 @@ class _Regression:
         weights[0] = 0.0  # not of the constant
         return OneStep(np.linalg.solve(gram + np.diag(weights), cross).T, self.features)
 
+    def quality(self) -> tuple[float, float]:
+        """Return the smallest singular value and the condition number of the scaled features."""
+        gram = self.gram.sum(0)
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(gram / np.outer(scale, scale)), 0.0))
+        return float(singular[0]), float(singular[-1] / max(singular[0], 1e-300))
+
     def out_of_fold(self, robot: Robot, s: Samples, ridge: float) -> Array:
         """Return the errors (T, N, n + d·discs) of all windows, each predicted without its fold."""
         found = np.empty_like(s.after)
@@ -219,6 +226,7 @@ class Calibration:
         factor: the largest out-of-fold score: the final shape is scaled by it.
         scores, first_scores (T,): the score of every window, and of its first period, divided by the factor: at most 1.
         samples: the recorded driving.
+        smallest_singular, condition: of the chosen features, each scaled to its root mean square.
     """
 
     chosen: Candidate
@@ -227,6 +235,8 @@ class Calibration:
     scores: Array
     first_scores: Array
     samples: Samples
+    smallest_singular: float
+    condition: float
 
 
 def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Calibration]:
@@ -263,7 +273,9 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         data.about | {"data": data.digest(), "periods": str(data.periods)},
         one_step=one_step,
     )
-    return model, Calibration(chosen, tuple(candidates), factor, scores / factor, first_scores / factor, s)
+    return model, Calibration(
+        chosen, tuple(candidates), factor, scores / factor, first_scores / factor, s, *regression.quality()
+    )
 
 
 def _bound(kappa: Array, w: Array) -> ErrorBound:

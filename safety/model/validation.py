@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv
 
+from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import CONFIDENCE as CONFIDENCE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reachable_tube import Tube
@@ -19,6 +20,7 @@ from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_causes import (
     AFTER,
     PATH,
+    REGIMES,
     ViolationGroup,
     group_violations,
     position_parts,
@@ -26,6 +28,7 @@ from brakeline.safety.model.error_causes import (
     state_parts,
 )
 from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
+from brakeline.safety.model.one_step_fitting import Calibration, Candidate
 from brakeline.safety.model.turning_in_place import inside
 from brakeline.safety.model.windows import (
     PLAN,
@@ -33,6 +36,7 @@ from brakeline.safety.model.windows import (
     Windows,
     check_regressors,
     non_overlapping,
+    non_overlapping_starts,
     predicted_outputs,
     windows,
 )
@@ -43,6 +47,34 @@ Array = NDArray[np.float64]
 EPISODE = 300  # steps
 HOUR = 3600.0  # s
 CHUNK = 256  # windows at once, since an exact matrix zonotope has thousands of generators
+
+
+START, RESTLESS = "first period of an episode", "restless inputs"
+JUMP = 0.5  # share of an input's range; a change from one period to the next above it is a jump
+RESTLESS_SHARE = 0.3  # of a plan's periods with a jump
+
+
+@dataclass(frozen=True)
+class GroupStatement:
+    """What a model set states about one kind of driving (docs/method.md §14).
+
+    Attributes:
+        name: `START`, `RESTLESS`, or one of `error_causes.REGIMES`.
+        windows: number of windows of this kind, which may overlap.
+        plans: number of them that do not overlap.
+        violations: number of `plans` outside their tubes.
+        marginal: expected share of new windows outside, 1 / (windows + 1) if the largest score sets the width.
+        bound: the largest share of plans outside, at 99 % confidence.
+        excess: the largest ratio of an error to its bound.
+    """
+
+    name: str
+    windows: int
+    plans: int
+    violations: int
+    marginal: float
+    bound: float
+    excess: float
 
 
 @dataclass(frozen=True)
@@ -77,6 +109,10 @@ class ValidationReport:
     bound_in_place: float = 1.0  # probability that any part of a plan in place is outside, at 99 % confidence
     inflation: float = 1.0  # factor on the envelopes of the model set
     leaving: tuple[ViolationGroup, ...] = ()  # the violations by coordinate and driving regime
+    marginal: float | None = None  # mode one-step: expected share of new plans outside, from windows that may overlap
+    groups: tuple[GroupStatement, ...] = ()  # mode one-step: the statement by kind of driving
+    chosen: Candidate | None = None  # mode one-step: the chosen features
+    candidates: tuple[Candidate, ...] = ()  # mode one-step: all features tried, from the best to the worst
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -192,6 +228,62 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
         leaving=group_violations(excess, parts, regimes(robot, plans.z)),
     )
     return statement, excess
+
+
+def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationReport:
+    """State what the calibration of a model set of mode one-step says (docs/method.md §13, §14).
+
+    Every window was predicted without its fold. The largest score set the width, so no window is outside. The bounds at
+    99 % confidence count windows that do not overlap: plans for `bound_plan`, periods for `bound_step`.
+    """
+    robot, s, ready = model.robot, calibration.samples, Filter(model)
+    apart = non_overlapping_starts(s.start, robot.horizon)
+    plans, steps = int(apart.sum()), len(s.z)
+    bound_step = upper_bound(0, steps)
+    return ValidationReport(
+        certificate=model.model_config.certificate,
+        mode=model.model_config.mode,
+        version=model.version,
+        samples=len(s.v),
+        rank=calibration.chosen.features,
+        smallest_singular=calibration.smallest_singular,
+        condition=calibration.condition,
+        windows=plans,
+        violations=0,
+        step_violations=0,
+        bound_step=bound_step,
+        bound_plan=upper_bound(0, plans),
+        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
+        outside_episode=bound_step * EPISODE,
+        outside_hour=bound_step * HOUR / robot.period,
+        half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
+        half_width_full=ready.half_width(np.asarray(robot.high())),
+        clearance_margin=ready.clearance_margin,
+        excess=float(calibration.scores.max(initial=0.0)),
+        inflation=calibration.factor,
+        marginal=1.0 / (steps + 1),
+        groups=_groups(robot, calibration, apart),
+        chosen=calibration.chosen,
+        candidates=calibration.candidates,
+    )
+
+
+def _groups(robot: Robot, calibration: Calibration, apart: NDArray[np.bool_]) -> tuple[GroupStatement, ...]:
+    """Return the statement for each kind of driving that was recorded."""
+    s, m, known = calibration.samples, robot.action_dim, len(robot.regressor)
+    changes = np.abs(np.diff(s.z[:, known:].reshape(len(s.z), -1, m), axis=1)) / (robot.high() - robot.low())
+    kinds = {START: s.start[:, 1] == 0, RESTLESS: (changes.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
+    driving = regimes(robot, s.z)
+    kinds |= {name: driving == name for name in REGIMES}
+    found = []
+    for name, of in kinds.items():
+        scores = calibration.scores[of]
+        count, independent = len(scores), int((of & apart).sum())
+        excess = float(scores.max(initial=0.0))
+        bound = upper_bound(0, independent)
+        if count:
+            found.append(GroupStatement(name, count, independent, 0, 1.0 / (count + 1), bound, excess))
+    return tuple(found)
 
 
 def _share(off: Array, half: Array) -> Array:

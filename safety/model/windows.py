@@ -10,6 +10,7 @@ the robot's frame at the window's start, so position is no regressor.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -258,13 +259,18 @@ def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
 
 def non_overlapping(w: Windows, length: int) -> Windows:
     """Return windows that do not overlap: each starts at least `length` periods after the one before."""
-    chosen = np.zeros(len(w), dtype=bool)
+    return w.take(non_overlapping_starts(w.start, length))
+
+
+def non_overlapping_starts(start: NDArray[np.integer[Any]], length: int) -> NDArray[np.bool_]:
+    """Return which windows (T,) start at least `length` periods after the one before. start (T, 2): see `Windows`."""
+    chosen = np.zeros(len(start), dtype=bool)
     last = (-1, 0)
-    for i, (trajectory, period) in enumerate(w.start):
+    for i, (trajectory, period) in enumerate(start):
         if trajectory != last[0] or period >= last[1] + length:
             chosen[i] = True
             last = (trajectory, period)
-    return w.take(chosen)
+    return chosen
 
 
 @dataclass(frozen=True)
