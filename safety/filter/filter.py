@@ -304,7 +304,7 @@ class Filter:
             z = self._closest(choice, z_0, proposal, record)
             if z is None:
                 return None
-            exact = at.constraints.at(z, local_map.widening)
+            exact = self.constraints.at(z, local_map.widening)
             if exact is at.constraints:  # a linear tube: the rows hold everywhere
                 if exact.margin(choice, z) < 0.0:
                     return None
@@ -373,7 +373,7 @@ class Filter:
         if self._turns_in_place(stay):  # turns have their own tube: room to stand is enough
             stay = self.inputs.regressors(z_0, self.inputs.limited(self.inputs.nothing, before))
         kept_off = self.clearance_margin * rows.keep
-        staying = at.constraints.at(stay, local_map.widening)
+        staying = self.constraints.at(stay, local_map.widening)
         there = rows if staying is at.constraints else staying.rows(local_map, stay, at.planes)
         inside = there.support(self.tube, stay) > there.bound - kept_off
         bound = np.where(inside, rows.bound, rows.bound - kept_off)

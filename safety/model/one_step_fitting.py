@@ -6,6 +6,7 @@ cut into folds, and a predictor that did not see a fold predicts the windows in 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.driving_kinds import driving_kinds
 from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound, envelope
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
@@ -33,6 +35,8 @@ SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor l
 MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameters
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
+OUTSIDE = 0.001  # share of the windows that may be outside, in every kind of driving
+MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
 
 
@@ -166,6 +170,8 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
         The choice, all candidates from the best to the worst, and the regression of the choice.
     """
     found: list[tuple[Candidate, _Regression]] = []
+    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
+    few_windows = replace(s, z=s.z[some], after=s.after[some], fold=s.fold[some])
     for degree, lags, saturating in product(DEGREES, LAGS, (False, True)):
         features = features_for(robot, s.v, degree, lags, saturating)
         count = len(features.terms)
@@ -174,7 +180,7 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
             continue
         regression = _Regression.of(features, s)
         for ridge in RIDGES:
-            off = regression.out_of_fold(robot, s, ridge)[..., : robot.position_dim]
+            off = regression.out_of_fold(robot, few_windows, ridge)[..., : robot.position_dim]
             error = float(np.quantile(np.linalg.norm(off, axis=-1), QUANTILE))
             found.append((Candidate(degree, lags, saturating, ridge, error, count), regression))
     found = [pair for pair in found if np.isfinite(pair[0].error)]
@@ -223,8 +229,9 @@ class Calibration:
 
     Attributes:
         chosen, candidates: the choice, and all candidates from the best to the worst.
-        factor: the largest out-of-fold score: the final shape is scaled by it.
-        scores, first_scores (T,): the score of every window, and of its first period, divided by the factor: at most 1.
+        factor: factor on the final shape of positions and chord deviations, from the out-of-fold scores.
+        scores (T,): the score of every window, relative to the factor; above 1, the window is outside its sets.
+        first_scores (T,): the same for the predicted state after one period, which has a factor of its own.
         samples: the recorded driving.
         smallest_singular, condition: of the chosen features, each scaled to its root mean square.
     """
@@ -253,12 +260,16 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
     s = samples_of(data)
     chosen, candidates, regression = choose(robot, s)
-    scores, first_scores = _scores(robot, s, regression, chosen.ridge)
-    factor = max(float(scores.max()), 1.0)
+    scores, positions, others = _scores(robot, s, regression, chosen.ridge)
+    kinds = driving_kinds(robot, s.z, s.start)
+    factor, first = _factor(scores, kinds), _factor(others, kinds)
     one_step = regression.fit(chosen.ridge)
     shape = _shape(robot, s.z, s.after - one_step.rollouts(robot, s.z), s.chords)
-    n = s.after.shape[2]
-    kappa, w, nz = factor * shape.kappa, factor * shape.w, s.z.shape[1]
+    n, d, nz = s.after.shape[2], robot.position_dim, s.z.shape[1]
+    scale = np.full(n + 1, factor)
+    kappa, w = scale[:, None] * shape.kappa, scale * shape.w
+    scale[d:n] = first
+    kappa[0], w[0] = scale[:, None] * shape.kappa[0], scale * shape.w[0]
     steps = tuple(_bound(kappa[k, :n], w[k, :n]) for k in range(robot.horizon))
     stopping = stopping_distance_of_stops(data, model_config)
     known = s.v[:, [*range(len(robot.regressor)), *range(len(robot.regressor) + robot.action_dim, s.v.shape[1])]]
@@ -273,9 +284,21 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         data.about | {"data": data.digest(), "periods": str(data.periods)},
         one_step=one_step,
     )
-    return model, Calibration(
-        chosen, tuple(candidates), factor, scores / factor, first_scores / factor, s, *regression.quality()
-    )
+    relative = scores / factor, np.maximum(positions / factor, others / first)
+    return model, Calibration(chosen, tuple(candidates), factor, *relative, s, *regression.quality())
+
+
+def _factor(scores: Array, kinds: dict[str, NDArray[np.bool_]]) -> float:
+    """Return the least factor that leaves at most a share `OUTSIDE` of the windows of every kind outside, at least 1.
+
+    This is the ⌈(n + 1)(1 - OUTSIDE)⌉-th score of n windows, and the largest one if they are few (docs/method.md §14).
+    """
+    found = [1.0]
+    for kind in (np.ones(len(scores), dtype=bool), *kinds.values()):
+        ordered = np.sort(scores[kind])
+        if len(ordered):
+            found.append(float(ordered[min(math.ceil((len(ordered) + 1) * (1.0 - OUTSIDE)), len(ordered)) - 1]))
+    return max(found)
 
 
 def _bound(kappa: Array, w: Array) -> ErrorBound:
@@ -293,10 +316,15 @@ def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
     return shape
 
 
-def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> tuple[Array, Array]:
-    """Return the scores of all windows, and of their first periods, each from the folds that it is not in."""
-    scores, first = np.zeros(len(s.z)), np.zeros(len(s.z))
-    used = [*range(robot.position_dim), *extra_coordinates(robot)]
+def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> tuple[Array, Array, Array]:
+    """Return three scores (T,) of each window, from the folds that it is not in.
+
+    Returns:
+        The largest ratio of positions, coordinates that a limit needs and chord deviations; the same for the positions
+        after one period; and that of the other coordinates after one period.
+    """
+    d, scores = robot.position_dim, np.zeros((3, len(s.z)))
+    used = [*range(d), *extra_coordinates(robot), -1]
     for i in range(len(regression.gram)):
         held = s.fold == i
         one_step = regression.fit(ridge, without=i)
@@ -304,9 +332,10 @@ def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> 
         shape = _shape(robot, s.z[~held], errors[~held], s.chords[~held])
         widths = shape.widths(s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
-        first[held] = shares[:, 0, :-1].max(1)
-        scores[held] = np.maximum(shares[..., [*used, -1]].max((1, 2)), first[held])
-    return scores, first
+        scores[0, held] = shares[..., used].max((1, 2))
+        scores[1, held] = shares[:, 0, :d].max(1)
+        scores[2, held] = shares[:, 0, d:-1].max(1, initial=0.0)
+    return scores[0], scores[1], scores[2]
 
 
 def _shares(errors: Array, widths: Array) -> Array:

@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv
 
-from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import CONFIDENCE as CONFIDENCE
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.driving_kinds import driving_kinds
 from brakeline.safety.model.error_causes import (
     AFTER,
     PATH,
-    REGIMES,
     ViolationGroup,
     group_violations,
     position_parts,
@@ -49,21 +48,16 @@ HOUR = 3600.0  # s
 CHUNK = 256  # windows at once, since an exact matrix zonotope has thousands of generators
 
 
-START, RESTLESS = "first period of an episode", "restless inputs"
-JUMP = 0.5  # share of an input's range; a change from one period to the next above it is a jump
-RESTLESS_SHARE = 0.3  # of a plan's periods with a jump
-
-
 @dataclass(frozen=True)
 class GroupStatement:
     """What a model set states about one kind of driving (docs/method.md §14).
 
     Attributes:
-        name: `START`, `RESTLESS`, or one of `error_causes.REGIMES`.
+        name: one of the names in `driving_kinds`.
         windows: number of windows of this kind, which may overlap.
         plans: number of them that do not overlap.
         violations: number of `plans` outside their tubes.
-        marginal: expected share of new windows outside, 1 / (windows + 1) if the largest score sets the width.
+        marginal: expected share of new windows outside.
         bound: the largest share of plans outside, at 99 % confidence.
         excess: the largest ratio of an error to its bound.
     """
@@ -233,13 +227,14 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
 def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationReport:
     """State what the calibration of a model set of mode one-step says (docs/method.md §13, §14).
 
-    Every window was predicted without its fold. The largest score set the width, so no window is outside. The bounds at
-    99 % confidence count windows that do not overlap: plans for `bound_plan`, periods for `bound_step`.
+    Every window was predicted without its fold. The bounds at 99 % confidence count windows that do not overlap: plans
+    for `bound_plan`, periods for `bound_step`.
     """
     robot, s, ready = model.robot, calibration.samples, Filter(model)
     apart = non_overlapping_starts(s.start, robot.horizon)
     plans, steps = int(apart.sum()), len(s.z)
-    bound_step = upper_bound(0, steps)
+    outside, steps_outside = calibration.scores > 1.0, int((calibration.first_scores > 1.0).sum())
+    bound_step = upper_bound(steps_outside, steps)
     return ValidationReport(
         certificate=model.model_config.certificate,
         mode=model.model_config.mode,
@@ -249,10 +244,10 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
         smallest_singular=calibration.smallest_singular,
         condition=calibration.condition,
         windows=plans,
-        violations=0,
-        step_violations=0,
+        violations=int(outside[apart].sum()),
+        step_violations=steps_outside,
         bound_step=bound_step,
-        bound_plan=upper_bound(0, plans),
+        bound_plan=upper_bound(int(outside[apart].sum()), plans),
         bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
         outside_episode=bound_step * EPISODE,
         outside_hour=bound_step * HOUR / robot.period,
@@ -261,29 +256,28 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
         clearance_margin=ready.clearance_margin,
         excess=float(calibration.scores.max(initial=0.0)),
         inflation=calibration.factor,
-        marginal=1.0 / (steps + 1),
-        groups=_groups(robot, calibration, apart),
+        marginal=_marginal(outside),
+        groups=tuple(
+            GroupStatement(
+                name,
+                int(kind.sum()),
+                int((kind & apart).sum()),
+                int((kind & apart & outside).sum()),
+                _marginal(outside[kind]),
+                upper_bound(int((kind & apart & outside).sum()), int((kind & apart).sum())),
+                float(calibration.scores[kind].max(initial=0.0)),
+            )
+            for name, kind in driving_kinds(robot, s.z, s.start).items()
+            if kind.any()
+        ),
         chosen=calibration.chosen,
         candidates=calibration.candidates,
     )
 
 
-def _groups(robot: Robot, calibration: Calibration, apart: NDArray[np.bool_]) -> tuple[GroupStatement, ...]:
-    """Return the statement for each kind of driving that was recorded."""
-    s, m, known = calibration.samples, robot.action_dim, len(robot.regressor)
-    changes = np.abs(np.diff(s.z[:, known:].reshape(len(s.z), -1, m), axis=1)) / (robot.high() - robot.low())
-    kinds = {START: s.start[:, 1] == 0, RESTLESS: (changes.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
-    driving = regimes(robot, s.z)
-    kinds |= {name: driving == name for name in REGIMES}
-    found = []
-    for name, of in kinds.items():
-        scores = calibration.scores[of]
-        count, independent = len(scores), int((of & apart).sum())
-        excess = float(scores.max(initial=0.0))
-        bound = upper_bound(0, independent)
-        if count:
-            found.append(GroupStatement(name, count, independent, 0, 1.0 / (count + 1), bound, excess))
-    return tuple(found)
+def _marginal(outside: NDArray[np.bool_]) -> float:
+    """Return the expected share of new windows outside, from exchangeable windows of which these were outside."""
+    return (int(outside.sum()) + 1) / (len(outside) + 1)
 
 
 def _share(off: Array, half: Array) -> Array:

@@ -1,0 +1,30 @@
+"""Kinds of driving in which a statement about the average may not hold (docs/method.md §14)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import Robot
+from brakeline.safety.model.error_causes import REGIMES, regimes
+
+Array = NDArray[np.float64]
+
+START, RESTLESS = "first period of an episode", "restless inputs"
+JUMP = 0.5  # share of an input's range; a change from one period to the next above it is a jump
+RESTLESS_SHARE = 0.3  # of a plan's periods with a jump
+
+
+def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
+    """Return which windows (T,) belong to each kind of driving; a window may belong to several kinds.
+
+    Args:
+        robot: the robot.
+        z (T, r + m + N·m): regressors with all inputs.
+        start (T, 2): trajectory and first period.
+    """
+    inputs = z[:, len(robot.regressor) :].reshape(len(z), -1, robot.action_dim)
+    changes = np.abs(np.diff(inputs, axis=1)) / (robot.high() - robot.low())
+    kinds = {START: start[:, 1] == 0, RESTLESS: (changes.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
+    driving = regimes(robot, z)
+    return kinds | {name: driving == name for name in REGIMES}
