@@ -100,7 +100,7 @@ def _windows(data: Dataset, t: Trajectory, number: int, block: Index) -> tuple[A
     start = np.arange(max(len(t.inputs) - N + 1, 0))
     start = start[block[start] == block[start + N - 1]]
     at = start[:, None] + np.arange(N)
-    measured, inputs = t.states[start][:, list(robot.regressor)], t.inputs[at].reshape(len(at), -1)
+    measured, inputs = t.states[start][:, list(robot.regressor)], t.inputs[at].reshape(len(at), N * robot.action_dim)
     z = np.hstack([measured, _before(robot, t)[start], inputs])
     ends = [displacement(robot, t.states[start], t.states[start + k]) for k in range(1, N + 1)]
     after = [predicted_outputs(robot, end) for end in ends]
