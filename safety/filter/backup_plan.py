@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.reservation import Reservation
+from brakeline.safety.filter.widening import Widening
 
 Array = NDArray[np.float64]
 
@@ -56,10 +57,12 @@ class BackupPlan:
         predicted: set of the next measured state, if the decision had one.
         reservation: what is left of the robot's reservation, in a world with other robots.
         seen (n,): last measured state.
+        widening: the last states and inputs, and the factor on the sets of the next decision.
     """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
+        self.widening = Widening(robot)
         self.reset()
 
     def reset(self) -> None:
@@ -70,6 +73,7 @@ class BackupPlan:
         self.predicted: Prediction | None = None
         self.reservation: Reservation | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
+        self.widening.interrupt()
         self._compare = False  # a state was measured since the last decision
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._plan_tokens: tuple[bytes, ...] = ()  # for this period and the later ones; the last one stays
@@ -97,8 +101,14 @@ class BackupPlan:
         verified: bool,
         plan_tokens: Iterable[bytes] = (),
         reservation: Reservation | None = None,
+        score: float | None = None,
     ) -> Array:
-        """Commit to the plan of a decision; return the input to execute next."""
+        """Commit to the plan of a decision; return the input to execute next.
+
+        score: of the window that ended with the request, if the filter gave one.
+        """
+        if score is not None:
+            self.widening.judge(score)
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED
@@ -126,8 +136,12 @@ class BackupPlan:
 
     def _advance(self) -> Array:
         robot = self.robot
-        self._compare = False
         now: Array = self.plan[0].copy()
+        if self._compare:
+            self.widening.executed(self.seen, self.input_in_force, now)
+        else:
+            self.widening.interrupt()
+        self._compare = False
         self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
         self.reservation = None if self.reservation is None else self.reservation.later()
         rests = robot.is_stopping(now, self.seen, self.input_in_force)

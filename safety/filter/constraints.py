@@ -207,13 +207,18 @@ class TubeConstraints:
         other = copy(self)
         for name in ("_reached", "_filled", "_boxes"):
             other.__dict__.pop(name, None)
-        other.widening = widening
+        other.widening, other.reach = widening, self._reach_for(widening)
+        other.far = self.far or widening > 1.0  # the reach is that of tubes without it
         if tube is not self.tube:
             other.tube, other._first = tube, tube.first
             other.discs = _discs(self.robot, tube, self.discs)
             if self.limits is not None:
                 other.limits = self.limits.around(tube)
         return other
+
+    def _reach_for(self, widening: float) -> float:
+        """Return the radius [m] of local maps for tubes that are wider by a factor; no plan leaves it unnoticed."""
+        return min(self.reach * widening, max(self.robot.sight, self.reach))
 
     @cached_property
     def _reached(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
@@ -277,31 +282,32 @@ class TubeConstraints:
         start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
         turn = self.turn(heading)
-        beyond = robot.sight
+        beyond, reach = robot.sight, self._reach_for(request.widening)
         if len(near):
-            beyond, counts = self._parted(near.distance(start) - near.margin, beyond)
+            beyond, counts = self._parted(near.distance(start) - near.margin, beyond, reach)
             near = near.take(counts)
         moving = request.movers
         if moving is not None:
-            beyond, counts = self._parted(moving.least_distance(start, robot.horizon * robot.period), beyond)
+            beyond, counts = self._parted(moving.least_distance(start, robot.horizon * robot.period), beyond, reach)
             moving = moving.take(counts) if counts.any() else None
         other_reservations = request.other_reservations
         if other_reservations is not None:
-            beyond, counts = self._parted(other_reservations.nearest(start), beyond)
+            beyond, counts = self._parted(other_reservations.nearest(start), beyond, reach)
             other_reservations = other_reservations.take(counts) if counts.any() else None
         unseen: seen.OccupiedCells | shades.OccludedRegions | None = None
         if isinstance(request.scan, RangeImage):
-            unseen = shades.occluded_regions(request.scan, self._room(z_0, inputs, start, turn), self.body, start)
+            room = self._room(z_0, inputs, start, turn, request.widening)
+            unseen = shades.occluded_regions(request.scan, room, self.body, start)
         elif request.scan is not None:
-            unseen = self._unseen(request.scan, start)
-        return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations)
+            unseen = self._unseen(request.scan, start, reach)
+        return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, request.widening)
 
-    def _parted(self, away: Array, beyond: float) -> tuple[float, NDArray[np.bool_]]:
+    def _parted(self, away: Array, beyond: float, reach: float) -> tuple[float, NDArray[np.bool_]]:
         """Return the distance [m] of the nearest obstacle beyond reach, at most `beyond`, and which (n,) are within.
 
         An obstacle whose distance is NaN counts as within reach.
         """
-        counts = ~(away > self.reach)
+        counts = ~(away > reach)
         return float(away[~counts].min(initial=beyond)), counts
 
     def turn(self, heading: float) -> Array:
@@ -313,19 +319,22 @@ class TubeConstraints:
         turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = cos, -sin, sin, cos
         return turn
 
-    def _room(self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array) -> shades.PlanBoxes:
+    def _room(
+        self, z_0: Array, inputs: tuple[Array, Array], start: Array, turn: Array, widening: float
+    ) -> shades.PlanBoxes:
         """Return boxes, world, that contain the discs' centers under every plan after z_0, with room to spare."""
         z = np.concatenate([z_0, inputs[0]])
         if isinstance(self.tube, RolloutTube):  # a verified plan does not leave the reach, and no box of it is smaller
-            aside = self.reach + self._beside
+            aside = self._reach_for(widening) + self._beside
             boxes = np.tile(np.stack([start - aside, start + aside])[:, None], (1, self.robot.horizon + 1, 1))
         else:
-            boxes = halfspace_kernels.filled_by_plans(*self._filled, z, inputs[1], self._beside, start, turn)
+            filled = self.at(z, widening)._filled
+            boxes = halfspace_kernels.filled_by_plans(*filled, z, inputs[1], self._beside, start, turn)
         return shades.PlanBoxes(boxes, self.robot.horizon * self.robot.period)
 
-    def _unseen(self, scan: Scan, start: Array) -> seen.OccupiedCells | None:
+    def _unseen(self, scan: Scan, start: Array, reach: float) -> seen.OccupiedCells | None:
         """Return the cells that a scan does not show to be free, within reach or able to come there during a plan."""
-        within = self.reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
+        within = reach + scan.speed * (scan.age + self.robot.horizon * self.robot.period)
         within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.sensor_error
         occupied_cells = seen.occupied_cells(scan, within + scan.heading_error * within)
         return occupied_cells if len(occupied_cells) else None

@@ -47,6 +47,7 @@ from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
+from brakeline.safety.model.windows import displacement
 from brakeline.safety.perception.scan_free_space import shows_free
 
 Array = NDArray[np.float64]
@@ -141,6 +142,9 @@ class Filter:
         self.first_free = robot.regressor_dim + robot.committed_steps * robot.action_dim  # of regressors
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
+        steps = model.steps if model.one_step is not None else ()
+        self._kappa = np.array([step.kappa[: robot.state_dim] for step in steps])  # (N, n, nz), for scores
+        self._w = np.array([step.w[: robot.state_dim] for step in steps])
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
     @classmethod
@@ -228,8 +232,9 @@ class Filter:
         committed: free inputs of the committed plan.
         """
         z = self.inputs.regressors(z_0, proposal)
-        if local_map.empty and not self.constraints.far and self.constraints.limits is None:
-            constraints = self._constraints_for(z, local_map.widening)
+        everywhere = local_map.empty and self.constraints.limits is None
+        if everywhere and not self.constraints.far and local_map.widening == 1.0:
+            constraints = self._constraints_for(z)
             return _Candidate(ALLOWED, self.inputs.plan(z), z, self.reach, True, constraints)
         constraints, general = self._constraints_for(z, local_map.widening), self.constraints.at(z, local_map.widening)
         planes = constraints.planes(local_map, z)
@@ -509,7 +514,26 @@ class Filter:
             for_clearance=candidate.for_clearance if candidate.kind == ADJUSTED else None,
             reservation=reservation,
             bound=self.bound,
+            widening=request.widening,
+            score=self.score(request),
         )
+
+    def score(self, request: Request) -> float | None:
+        """Return the largest ratio of an error to its set in the window that ends with the request (§15).
+
+        The sets are those without widening. None if there is no window, or no predictor for driving of any kind.
+        """
+        model, past = self.model, request.past
+        if model.one_step is None or past is None or not request.finite:
+            return None
+        robot = self.robot
+        z = np.concatenate([past.states[0, self.regressor], past.inputs.ravel()])
+        after = displacement(robot, past.states[0], np.vstack([past.states[1:], request.state]))
+        off = np.abs(after - model.one_step.rollouts(robot, z[None])[0, :, : robot.state_dim])
+        widths = self._kappa @ np.abs(z) + self._w
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.where(off > 0.0, off / widths, 0.0)
+        return float(max(shares[:, : robot.position_dim].max(), shares[0].max()))
 
     def standing_reservation(self, state: Array) -> Reservation:
         """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""

@@ -19,6 +19,7 @@ from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
+from brakeline.safety.filter.widening import PastWindow
 
 Array = NDArray[np.float64]
 
@@ -53,6 +54,8 @@ class Request:
         reservation: the reservation of this robot, in a world with other robots.
         other_reservations: the reservations of the other robots.
         observation: the input of a rival's networks; the filter does not need it.
+        widening: factor on every set, at least 1 (docs/method.md §15).
+        past: the last periods of a plan's length, whose score the decision tells.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it.
     """
@@ -70,6 +73,8 @@ class Request:
     other_reservations: OtherReservations | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     known_free: bool = False
+    widening: float = 1.0
+    past: PastWindow | None = None
 
     def __post_init__(self) -> None:
         """Convert arrays to the type and the memory layout that compiled code needs."""
@@ -107,6 +112,9 @@ class Decision:
         reservation: the space that this robot reserves against the other robots of its world.
         bound: the largest share of verified plans that leave their tubes, at 99 % confidence. 1 if the model set states
             no bound, None if the method verifies nothing.
+        widening: the factor on all sets of this decision, from the request.
+        score: the largest ratio of an error to its set, without widening, in the window that ended with the request.
+            None without such a window, or if the model set cannot tell.
         for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
             unknown.
     """
@@ -133,6 +141,8 @@ class Decision:
     reservation: Reservation | None = None
     bound: float | None = None
     for_clearance: bool | None = None
+    widening: float = 1.0
+    score: float | None = None
 
 
 def check_for_filter(robot: Robot, request: Request) -> None:
@@ -172,6 +182,10 @@ def check_surroundings(robot: Robot, request: Request) -> None:
     moving = request.movers is not None and len(request.movers)
     if not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
         raise BadRequest("obstacles", NOTHING_KNOWN)
+    if not 1.0 <= request.widening < math.inf:  # a smaller factor would make sets smaller than stated
+        raise BadRequest("widening", f"a widening is a finite factor of at least 1, not {request.widening:g}")
+    if request.past is not None:
+        _check_past(robot, request.past)
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
@@ -180,6 +194,14 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+
+
+def _check_past(robot: Robot, past: PastWindow) -> None:
+    sizes = (robot.horizon, robot.state_dim), (robot.horizon + 1, robot.action_dim)
+    if (past.states.shape, past.inputs.shape) != sizes:
+        raise BadRequest("past", f"past has {sizes[0][0]} states and {sizes[1][0]} inputs of {robot.name}")
+    if not (np.isfinite(past.states).all() and np.isfinite(past.inputs).all()):
+        raise BadRequest("past", "past holds NaN or infinity")
 
 
 class FastRequestCheck:

@@ -139,5 +139,11 @@ def known_free_in(value: bool) -> bool:
 def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
     """Commit to an answer's plan, and return `answer.action`, the input to execute next."""
     return backup_plan.accept(
-        answer.plan, answer.model, answer.predicted, answer.verified, answer.plan_tokens, answer.reservation
+        answer.plan,
+        answer.model,
+        answer.predicted,
+        answer.verified,
+        answer.plan_tokens,
+        answer.reservation,
+        answer.score,
     )

@@ -122,6 +122,8 @@ class InProcess:
             predicted=backup_plan.predicted,
             observation=observation_in(observation),
             known_free=known_free_in(known_free),
+            widening=backup_plan.widening.factor,
+            past=backup_plan.widening.past,
         )
 
 

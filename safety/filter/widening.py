@@ -1,0 +1,79 @@
+"""How much wider than stated the sets of a robot must be today (docs/method.md §15).
+
+A payload, a worn tyre or wind makes any model wrong for good. Whoever keeps the backup plan also keeps the last states
+and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
+The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import Robot
+
+Array = NDArray[np.float64]
+
+WINDOWS = 600  # last windows whose scores count
+MOST = 1e3  # beyond it nothing is verified anyway, and a request needs a finite factor
+RESERVE = 1.1  # factor on the largest score
+
+
+@dataclass(frozen=True)
+class PastWindow:
+    """The last periods of a plan's length, up to the state in the request.
+
+    Attributes:
+        states (N, n): measured states at the periods' starts.
+        inputs (N + 1, m): the input in force before the first period, then the executed inputs.
+    """
+
+    states: Array
+    inputs: Array
+
+
+class Widening:
+    """The last measured states and executed inputs of one robot, and the factor that follows from their scores."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._scores: deque[tuple[int, float]] = deque()  # falling scores, each the largest since the one before it
+        self._count = 0
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Begin a new window: an episode has ended, or a period had no measurement. The scores stay."""
+        self._states: deque[Array] = deque(maxlen=self.robot.horizon)
+        self._inputs: deque[Array] = deque(maxlen=self.robot.horizon + 1)
+
+    def executed(self, state: Array, before: Array, action: Array) -> None:
+        """Add a period: the measured state (n,) at its start, the input before it and its own input (m,)."""
+        if not self._states:
+            self._inputs.append(before.copy())
+        self._states.append(state.copy())
+        self._inputs.append(action.copy())
+
+    @property
+    def past(self) -> PastWindow | None:
+        """The window that ends at the next measurement; None before a plan's length has passed."""
+        if len(self._states) < self.robot.horizon:
+            return None
+        return PastWindow(np.array(self._states), np.array(self._inputs))
+
+    def judge(self, score: float) -> None:
+        """Add the score of a window that has ended. A score that is no number counts as infinite."""
+        score = score if score == score else np.inf
+        self._count += 1
+        while self._scores and self._scores[-1][1] <= score:
+            self._scores.pop()
+        self._scores.append((self._count, score))
+        if self._scores[0][0] <= self._count - WINDOWS:
+            self._scores.popleft()
+
+    @property
+    def factor(self) -> float:
+        """The factor on every set: at least 1."""
+        return min(max(1.0, RESERVE * self._scores[0][1]), MOST) if self._scores else 1.0

@@ -1,0 +1,96 @@
+"""The widening of all sets that follows from how much of them was used (docs/method.md §15)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brakeline.errors import BadRequest
+from brakeline.messaging.obstacle import Shapes
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import Request
+from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening
+from brakeline.safety.service.in_process import InProcess
+from tests.robots import GROUND
+from tests.safety.asked import cylinder
+from tests.safety.test_one_step import certified, ready, request
+from tests.safety.test_turning_in_place import ROBOT, wandering
+from tests.safety.unicycle import Unicycle
+
+POSTS = [cylinder(0.3, 0.25, 0.1), cylinder(-0.4, -0.3, 0.1)]
+
+
+def test_the_factor_is_a_tenth_above_the_largest_recent_score_and_never_below_one():
+    widening = Widening(ROBOT)
+    assert widening.factor == 1.0
+    for score in (0.5, 2.0, 0.1):
+        widening.judge(score)
+    assert widening.factor == pytest.approx(2.0 * RESERVE)
+    for _ in range(WINDOWS - 2):
+        widening.judge(0.3)
+    assert widening.factor == pytest.approx(2.0 * RESERVE)
+    widening.judge(0.3)
+    assert widening.factor == 1.0
+    widening.judge(np.nan)
+    assert widening.factor == MOST
+
+
+def test_a_window_holds_the_last_periods_without_a_gap():
+    widening, N = Widening(ROBOT), ROBOT.horizon
+    inputs = np.arange(2.0 * (N + 3)).reshape(-1, 2)
+    for k in range(1, N + 2):
+        assert widening.past is None or k == N + 1
+        widening.executed(np.full(5, float(k)), inputs[k - 1], inputs[k])
+    past = widening.past
+    assert past.states[:, 0].tolist() == list(range(2, N + 2))
+    assert past.inputs.tolist() == inputs[1 : N + 2].tolist()
+    widening.interrupt()
+    assert widening.past is None
+
+
+@pytest.mark.parametrize("factor", [0.99, 0.0, -1.0, np.nan, np.inf])
+def test_a_factor_below_one_or_without_a_value_is_refused(factor):
+    ask = replace(request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS), widening=factor)
+    with pytest.raises(BadRequest, match="widening"):
+        ready().decide(ask)
+
+
+def test_a_window_of_the_wrong_size_or_with_nan_is_refused():
+    ask = request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS)
+    N = ROBOT.horizon
+    for states, inputs in ((N, N), (N - 1, N + 1)):
+        with pytest.raises(BadRequest, match="past"):
+            ready().decide(replace(ask, past=PastWindow(np.zeros((states, 5)), np.zeros((inputs, 2)))))
+    with pytest.raises(BadRequest, match="NaN"):
+        ready().decide(replace(ask, past=PastWindow(np.full((N, 5), np.nan), np.zeros((N + 1, 2)))))
+
+
+@pytest.mark.parametrize("of", ["one-step", "direct"])
+def test_every_set_grows_by_the_factor_and_the_margin_falls(of):
+    safety, robot = (ready(), ROBOT) if of == "one-step" else (Filter.load("ground"), GROUND)
+    plan = np.zeros((robot.horizon, 2))
+    ask = Request(np.zeros(5), np.array([0.1, 0.2]), np.zeros(2), plan, Shapes.of(POSTS, 2))
+    stated, wide = safety.decide(ask), safety.decide(replace(ask, widening=3.0))
+    noise = np.array(robot.measurement_bound[:2])
+    assert wide.tube_half_width - noise == pytest.approx(3.0 * (stated.tube_half_width - noise))
+    assert wide.predicted.half_width == pytest.approx(3.0 * stated.predicted.half_width)
+    assert wide.margin < stated.margin and wide.widening == 3.0
+    moving = replace(ask, state=np.array([0.0, 0.0, 0.0, 0.1, 0.0]), input_in_force=np.array([0.1, 0.0]))
+    assert not safety.decide(replace(moving, widening=1e3)).verified
+
+
+def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
+    """The robot answers as if it were heavier; without the widening most windows leave their sets."""
+    client = InProcess(Filter(certified()[0]), accept_bound=1.0)
+    rng = np.random.default_rng(3)
+    robot = Unicycle((0.0, 0.0, 0.0), rng, slip=-0.05)  # it drives slower than asked
+    scores, factors = [], []
+    for action in wandering(rng, 300):
+        answer = client.decide(robot.measure(), action, [], known_free=True)
+        scores.append(0.0 if answer.score is None else answer.score)
+        factors.append(answer.widening)
+        robot.step(answer.action)
+    scores, factors = np.array(scores), np.array(factors)
+    assert (scores[100:] > 1.0).mean() > 0.3
+    assert (scores[100:] > factors[100:]).mean() < 0.02
+    assert factors[0] == 1.0 and 1.5 < factors[-1] < 20.0
