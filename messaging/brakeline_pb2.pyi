@@ -441,6 +441,9 @@ class Request(_message.Message):
     SCAN_FIELD_NUMBER: _builtins.int
     IMAGE_FIELD_NUMBER: _builtins.int
     KNOWN_FREE_FIELD_NUMBER: _builtins.int
+    WIDENING_FIELD_NUMBER: _builtins.int
+    PAST_STATES_FIELD_NUMBER: _builtins.int
+    PAST_INPUTS_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -455,6 +458,8 @@ class Request(_message.Message):
     """signature by which the service recognises `plan` as verified by `model` (safety/service/plan_token.py)"""
     known_free: _builtins.bool
     """Nothing but `obstacles` is near: all other space within reach is free. Needed without obstacles, scan and image."""
+    widening: _builtins.float
+    """factor on every set of the tube, at least 1; 0: not given, so 1"""
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """measured"""
@@ -499,6 +504,16 @@ class Request(_message.Message):
     def image(self) -> Global___RangeImage:
         """the same for a robot in space"""
 
+    @_builtins.property
+    def past_states(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """The last `horizon` periods up to `state`, if the last decision asked for them: their score is in the decision.
+        (horizon, state), measured at the periods' starts
+        """
+
+    @_builtins.property
+    def past_inputs(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(horizon + 1, inputs): the input before the first period, then those executed"""
+
     def __init__(
         self,
         *,
@@ -523,10 +538,13 @@ class Request(_message.Message):
         scan: Global___Scan | None = ...,
         image: Global___RangeImage | None = ...,
         known_free: _builtins.bool = ...,
+        widening: _builtins.float = ...,
+        past_states: _abc.Iterable[_builtins.float] | None = ...,
+        past_inputs: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "state", b"state", "step", b"step", "time", b"time", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -587,6 +605,8 @@ class Decision(_message.Message):
     STOPPED_FIELD_NUMBER: _builtins.int
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     BOUND_FIELD_NUMBER: _builtins.int
+    JUDGES_FIELD_NUMBER: _builtins.int
+    SCORE_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -625,6 +645,10 @@ class Decision(_message.Message):
     """The model set's statement: at most this share of the plans that it verifies leave their tubes, at 99 % confidence;
     1: it states nothing. Absent: another method, or a log from before.
     """
+    judges: _builtins.bool
+    """the model set can score the last periods: send them with the next request"""
+    score: _builtins.float
+    """largest ratio of an error to its set, without widening, in the periods of the request"""
     @_builtins.property
     def plan(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """(horizon, inputs); its first row is to be executed now"""
@@ -685,19 +709,25 @@ class Decision(_message.Message):
         stopped: Global___Stopped | None = ...,
         for_clearance: _builtins.bool | None = ...,
         bound: _builtins.float | None = ...,
+        judges: _builtins.bool = ...,
+        score: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "score", b"score", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "judges", b"judges", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "score", b"score", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
     _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015
     _WhichOneofReturnType__for_clearance: _TypeAlias = _typing.Literal["for_clearance"]  # noqa: Y015
     _WhichOneofArgType__for_clearance: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance"]  # noqa: Y015
+    _WhichOneofReturnType__score: _TypeAlias = _typing.Literal["score"]  # noqa: Y015
+    _WhichOneofArgType__score: _TypeAlias = _typing.Literal["_score", b"_score"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__bound) -> _WhichOneofReturnType__bound | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__for_clearance) -> _WhichOneofReturnType__for_clearance | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__score) -> _WhichOneofReturnType__score | None: ...
 
 Global___Decision: _TypeAlias = Decision  # noqa: Y015
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.filter.widening import Widening
+from brakeline.safety.filter.widening import PastWindow, Widening
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,7 @@ class BackupPlan:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.widening = Widening(robot)
+        self._scored_by = ""
         self.reset()
 
     def reset(self) -> None:
@@ -74,6 +75,7 @@ class BackupPlan:
         self.reservation: Reservation | None = None
         self.seen: Array = np.zeros(self.robot.state_dim)  # the last measured state: of feedback, a stop is made of it
         self.widening.interrupt()
+        self._judged = False
         self._compare = False  # a state was measured since the last decision
         self._still = self.robot.horizon  # periods of a stop's inputs
         self._plan_tokens: tuple[bytes, ...] = ()  # for this period and the later ones; the last one stays
@@ -82,6 +84,11 @@ class BackupPlan:
     def next_input(self) -> Array:
         """(m,) the input to execute in the coming period, after `accept` or `fallback`."""
         return self.plan[0].copy() if self.robot.late else self.input_in_force
+
+    @property
+    def past(self) -> PastWindow | None:
+        """The window that ends with the next request, if the last decision asked for it."""
+        return self.widening.past if self._judged else None
 
     @property
     def plan_token(self) -> bytes:
@@ -102,12 +109,20 @@ class BackupPlan:
         plan_tokens: Iterable[bytes] = (),
         reservation: Reservation | None = None,
         score: float | None = None,
+        judges: bool = False,
     ) -> Array:
         """Commit to the plan of a decision; return the input to execute next.
 
-        score: of the window that ended with the request, if the filter gave one.
+        Args:
+            plan, model, predicted, verified, plan_tokens, reservation: of the decision.
+            score: of the window that ended with the request, if the filter gave one.
+            judges: whether the filter can score a window; if not, `past` gives none.
         """
-        if score is not None:
+        self._judged = judges
+        if verified and model != self._scored_by:  # scores are relative to the sets of one model set
+            self.widening.forget()
+            self._scored_by = model
+        elif score is not None:
             self.widening.judge(score)
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)

@@ -514,7 +514,7 @@ class Filter:
             for_clearance=candidate.for_clearance if candidate.kind == ADJUSTED else None,
             reservation=reservation,
             bound=self.bound,
-            widening=request.widening,
+            judges=self.model.one_step is not None,
             score=self.score(request),
         )
 

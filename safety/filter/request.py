@@ -112,9 +112,9 @@ class Decision:
         reservation: the space that this robot reserves against the other robots of its world.
         bound: the largest share of verified plans that leave their tubes, at 99 % confidence. 1 if the model set states
             no bound, None if the method verifies nothing.
-        widening: the factor on all sets of this decision, from the request.
-        score: the largest ratio of an error to its set, without widening, in the window that ended with the request.
-            None without such a window, or if the model set cannot tell.
+        judges: the model set can score a window that has ended; the next request should hold one.
+        score: the largest ratio of an error to its set, without widening, in the request's past window. None without
+            such a window, or if the model set cannot score it.
         for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
             unknown.
     """
@@ -141,7 +141,7 @@ class Decision:
     reservation: Reservation | None = None
     bound: float | None = None
     for_clearance: bool | None = None
-    widening: float = 1.0
+    judges: bool = False
     score: float | None = None
 
 

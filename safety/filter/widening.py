@@ -40,9 +40,13 @@ class Widening:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
+        self.forget()
+        self.interrupt()
+
+    def forget(self) -> None:
+        """Drop all scores: another model set is in use."""
         self._scores: deque[tuple[int, float]] = deque()  # falling scores, each the largest since the one before it
         self._count = 0
-        self.interrupt()
 
     def interrupt(self) -> None:
         """Begin a new window: an episode has ended, or a period had no measurement. The scores stay."""

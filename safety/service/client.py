@@ -70,7 +70,11 @@ def request_message(
         step=step,
         time=time,
         fleet=fleet,
+        widening=backup_plan.widening.factor,
     )
+    if (past := backup_plan.past) is not None:
+        message.past_states.extend(past.states.ravel().tolist())
+        message.past_inputs.extend(past.inputs.ravel().tolist())
     set_measurement(message, scan_in(scan))
     if backup_plan.predicted is not None:
         message.predicted_center.extend(backup_plan.predicted.center.tolist())

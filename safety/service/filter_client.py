@@ -146,4 +146,5 @@ def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
         answer.plan_tokens,
         answer.reservation,
         answer.score,
+        answer.judges,
     )

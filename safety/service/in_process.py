@@ -123,7 +123,7 @@ class InProcess:
             observation=observation_in(observation),
             known_free=known_free_in(known_free),
             widening=backup_plan.widening.factor,
-            past=backup_plan.widening.past,
+            past=backup_plan.past,
         )
 
 

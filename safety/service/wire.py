@@ -24,6 +24,7 @@ from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
+from brakeline.safety.filter.widening import PastWindow
 
 KIND_NUMBERS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 KIND_NAMES = {number: name for name, number in KIND_NUMBERS.items()}
@@ -36,7 +37,7 @@ DIGEST_SIZE = 16  # bytes
 # Fields with the same name and value in a decision and in its message.
 SAME_FIELDS = (
     *("margin", "at_least", "model", "reason", "verified", "contained", "compared"),
-    *("time_ms", "solve_ms", "verify_ms", "solver", "iterations", "broken"),
+    *("time_ms", "solve_ms", "verify_ms", "solver", "iterations", "broken", "judges"),
 )
 
 
@@ -132,7 +133,18 @@ def request_of(
         other_reservations=other_reservations,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
         known_free=message.known_free,
+        widening=message.widening or 1.0,
+        past=_past_of(message, robot),
     )
+
+
+def _past_of(message: pb.Request, robot: Robot) -> PastWindow | None:
+    if not message.past_states and not message.past_inputs:
+        return None
+    states, inputs, N = array_of(message.past_states), array_of(message.past_inputs), robot.horizon
+    if (states.size, inputs.size) != (N * robot.state_dim, (N + 1) * robot.action_dim):
+        raise BadRequest("past", f"past holds {N} states and {N + 1} inputs of {robot.name}")
+    return PastWindow(states.reshape(N, -1), inputs.reshape(N + 1, -1))
 
 
 def array_of(field: Collection[float]) -> NDArray[np.float64]:
@@ -184,6 +196,7 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
         queue_ms=queue_ms,
         for_clearance=decision.for_clearance,
         bound=decision.bound,
+        score=decision.score,
         **{name: getattr(decision, name) for name in SAME_FIELDS},
     )
     if (stopped := decision.blocked_by) is not None:
@@ -224,6 +237,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
         bound=valid_bound(m.bound) if m.HasField("bound") else None,
+        score=max(m.score, 0.0) if m.HasField("score") else None,
     )
 
 

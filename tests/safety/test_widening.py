@@ -10,7 +10,9 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening
+from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
+from brakeline.safety.service.wire import decision_of, decision_reply, request_of
 from tests.robots import GROUND
 from tests.safety.asked import cylinder
 from tests.safety.test_one_step import certified, ready, request
@@ -74,9 +76,25 @@ def test_every_set_grows_by_the_factor_and_the_margin_falls(of):
     noise = np.array(robot.measurement_bound[:2])
     assert wide.tube_half_width - noise == pytest.approx(3.0 * (stated.tube_half_width - noise))
     assert wide.predicted.half_width == pytest.approx(3.0 * stated.predicted.half_width)
-    assert wide.margin < stated.margin and wide.widening == 3.0
+    assert wide.margin < stated.margin
     moving = replace(ask, state=np.array([0.0, 0.0, 0.0, 0.1, 0.0]), input_in_force=np.array([0.1, 0.0]))
     assert not safety.decide(replace(moving, widening=1e3)).verified
+
+
+def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_scores():
+    client, rng = InProcess(ready(), accept_bound=1.0), np.random.default_rng(0)
+    plan, robot = client.backup_plan, Unicycle((0.0, 0.0, 0.0), rng)
+    for action in wandering(rng, ROBOT.horizon + 3):
+        answer = client.decide(robot.measure(), action, [], known_free=True)
+        robot.step(answer.action)
+    plan.widening.judge(2.0)
+    asked = request_of(request_message(plan, robot.measure(), np.zeros(2), known_free=True), ROBOT)
+    assert asked.widening == pytest.approx(2.0 * RESERVE)
+    assert (asked.past.states == plan.past.states).all() and (asked.past.inputs == plan.past.inputs).all()
+    sent = decision_reply(answer, 0.0).decision
+    assert decision_of(sent, ROBOT).score == answer.score and decision_of(sent, ROBOT).judges
+    plan.accept(answer.plan, "another", answer.predicted, True, judges=True, score=5.0)
+    assert plan.widening.factor == 1.0
 
 
 def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
@@ -86,9 +104,9 @@ def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
     robot = Unicycle((0.0, 0.0, 0.0), rng, slip=-0.05)  # it drives slower than asked
     scores, factors = [], []
     for action in wandering(rng, 300):
+        factors.append(client.backup_plan.widening.factor)
         answer = client.decide(robot.measure(), action, [], known_free=True)
         scores.append(0.0 if answer.score is None else answer.score)
-        factors.append(answer.widening)
         robot.step(answer.action)
     scores, factors = np.array(scores), np.array(factors)
     assert (scores[100:] > 1.0).mean() > 0.3
