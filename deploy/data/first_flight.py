@@ -23,7 +23,7 @@ from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.errors import BadData, FlightEnded, Unsupported
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
-from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.validation import ValidationReport
 from brakeline.safety.model.windows import FREE, windows
 
@@ -245,7 +245,8 @@ class FirstFlight:
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
         """Certify while the vehicle hovers."""
         try:
-            return certify_supported(replace(data, robot=self._robot), ModelConfig().of_minutes())[:2]
+            config = ModelConfig(mode=ONE_STEP).of_minutes()
+            return certify_supported(replace(data, robot=self._robot), config)[:2]
         except (BadData, Unsupported) as error:
             missing.append(f"the data support no model set: {error}")
             return None, None
