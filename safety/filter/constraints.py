@@ -142,7 +142,6 @@ class TubeConstraints:
     """A tube, and the rows that the surroundings of a robot add to it.
 
     Attributes:
-        discs: discs of the body, each with its tube. boxes: builds the rows of reservations. limits: of state limits.
         measured (d,): half-widths of the position's measurement error [m].
         clearance_margin, reach [m]: see `Filter`. widest [m]: no tube, with the body, goes farther.
         far: a tube may leave the sensor's range, so every candidate is checked against it.
@@ -172,7 +171,7 @@ class TubeConstraints:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.widening = 1.0
-        self.discs = _discs(robot, tube)
+        self._base: TubeConstraints | None = None
         self._free = free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
         whole = np.ascontiguousarray
         self._spans, self._W_free = whole(np.abs(tube.directions)), whole(np.abs(tube.W[:, -free:]))
@@ -183,7 +182,6 @@ class TubeConstraints:
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self._regressor = model.first_regressor
-        self.limits = StateLimits(robot, tube) if robot.limits else None
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m
@@ -210,15 +208,27 @@ class TubeConstraints:
         other.widening, other.reach = widening, self._reach_for(widening)
         other.far = self.far or widening > 1.0  # the reach is that of tubes without it
         if tube is not self.tube:
-            other.tube, other._first = tube, tube.first
-            other.discs = _discs(self.robot, tube, self.discs)
-            if self.limits is not None:
-                other.limits = self.limits.around(tube)
+            other.tube, other._first, other._base = tube, tube.first, self
+            for name in ("discs", "limits"):
+                other.__dict__.pop(name, None)
         return other
 
     def _reach_for(self, widening: float) -> float:
         """Return the radius [m] of local maps for tubes that are wider by a factor; no plan leaves it unnoticed."""
         return min(self.reach * widening, max(self.robot.sight, self.reach))
+
+    @cached_property
+    def discs(self) -> list[_Disc]:
+        """Discs of the body, each with its tube."""
+        return _discs(self.robot, self.tube, None if self._base is None else self._base.discs)
+
+    @cached_property
+    def limits(self) -> StateLimits | None:
+        """The rows of the state limits, if the robot has any."""
+        if not self.robot.limits:
+            return None
+        base = None if self._base is None else self._base.limits
+        return StateLimits(self.robot, self.tube) if base is None else base.around(self.tube)
 
     @cached_property
     def _reached(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:

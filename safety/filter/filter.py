@@ -52,6 +52,7 @@ from brakeline.safety.perception.scan_free_space import shows_free
 
 Array = NDArray[np.float64]
 
+NO_ROWS = np.zeros(0)
 LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
@@ -236,7 +237,10 @@ class Filter:
         if everywhere and not self.constraints.far and local_map.widening == 1.0:
             constraints = self._constraints_for(z)
             return _Candidate(ALLOWED, self.inputs.plan(z), z, self.reach, True, constraints)
-        constraints, general = self._constraints_for(z, local_map.widening), self.constraints.at(z, local_map.widening)
+        constraints = self._constraints_for(z, local_map.widening)
+        if everywhere and (margin := constraints.least(NO_ROWS, z)) >= max(self.clearance_margin, 0.0):
+            return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
+        general = self.constraints.at(z, local_map.widening) if self._turns_in_place(z) else constraints
         planes = constraints.planes(local_map, z)
         slack = constraints.slack(local_map, z, planes)
         margin = constraints.least(slack, z)

@@ -136,6 +136,10 @@ class RolloutTube(Tube):
     kept: tuple[int, ...] = field(kw_only=True)
 
     @cached_property
+    def _kept(self) -> NDArray[np.int64]:
+        return np.array(self.kept, dtype=np.int64)
+
+    @cached_property
     def _arguments(self) -> Arguments:
         return self.one_step.arguments(self.robot)
 
@@ -143,21 +147,10 @@ class RolloutTube(Tube):
         """Linearise the rollout at z: the centers are exact there, and affine everywhere."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        outputs, gradient = rollout_kernels.linearized(*self._arguments, z, self.inputs_of)
-        offset, d, kept = outputs - gradient @ z, self.position.shape[1], list(self.kept)
-        n = self.robot.state_dim
-        return Tube(
-            np.ascontiguousarray(gradient[:, :d]),
-            self.directions,
-            self.W,
-            self.M,
-            self.m_0,
-            gradient[:, kept],
-            self.more_directions,
-            offset[:, :d],
-            offset[:, kept],
-            outputs[0, :n],
-        )
+        parts = rollout_kernels.affine(*self._arguments, z, self.inputs_of, self._kept)
+        position, offset, more, more_offset, first = parts
+        sets = self.W, self.M, self.m_0
+        return Tube(position, self.directions, *sets, more, self.more_directions, offset, more_offset, first)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""

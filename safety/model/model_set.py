@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +71,16 @@ class ModelSet:
         """The bound for one period, which the next measurement is compared with."""
         return self.steps[0]
 
+    @cached_property
+    def _inputs_of(self) -> Array:
+        """The map from the regressors of a plan to those of a free window."""
+        return plan_regressor_map(self.robot)
+
     def first_regressor(self, z: Array) -> Array:
         """Return the regressor of `first` from z (..., nz): [...; input in force; first input]."""
         robot = self.robot
         if self.model_config.mode != RECURSION:
-            return z if self.model_config.windows == PLAN else z @ plan_regressor_map(robot).T
+            return z if self.model_config.windows == PLAN else z @ self._inputs_of.T
         reg, m = len(robot.regressor), robot.action_dim
         missing = robot.state_dim - robot.position_dim - reg  # coordinates that are zero in the frame of now
         zeros = np.zeros((*z.shape[:-1], missing))
@@ -152,7 +158,7 @@ class ModelSet:
             tube = stack_direct(steps, d, chord_deviations, stopping_distance, more)
             if self.one_step is None:
                 return tube
-            inputs_of = plan_regressor_map(self.robot) if plans else np.eye(regressors(self.robot, self.model_config))
+            inputs_of = self._inputs_of if plans else np.eye(regressors(self.robot, self.model_config))
             return stack_rollout(tube, self.robot, self.one_step, inputs_of, more)
         how = recursion_maps(self.robot, plans or self.model_config.windows == PLAN)
         return stack_recursive(steps, how, d, chord_deviations, stopping_distance, more=more)

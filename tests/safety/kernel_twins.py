@@ -154,3 +154,10 @@ def linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z
     ends = [rollouts(*parts, ((z + sign * step * np.eye(len(z))) @ T.T)) for sign in (1.0, -1.0)]
     gradient = (ends[0] - ends[1]) / (2.0 * step)
     return rollouts(*parts, (T @ z)[None])[0], np.moveaxis(gradient, 0, -1)
+
+
+def affine(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T, kept):
+    """`rollout_kernels.affine`."""
+    outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
+    offset = outputs - gradient @ z
+    return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept], outputs[0, : len(C)]

@@ -217,3 +217,44 @@ def linearized(
                 slope[at, c] -= north * dpose[0, c]
                 slope[at + 1, c] += east * dpose[0, c]
     return outputs, gradient
+
+
+@compiled(
+    "Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1]))"
+    "(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[::1], f8[:,::1], i8[::1])"
+)
+def affine(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    z: Array,
+    T: Array,
+    kept: Index,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `kept` (k,).
+
+    Returns:
+        Gradient (N, d, nz) and offset (N, d) of the positions, the same of the kept coordinates, and all coordinates
+        after one period (n,).
+    """
+    outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
+    N, nz, k = len(outputs), len(z), len(kept)
+    position, offset = np.empty((N, d, nz)), np.empty((N, d))
+    more, more_offset = np.empty((N, k, nz)), np.empty((N, k))
+    for i in range(N):
+        for axis in range(d + k):
+            at = axis if axis < d else kept[axis - d]
+            rest = outputs[i, at]
+            for j in range(nz):
+                rest -= gradient[i, at, j] * z[j]
+            if axis < d:
+                position[i, axis], offset[i, axis] = gradient[i, at], rest
+            else:
+                more[i, axis - d], more_offset[i, axis - d] = gradient[i, at], rest
+    return position, offset, more, more_offset, outputs[0, : len(C)].copy()
