@@ -78,7 +78,7 @@ class CertifyCommand:
         models: list[tuple[ModelSet, ValidationReport]] = []
         results: dict[str, Any] = {}
         notes: list[str] = []
-        forms = self._forms(robot)
+        forms = self._forms(data.robot)
         with under_way("certifying", len(forms)) as advance:
             for kind, mode in forms:
                 advance(0, f"certifying {kind}, {mode}")
