@@ -137,6 +137,9 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
     if plans.get("flown"):
         outside = f"{_share(plans['outside'], plans['flown'])}; {stated(plans)}"
         yield "verified plans that were followed", f"{plans['flown']}, left their tube: {outside}"
+    if plans.get("scored"):
+        wide = f"{_share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
+        yield "windows outside the stated sets", f"{_share(plans['beyond'], plans['scored'])}; {wide}"
     for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):
         if figures.get(name):
             yield f"[red]{label}[/]", str(figures[name])

@@ -35,6 +35,9 @@ class TubeStats:
         outside: how many of them left their tube: a measured position was outside at the end of a period.
         excess: largest ratio of the distance from the tube's center to its half-width.
         bound: largest fraction of plans outside that the model sets state; None if a decision has no bound.
+        scored: number of windows of a plan's length that the filter scored, whatever the plans were.
+        beyond, beyond_widened: how many of them left the stated sets, and the sets as widened at their end.
+        widening: largest widening of a request.
     """
 
     robots: RecordedRobots = field(default_factory=RecordedRobots)
@@ -42,6 +45,10 @@ class TubeStats:
     outside: int = 0
     excess: float = 0.0
     bound: float | None = 0.0
+    scored: int = 0
+    beyond: int = 0
+    beyond_widened: int = 0
+    widening: float = 1.0
     _own: pb.Exchange | None = None  # latest exchange whose own proposal was verified
     _tube: tuple[Array, Array] | None = None  # centers and half-widths (N, d), once the actor follows the plan
     _periods: int = 0  # since `_own`
@@ -50,6 +57,11 @@ class TubeStats:
     def exchange(self, exchange: pb.Exchange) -> None:
         """Add the actor's next exchange."""
         decision = exchange.reply.decision
+        self.widening = max(self.widening, exchange.request.widening)
+        if decision.HasField("score"):
+            self.scored += 1
+            self.beyond += not decision.score <= 1.0
+            self.beyond_widened += not decision.score <= max(exchange.request.widening, 1.0)
         if self._own is not None and not self._goes_on(exchange):
             self._end()
         if self._own is not None:
@@ -112,7 +124,8 @@ def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
 
 def figures(parts: Iterable[TubeStats]) -> Figures:
     """Return the figures of all actors."""
-    parts = [part for part in parts if part.flown]
+    every = list(parts)
+    parts = [part for part in every if part.flown]
     stated = [part.bound for part in parts]
     known = [bound for bound in stated if bound is not None]
     return {
@@ -120,6 +133,10 @@ def figures(parts: Iterable[TubeStats]) -> Figures:
         "outside": sum(part.outside for part in parts),
         "excess": max((part.excess for part in parts), default=0.0),
         "bound": max(known) if known and len(known) == len(stated) else None,
+        "scored": sum(part.scored for part in every),
+        "beyond": sum(part.beyond for part in every),
+        "beyond_widened": sum(part.beyond_widened for part in every),
+        "widening": max((part.widening for part in every), default=1.0),
     }
 
 

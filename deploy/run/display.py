@@ -110,6 +110,9 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     ]
     if plans["flown"]:
         rows.append(("plans outside tube", f"{share(plans['outside'], plans['flown'])}; {stated(plans)}", "", ""))
+    if plans["scored"]:
+        widest = f"{plans['widening']:.3g} times"
+        rows.append(("windows outside sets", share(plans["beyond"], plans["scored"]), "widened by up to", widest))
     decide, reply = (
         known("{0[p50]:.2f} / {0[p99]:.2f} ms", figures[name]) for name in ("decision_ms", "round_trip_ms")
     )

@@ -97,13 +97,16 @@ def test_malformed_exchanges_raise_no_error(data):
     assert plans.outside <= plans.flown
 
 
+NOT_SCORED = {"scored": 0, "beyond": 0, "beyond_widened": 0, "widening": 1.0}
+
+
 def test_plans_are_among_the_figures_of_a_run():
     metrics = Metrics()
     exchanges = asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.9, 1), asked(2, pb.ALLOWED, 0.2, 2)
     for sequence, exchange in enumerate(exchanges, 1):
         exchange.header.sequence = sequence
         metrics.add("exchange/a", exchange)
-    expected = {"flown": 1, "outside": 1, "excess": pytest.approx(16.0), "bound": None}
+    expected = {"flown": 1, "outside": 1, "excess": pytest.approx(16.0), "bound": None, **NOT_SCORED}
     assert metrics.figures()["plans"] == figures(metrics.plans.values()) == expected
 
 
@@ -123,7 +126,17 @@ def test_the_stated_bound_is_reported_with_the_count():
     assert left(0.01, 0.26)["bound"] == 0.26, "that of the loosest"
     assert left(0.01, None)["bound"] is None and stated(left(None)) == "no bound was recorded"
     assert stated(left(float("nan"))) == "no bound was stated"
-    assert figures([]) == {"flown": 0, "outside": 0, "excess": 0.0, "bound": None}
+    assert figures([]) == {"flown": 0, "outside": 0, "excess": 0.0, "bound": None, **NOT_SCORED}
+
+
+def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_widened():
+    exchanges = [asked(k, pb.ALLOWED) for k in range(4)]
+    for exchange, score, widening in zip(exchanges, (0.5, 1.5, 3.0, float("nan")), (0.0, 1.0, 3.3, 3.3), strict=True):
+        exchange.reply.decision.score, exchange.request.widening = score, widening
+    found = figures([of(*exchanges)])
+    assert (found["scored"], found["beyond"], found["beyond_widened"], found["widening"]) == (4, 3, 2, 3.3)
+    shown = printed(show(closed_loop([]) | {"plans": found}))
+    assert "3 (75.0%); 2 (50.0%) as widened, by up to 3.3 times" in shown
 
 
 def test_the_table_of_a_run_shows_both():
