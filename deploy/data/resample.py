@@ -104,8 +104,11 @@ def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list
     d = robot.position_dim
     at = np.column_stack([np.interp(fine, time, values) for time, values in r.states[:d]])
     paths = at[1:].reshape(count, samples, d) - at[:-1:samples, None]
-    turned = np.zeros(count)
+    turned, headings = np.zeros(count), None
     if robot.heading is not None:
+        time, values = r.states[robot.heading]
+        fine_heading = np.interp(fine, time, values)
+        headings = fine_heading[1:].reshape(count, samples) - fine_heading[:-1:samples, None]
         heading = states[:, robot.heading]
         paths = rotate(paths, np.broadcast_to(-heading[:-1, None], paths.shape[:2]))
         turned = np.diff(heading)
@@ -119,7 +122,8 @@ def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list
     for i, j in zip(bounds[::2], bounds[1::2], strict=True):
         if j - i > FEWEST_PERIODS:  # the first period only gives the input in force at the start
             rows = slice(i + 1, j)
-            pieces.append(Trajectory(states[i + 1 : j + 1], inputs[rows], paths[rows], turned[rows], inputs[i]))
+            within = None if headings is None else headings[rows]
+            pieces.append(Trajectory(states[i + 1 : j + 1], inputs[rows], paths[rows], turned[rows], inputs[i], within))
     return pieces, uneven.astype(float), int((~good).sum())
 
 
@@ -161,7 +165,8 @@ def _split(t: Trajectory, longest: int) -> Iterator[Trajectory]:
     edges = np.linspace(0, len(t.inputs), count + 1).astype(int)
     for i, j in pairwise(edges):
         before = t.before if i == 0 else t.inputs[i - 1]
-        yield Trajectory(t.states[i : j + 1], t.inputs[i:j], t.paths[i:j], t.turned[i:j], before)
+        within = None if t.headings is None else t.headings[i:j]
+        yield Trajectory(t.states[i : j + 1], t.inputs[i:j], t.paths[i:j], t.turned[i:j], before, within)
 
 
 def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) -> float:

@@ -35,6 +35,7 @@ class Trajectory:
             dead reckoning.
         turned (T,): heading change over each period [rad], from dead reckoning.
         before (m,): the input in force at the start. None if the robot stood still.
+        headings (T, S): heading changes [rad] since the period's start, at the times of `paths`. None if unknown.
     """
 
     states: Array
@@ -42,6 +43,7 @@ class Trajectory:
     paths: Array
     turned: Array
     before: Array | None = None
+    headings: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,9 @@ class Dataset:
                 raise BadData(f"trajectory {i}: shapes {shapes} where {wanted} belong")
             if t.before is not None and t.before.shape != (robot.action_dim,):
                 raise BadData(f"trajectory {i}: the input before it has shape {t.before.shape}")
-            for name in ("states", "inputs", "paths", "turned", "before"):
+            if t.headings is not None and t.headings.shape != t.paths.shape[:2]:
+                raise BadData(f"trajectory {i}: headings of shape {t.headings.shape}, paths of {t.paths.shape}")
+            for name in ("states", "inputs", "paths", "turned", "before", "headings"):
                 if getattr(t, name) is not None and not np.isfinite(getattr(t, name)).all():
                     raise BadData(f"trajectory {i}: {name} holds NaN or infinity")
             inputs = t.inputs if t.before is None else np.vstack([t.before, t.inputs])
@@ -117,6 +121,8 @@ class Dataset:
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
         still = np.zeros(self.robot.action_dim)
         tensors["before"] = np.array([still if t.before is None else t.before for t in self.trajectories])
+        if all(t.headings is not None for t in self.trajectories):
+            tensors["headings"] = np.concatenate([t.headings for t in self.trajectories])
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
         robot = self.robot.in_lockstep()
         about: dict[str, Any] = {"robot": robot.name, "layout": robot.layout(), "about": self.about}
@@ -165,6 +171,8 @@ class Dataset:
             "turned": total,
             "before": len(lengths),
         }
+        if "headings" in tensors:
+            wanted["headings"] = total
         if any(len(tensors[name]) != count for name, count in wanted.items()):
             raise BadData(f"{path}: the trajectories' lengths do not add up")
         ends = np.cumsum(lengths)
@@ -175,6 +183,7 @@ class Dataset:
                 tensors["paths"][start:end],
                 tensors["turned"][start:end],
                 tensors["before"][i],
+                tensors["headings"][start:end] if "headings" in tensors else None,
             )
             for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
         )
@@ -201,7 +210,8 @@ class Dataset:
             sha.update(t.inputs.tobytes())
             sha.update(t.paths.tobytes())
             sha.update(t.turned.tobytes())
-            sha.update(b"" if t.before is None else t.before.tobytes())
+            for part in (t.before, t.headings):
+                sha.update(b"" if part is None else part.tobytes())
         return sha.hexdigest()[:12]
 
 

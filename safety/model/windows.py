@@ -146,9 +146,7 @@ def ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
     """
     known = _found.get(t)
     if known is None or known[0] != robot:
-        # The disc farthest from the regressed position goes off its chord by what turning does to it, too.
-        swing = max(disc.arm for disc in robot.body) * np.abs(t.turned)
-        known = _found[t] = robot, _off_chord(t.paths) + swing, _rest_travel(robot, t)
+        known = _found[t] = robot, _farthest_off_chord(robot, t), _rest_travel(robot, t)
     return known[1:]
 
 
@@ -185,6 +183,22 @@ def predicted_outputs(robot: Robot, y: Array) -> Array:
     arms = [np.asarray(disc.at) for disc in robot.body if disc.arm > 0.0]
     moved = [y[:, : robot.position_dim] + rotate(np.tile(arm, (len(y), 1)), y[:, robot.heading]) - arm for arm in arms]
     return np.hstack([y, *moved])
+
+
+def _farthest_off_chord(robot: Robot, t: Trajectory) -> Array:
+    """Return the largest distance (T,) of the centers of the body's discs from their chords in each period.
+
+    Between two samples, a center may leave its chord by as much as the heading changes there.
+    """
+    off = _off_chord(t.paths)
+    arms = [np.asarray(disc.at) for disc in robot.body if disc.arm > 0.0]
+    if t.headings is None or robot.heading is None:
+        return off + max(disc.arm for disc in robot.body) * np.abs(t.turned)
+    steps = np.abs(np.diff(t.headings, axis=1, prepend=0.0)).max(1)
+    for arm in arms:
+        swung = rotate(np.broadcast_to(arm, t.paths.shape), t.headings) - arm
+        off = np.maximum(off, _off_chord(t.paths + swung) + np.linalg.norm(arm) * steps)
+    return off
 
 
 def _off_chord(paths: Array) -> Array:
