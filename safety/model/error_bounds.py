@@ -54,11 +54,6 @@ class ErrorBound:
         """Return half-widths (..., n) of the interval hull of the bound for regressors z (..., nz)."""
         return np.asarray(self.magnitudes(z) @ np.abs(self.generators).T)
 
-    def matrix_hull(self) -> tuple[Array, Array]:
-        """Return the interval hull, two matrices (n, nz), of all matrices C + Σ_j g_j (M_j β) W with |β| <= 1."""
-        half = np.abs(self.generators) @ self.M @ np.abs(self.W)
-        return self.C - half, self.C + half
-
     def through(self, T: Array) -> ErrorBound:
         """Return this bound, which is about z' = T z with T (nz', nz), as a bound about z."""
         unbent = np.zeros((len(self.w), T.shape[1]))
@@ -209,24 +204,3 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
                 active = more
             corners[side, axis] = found.x[axis] - sign * 1e-6
     return unit * corners[0], unit * corners[1]
-
-
-def measured_noise(z: Array, y: Array, w_half: Array, v_half: Array) -> Array:
-    """Return half-widths of w + v⁺ - A v for a linear system with box noise and unknown A (docs/method.md §1).
-
-        |A v| <= s = (|C_A| v̄ + γ (w̄ + v̄)) / (1 - γ),    γ = Σ_i v̄_i ‖Z⁺_{:,i}‖₁,    with the state first in z.
-
-    Args:
-        z: (T, nz) measured regressors; y: (T, n); w_half, v_half: (n,).
-
-    Raises:
-        ErrorBoundError: γ >= 1: the measurements are too noisy for the data to bound A.
-    """
-    n = y.shape[1]
-    pseudo = np.linalg.pinv(z.T)
-    gamma = float(v_half @ np.abs(pseudo[:, :n]).sum(0))
-    if gamma >= 1.0:
-        raise ErrorBoundError(f"γ = {gamma:.3g} >= 1: the measurement noise is too large for a bound on A v")
-    C = y.T @ pseudo
-    s = (np.abs(C[:, :n]) @ v_half + gamma * (w_half + v_half)) / (1.0 - gamma)
-    return np.asarray(w_half + v_half + s)

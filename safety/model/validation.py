@@ -26,6 +26,7 @@ from brakeline.safety.model.error_causes import (
     regimes,
     state_parts,
 )
+from brakeline.safety.model.facet_normals import facet_normals
 from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
 from brakeline.safety.model.one_step_fitting import Calibration, Candidate
 from brakeline.safety.model.turning_in_place import inside
@@ -39,7 +40,6 @@ from brakeline.safety.model.windows import (
     predicted_outputs,
     windows,
 )
-from brakeline.safety.model.zonotope import facet_normals
 
 Array = NDArray[np.float64]
 
