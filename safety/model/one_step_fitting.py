@@ -181,7 +181,8 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
         regression = _Regression.of(features, s)
         for ridge in RIDGES:
             off = regression.out_of_fold(robot, few_windows, ridge)[..., : robot.position_dim]
-            error = float(np.quantile(np.linalg.norm(off, axis=-1), QUANTILE))
+            with np.errstate(over="ignore", invalid="ignore"):  # a rollout may diverge
+                error = float(np.quantile(np.linalg.norm(off, axis=-1), QUANTILE))
             found.append((Candidate(degree, lags, saturating, ridge, error, count), regression))
     found = [pair for pair in found if np.isfinite(pair[0].error)]
     least = min(c.error for c, _ in found)
