@@ -27,6 +27,7 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import OtherReservations, ReservationRows, reservation_half_spaces
 from brakeline.safety.filter.state_limits import StateLimits, stack_rows
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
+from brakeline.safety.model.one_step import FARTHEST as FARTHEST_SUPPORT
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
 
@@ -171,6 +172,7 @@ class TubeConstraints:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.widening = 1.0
+        self._farthest = 1.0 if model.one_step is None else FARTHEST_SUPPORT  # largest factor with which it verifies
         self._base: TubeConstraints | None = None
         self._free = free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
         whole = np.ascontiguousarray
@@ -277,7 +279,9 @@ class TubeConstraints:
         way = np.abs(tube.position) @ z + np.abs(tube.directions) @ sizes[: tube.generators]
         if isinstance(self.tube, RolloutTube):
             extremes = np.random.default_rng(0).integers(0, 2, (EXTREMES, len(low)))
-            way += np.abs(self.tube.outputs(np.where(extremes, high, low))[0]).max(0)
+            with np.errstate(over="ignore", invalid="ignore"):  # far from the data a rollout may diverge
+                way += np.nan_to_num(np.abs(self.tube.outputs(np.where(extremes, high, low))[0]), nan=np.inf).max(0)
+            way = np.minimum(way, robot.sight)
         return float(np.linalg.norm(way, axis=1).max() + self.body + sizes[tube.generators :].max())
 
     def extent(self, z: Array) -> float:
@@ -292,7 +296,7 @@ class TubeConstraints:
         start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
         turn = self.turn(heading)
-        beyond, reach = robot.sight, self._reach_for(request.widening)
+        beyond, reach = robot.sight, self._reach_for(request.widening * self._farthest)
         if len(near):
             beyond, counts = self._parted(near.distance(start) - near.margin, beyond, reach)
             near = near.take(counts)
@@ -335,7 +339,7 @@ class TubeConstraints:
         """Return boxes, world, that contain the discs' centers under every plan after z_0, with room to spare."""
         z = np.concatenate([z_0, inputs[0]])
         if isinstance(self.tube, RolloutTube):  # a verified plan does not leave the reach, and no box of it is smaller
-            aside = self._reach_for(widening) + self._beside
+            aside = self._reach_for(widening * self._farthest) + self._beside
             boxes = np.tile(np.stack([start - aside, start + aside])[:, None], (1, self.robot.horizon + 1, 1))
         else:
             filled = self.at(z, widening)._filled

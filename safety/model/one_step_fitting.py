@@ -22,7 +22,7 @@ from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound, envelope
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
-from brakeline.safety.model.one_step import Features, OneStep, features_for
+from brakeline.safety.model.one_step import Features, OneStep, Support, features_for
 from brakeline.safety.model.windows import displacement, predicted_outputs, ways
 
 Array = NDArray[np.float64]
@@ -46,11 +46,13 @@ class Samples:
 
     Attributes:
         v (P, v), y (P, n), period_fold (P,): all periods: variables [s; u; input of the period before] and outputs.
+        leading (P, v): the same variables in the order of regressors: [s; input of the period before; u].
         z (T, nz), after (T, N, n + d·discs), chords (T, N), fold (T,), start (T, 2): all windows of N periods that lie
             in one fold: regressors, outputs after each period, chord deviations [m], trajectory and first period.
     """
 
     v: Array
+    leading: Array
     y: Array
     period_fold: Index
     z: Array
@@ -75,7 +77,7 @@ def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
         periods = len(t.inputs)
         block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
         parts.append((*_periods(robot, t), block, *_windows(data, t, number, block)))
-    names = ("v", "y", "period_fold", "z", "after", "chords", "fold", "start")
+    names = ("v", "leading", "y", "period_fold", "z", "after", "chords", "fold", "start")
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples = Samples(**dict(zip(names, columns, strict=True)))
     if len(np.unique(samples.fold)) < folds:
@@ -90,9 +92,10 @@ def _before(robot: Robot, t: Trajectory) -> Array:
     return np.vstack([first, t.inputs[:-1]])
 
 
-def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
-    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, _before(robot, t)])
-    return v, displacement(robot, t.states[:-1], t.states[1:])
+def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array, Array]:
+    measured, before = t.states[:-1, list(robot.regressor)], _before(robot, t)
+    v, leading = np.hstack([measured, t.inputs, before]), np.hstack([measured, before, t.inputs])
+    return v, leading, displacement(robot, t.states[:-1], t.states[1:])
 
 
 def _windows(data: Dataset, t: Trajectory, number: int, block: Index) -> tuple[Array, Array, Array, Index, Index]:
@@ -131,6 +134,7 @@ class _Regression:
     """Ridge regressions on all folds, or on all but one, from their second moments: gram (K, F, F), cross (K, F, n)."""
 
     features: Features
+    support: Support
     gram: Array
     cross: Array
 
@@ -138,14 +142,17 @@ class _Regression:
     def of(features: Features, s: Samples) -> _Regression:
         phi, folds = features(s.v), range(int(s.period_fold.max()) + 1)
         parts = [(phi[s.period_fold == i], s.y[s.period_fold == i]) for i in folds]
-        return _Regression(features, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts]))
+        support = Support.of(s.leading)
+        return _Regression(
+            features, support, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts])
+        )
 
     def fit(self, ridge: float, without: int = -1) -> OneStep:
         used = [i for i in range(len(self.gram)) if i != without]
         gram, cross = self.gram[used].sum(0), self.cross[used].sum(0)
         weights = ridge * np.diag(gram) + 1e-12 * gram[0, 0]
         weights[0] = 0.0  # not of the constant
-        return OneStep(np.linalg.solve(gram + np.diag(weights), cross).T, self.features)
+        return OneStep(np.linalg.solve(gram + np.diag(weights), cross).T, self.features, self.support)
 
     def quality(self) -> tuple[float, float]:
         """Return the smallest singular value and the condition number of the scaled features."""
@@ -273,7 +280,7 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     kappa[0], w[0] = scale[:, None] * shape.kappa[0], scale * shape.w[0]
     steps = tuple(_bound(kappa[k, :n], w[k, :n]) for k in range(robot.horizon))
     stopping = stopping_distance_of_stops(data, model_config)
-    known = s.v[:, [*range(len(robot.regressor)), *range(len(robot.regressor) + robot.action_dim, s.v.shape[1])]]
+    known = s.leading[:, : robot.regressor_dim]
     model = ModelSet(
         robot,
         replace(model_config, mode=ONE_STEP, windows=FREE, certificate=RESIDUAL),

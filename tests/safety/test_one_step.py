@@ -17,6 +17,7 @@ from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.driving_kinds import RESTLESS, START
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.one_step import UNKNOWN, Support
 from brakeline.safety.model.one_step_fitting import fit_one_step, samples_of
 from brakeline.safety.model.windows import FREE
 from tests.safety.asked import cylinder
@@ -167,6 +168,20 @@ def test_a_file_gives_the_same_model_set_and_a_damaged_one_is_refused(tmp_path):
             ModelSet.decode(damaged.encode())
     with pytest.raises(BadModel, match="version"):
         ModelSet.decode(replace(model, model_config=replace(model.model_config, mode=DIRECT)).encode())
+
+
+def test_sets_grow_outside_the_recorded_driving_and_far_outside_nothing_is_verified():
+    recorded = np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 3)) * [1.0, 0.5, 0.2]
+    support = Support.of(recorded)
+    assert np.mean([support.factor(row) > 1.0 for row in recorded]) == pytest.approx(0.001, abs=5e-4)
+    corner = np.array([1.0, 0.5, 0.2])
+    assert 1.0 <= support.factor(corner) < 1.3 and 1.0 < support.factor(1.5 * corner) < 2.0
+    assert support.factor(3.0 * corner) == UNKNOWN
+    fast = request([0.0, 0.0, 0.0, 0.6, 1.5], [0.6, 1.5], [0.6, 1.5], [cylinder(2.0, 2.0, 0.1)])
+    slow = certified()[0].one_step
+    narrow = replace(slow, support=replace(slow.support, radius=0.1 * slow.support.radius))
+    decision = Filter(replace(certified()[0], one_step=narrow)).decide(fast)
+    assert ready().decide(fast).kind == ALLOWED and decision.kind == FAILSAFE and not decision.verified
 
 
 def test_too_little_driving_and_stops_by_feedback_are_refused():
