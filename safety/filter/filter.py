@@ -144,8 +144,9 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         steps = model.steps if model.one_step is not None else ()
-        self._kappa = np.array([step.kappa[: robot.state_dim] for step in steps])  # (N, n, nz), for scores
-        self._w = np.array([step.w[: robot.state_dim] for step in steps])
+        n = robot.state_dim  # for scores: W is the same for all periods
+        self._kappa, self._M = (np.array([getattr(step, name)[:n] for step in steps]) for name in ("kappa", "M"))
+        self._w = np.array([step.w[:n] for step in steps])
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
     @classmethod
@@ -539,7 +540,7 @@ class Filter:
         z = np.concatenate([past.states[0, self.regressor], past.inputs.ravel()])
         after = displacement(robot, past.states[0], np.vstack([past.states[1:], request.state]))
         off = np.abs(after - model.one_step.rollouts(robot, z[None])[0, :, : robot.state_dim])
-        widths = self._kappa @ np.abs(z) + self._w
+        widths = self._kappa @ np.abs(z) + self._M @ np.abs(model.steps[0].W @ z) + self._w
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(off > 0.0, off / widths, 0.0)
         return float(max(shares[:, : robot.position_dim].max(), shares[0].max()))

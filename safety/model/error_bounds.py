@@ -94,17 +94,18 @@ def whitening(z: Array) -> Array:
         raise ErrorBoundError("the regressors do not span their space: record more varied inputs") from None
 
 
-def envelope(features: Array, values: Array, inflation: float) -> tuple[Array, float]:
+def envelope(features: Array, values: Array, inflation: float, typical: Array | None = None) -> tuple[Array, float]:
     """Return the envelope (κ, w) with κ f + w >= v for all samples, times `inflation` (docs/method.md §1c).
 
-    A linear program minimises the mean of the bound over features f (T, q) >= 0 with values v (T,) >= 0. It starts from
+    A linear program minimises the mean of the bound over features f (T, q) >= 0 with values v (T,) >= 0, or over the
+    features `typical` (T', q). It starts from
     few samples and adds violated ones until there are none. What its tolerance leaves violated is added to w.
     """
     from scipy.optimize import linprog  # here: it takes half a second to load, and a service does not need it
 
     if not len(values):
         raise ErrorBoundError("no sample to bound")
-    cost = np.append(features.mean(0), 1.0)
+    cost = np.append((features if typical is None else typical).mean(0), 1.0)
     rows = np.column_stack([features, np.ones(len(features))])
     active = np.unique(np.concatenate([np.argsort(values)[-ROWS_A_ROUND:], rows.argmax(0)]))
     scale = float(values.max()) or 1.0

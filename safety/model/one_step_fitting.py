@@ -23,7 +23,7 @@ from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import Features, OneStep, Support, features_for
-from brakeline.safety.model.windows import displacement, predicted_outputs, ways
+from brakeline.safety.model.windows import displacement, plan_regressor_map, predicted_outputs, way_after_rest, ways
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,6 +37,7 @@ CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 OUTSIDE = 0.001  # share of the windows that may be outside, in every kind of driving
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
+FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
 
 
@@ -47,8 +48,9 @@ class Samples:
     Attributes:
         v (P, v), y (P, n), period_fold (P,): all periods: variables [s; u; input of the period before] and outputs.
         leading (P, v): the same variables in the order of regressors: [s; input of the period before; u].
-        z (T, nz), after (T, N, n + d·discs), chords (T, N), fold (T,), start (T, 2): all windows of N periods that lie
-            in one fold: regressors, outputs after each period, chord deviations [m], trajectory and first period.
+        z (T, nz), after (T, N, n + d·discs), chords (T, N), stops (T,), fold (T,), start (T, 2): all windows of N
+            periods that lie in one fold: regressors, outputs after each period, chord deviations [m], the way after the
+            window [m] if it ends in a stop, otherwise NaN, trajectory and first period.
     """
 
     v: Array
@@ -58,6 +60,7 @@ class Samples:
     z: Array
     after: Array
     chords: Array
+    stops: Array
     fold: Index
     start: Index
 
@@ -77,7 +80,7 @@ def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
         periods = len(t.inputs)
         block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
         parts.append((*_periods(robot, t), block, *_windows(data, t, number, block)))
-    names = ("v", "leading", "y", "period_fold", "z", "after", "chords", "fold", "start")
+    names = ("v", "leading", "y", "period_fold", "z", "after", "chords", "stops", "fold", "start")
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples = Samples(**dict(zip(names, columns, strict=True)))
     if len(np.unique(samples.fold)) < folds:
@@ -98,7 +101,9 @@ def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array, Array]:
     return v, leading, displacement(robot, t.states[:-1], t.states[1:])
 
 
-def _windows(data: Dataset, t: Trajectory, number: int, block: Index) -> tuple[Array, Array, Array, Index, Index]:
+def _windows(
+    data: Dataset, t: Trajectory, number: int, block: Index
+) -> tuple[Array, Array, Array, Array, Index, Index]:
     robot, N = data.robot, data.robot.horizon
     start = np.arange(max(len(t.inputs) - N + 1, 0))
     start = start[block[start] == block[start + N - 1]]
@@ -108,7 +113,8 @@ def _windows(data: Dataset, t: Trajectory, number: int, block: Index) -> tuple[A
     ends = [displacement(robot, t.states[start], t.states[start + k]) for k in range(1, N + 1)]
     after = [predicted_outputs(robot, end) for end in ends]
     chords = (ways(robot, t)[0] + data.chord_deviation)[at]
-    return z, np.stack(after, 1), chords, block[start], np.column_stack([np.full(len(start), number), start])
+    stops = way_after_rest(robot, t)[start + N]
+    return z, np.stack(after, 1), chords, stops, block[start], np.column_stack([np.full(len(start), number), start])
 
 
 @dataclass(frozen=True)
@@ -198,37 +204,70 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
     return chosen, sorted((c for c, _ in found), key=lambda c: c.error), regression
 
 
+def spread_features(robot: Robot, z: Array, k: int) -> Array:
+    """Return what the half-widths after k periods grow with (T, q), for regressors z (T, r + m + N·m).
+
+    These are the speeds, the input in force, and the means of the k inputs and of their changes, each without its sign:
+    with a slope for each input, minutes of driving would not determine a half-width.
+    """
+    known, m = robot.regressor_dim, robot.action_dim
+    inputs = z[:, known - m :].reshape(len(z), -1, m)[:, : k + 1]  # from the input in force on
+    changes = np.abs(np.diff(inputs, axis=1)).mean(1)
+    return np.hstack([np.abs(z[:, :known]), np.abs(inputs[:, 1:]).mean(1), changes])
+
+
+def _plans_from(robot: Robot, z: Array) -> Array:
+    """Return the regressors of plans from recorded starts: with the recorded first input, and braking at once."""
+    known, m = robot.regressor_dim, robot.action_dim
+    firsts = z[:, known : known + m], np.broadcast_to(robot.zero_input(), (len(z), m))
+    plans = [np.hstack([z[:, :known], np.tile(first, robot.free_steps)]) for first in firsts]
+    return np.asarray(np.vstack(plans) @ plan_regressor_map(robot).T)
+
+
 @dataclass(frozen=True)
 class Shape:
-    """Half-widths κ_k·|z| + w_k of the predicted coordinates after each period, up to a factor.
+    """Half-widths of the predicted coordinates after each period, up to a factor: slopes · `spread_features` + w.
 
     Attributes:
-        kappa (N, n', nz), w (N, n'): n' coordinates.
+        slopes (N, n', q), w (N, n'): n' coordinates.
     """
 
-    kappa: Array
+    slopes: Array
     w: Array
 
-    def widths(self, z: Array) -> Array:
+    def widths(self, robot: Robot, z: Array) -> Array:
         """Return half-widths (T, N, n') for regressors z (T, nz)."""
-        return np.asarray(np.einsum("knj,tj->tkn", self.kappa, np.abs(z), optimize=True) + self.w)
+        parts = [spread_features(robot, z, k + 1) @ slopes.T for k, slopes in enumerate(self.slopes)]
+        return np.asarray(np.stack(parts, axis=1) + self.w)
 
     @staticmethod
-    def around(robot: Robot, z: Array, errors: Array) -> Shape:
-        """Return the tightest shape on average that holds all errors (T, N, n').
+    def around(robot: Robot, z: Array, errors: Array, inflation: float = 1.0) -> Shape:
+        """Return the shape that holds all errors (T, N, n') and is tightest, on average, for plans as the filter has.
 
-        The half-width after k periods grows with the speeds, the input in force and the mean of the k inputs: with a
-        slope for each input, minutes of driving would not determine it.
+        Driving that was recorded holds large inputs to the end of a window; plans brake.
         """
-        (count, N, n), known, m = errors.shape, robot.regressor_dim, robot.action_dim
-        kappa, w, inputs = np.zeros((N, n, z.shape[1])), np.zeros((N, n)), np.abs(z[:, known:]).reshape(count, -1, m)
+        _, N, n = errors.shape
+        found, plans = [], _plans_from(robot, z)
         for k in range(N):
-            used = np.hstack([np.abs(z[:, :known]), inputs[:, : k + 1].mean(1)])
-            for i in range(n):
-                slopes, w[k, i] = envelope(used, np.abs(errors[:, k, i]), 1.0)
-                kappa[k, i, :known] = slopes[:known]
-                kappa[k, i, known : known + (k + 1) * m] = np.tile(slopes[known:], k + 1) / (k + 1)
-        return Shape(kappa, w)
+            used, typical = spread_features(robot, z, k + 1), spread_features(robot, plans, k + 1)
+            found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical) for i in range(n)]
+        slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
+        return Shape(slopes.reshape(N, n, -1), w.reshape(N, n))
+
+    def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
+        """Return the error bound of some coordinates after k periods, each times its factor; without a predictor.
+
+        The rows of W are the changes of the inputs.
+        """
+        known, m, N = robot.regressor_dim, robot.action_dim, robot.horizon
+        nz = known + N * m
+        changes = np.eye(N * m, nz, known) - np.eye(N * m, nz, known - m)
+        slopes, w = factor[:, None] * self.slopes[k - 1, coordinates], factor * self.w[k - 1, coordinates]
+        kappa, M = np.zeros((len(w), nz)), np.zeros((len(w), N * m))
+        kappa[:, :known] = slopes[:, :known]
+        kappa[:, known : known + k * m] = np.tile(slopes[:, known : known + m] / k, k)
+        M[:, : k * m] = np.tile(slopes[:, known + m :] / k, k)
+        return ErrorBound(np.zeros_like(kappa), changes, M, kappa, w, np.eye(len(w)))
 
 
 @dataclass(frozen=True)
@@ -273,22 +312,20 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     factor, first = _factor(scores, kinds), _factor(others, kinds)
     one_step = regression.fit(chosen.ridge)
     shape = _shape(robot, s.z, s.after - one_step.rollouts(robot, s.z), s.chords)
-    n, d, nz = s.after.shape[2], robot.position_dim, s.z.shape[1]
-    scale = np.full(n + 1, factor)
-    kappa, w = scale[:, None] * shape.kappa, scale * shape.w
-    scale[d:n] = first
-    kappa[0], w[0] = scale[:, None] * shape.kappa[0], scale * shape.w[0]
-    steps = tuple(_bound(kappa[k, :n], w[k, :n]) for k in range(robot.horizon))
-    stopping = stopping_distance_of_stops(data, model_config)
+    n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
+    scale = np.full(n, factor)
+    first_scale = np.where(np.arange(n) < d, factor, first)
+    steps = tuple(shape.bound(robot, k, slice(n), scale if k > 1 else first_scale) for k in range(1, N + 1))
+    chords = [shape.bound(robot, k, slice(n, n + 1), scale[:1]) for k in range(1, N + 1)]
     known = s.leading[:, : robot.regressor_dim]
     model = ModelSet(
         robot,
         replace(model_config, mode=ONE_STEP, windows=FREE, certificate=RESIDUAL),
         steps,
-        _bound(kappa[:, n], w[:, n]),
-        _bound(np.zeros((1, nz)), np.array([stopping])),
+        _stacked(chords),
+        _stopping_distance(data, s, model_config),
         np.stack([known.min(0), known.max(0)]),
-        np.eye(nz),
+        np.eye(s.z.shape[1]),
         data.about | {"data": data.digest(), "periods": str(data.periods)},
         one_step=one_step,
     )
@@ -309,16 +346,34 @@ def _factor(scores: Array, kinds: dict[str, NDArray[np.bool_]]) -> float:
     return max(found)
 
 
-def _bound(kappa: Array, w: Array) -> ErrorBound:
-    n, nz = kappa.shape
-    return ErrorBound(np.zeros((n, nz)), np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
+def _stacked(bounds: list[ErrorBound]) -> ErrorBound:
+    """Return bounds of one coordinate each, with the same W, as one bound."""
+    C, M, kappa = (np.vstack([getattr(one, name) for one in bounds]) for name in ("C", "M", "kappa"))
+    return ErrorBound(C, bounds[0].W, M, kappa, np.concatenate([one.w for one in bounds]), np.eye(len(bounds)))
+
+
+def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> ErrorBound:
+    """Return the bound of the way after a plan's end, from all windows that end in a stop.
+
+    Raises:
+        BadData: there are too few stops; the message says what to record.
+    """
+    largest = stopping_distance_of_stops(data, model_config)
+    ended = ~np.isnan(s.stops)
+    if int(ended.sum()) < FEWEST_ENDS:
+        spread = np.zeros((data.robot.horizon, 1, spread_features(data.robot, s.z[:1], 1).shape[1]))
+        shape = Shape(spread, np.full((data.robot.horizon, 1), largest))
+    else:
+        ways_on = np.repeat(s.stops[ended, None, None], data.robot.horizon, axis=1)
+        shape = Shape.around(data.robot, s.z[ended], ways_on, model_config.inflation)
+    return shape.bound(data.robot, data.robot.horizon, slice(1), np.ones(1))
 
 
 def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
     """Return the shape of the errors, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2))
-    shape.kappa[:, -1] *= CHORD_INFLATION
+    shape.slopes[:, -1] *= CHORD_INFLATION
     least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
     shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], least)
     return shape
@@ -338,7 +393,7 @@ def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> 
         one_step = regression.fit(ridge, without=i)
         errors = s.after - one_step.rollouts(robot, s.z)
         shape = _shape(robot, s.z[~held], errors[~held], s.chords[~held])
-        widths = shape.widths(s.z[held])
+        widths = shape.widths(robot, s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = shares[..., used].max((1, 2))
         scores[1, held] = shares[:, 0, :d].max(1)

@@ -263,12 +263,25 @@ def periods_until_standing(whole: Windows, data: Dataset, kind: str) -> int:
 
 def stopping_distances(robot: Robot, t: Trajectory, rested: int) -> Array:
     """Return the ways [m] after all times at which the inputs had been those of a stop for `rested` periods."""
-    still = stop_input_periods(robot, t)
-    lasted = np.zeros(len(still) + 1, dtype=int)
-    for i, rests in enumerate(still):
-        lasted[i + 1] = lasted[i] + 1 if rests else 0
     travel = ways(robot, t)[1]
-    return np.asarray(travel[(lasted == rested) & ~np.isnan(travel)])
+    return np.asarray(travel[(_periods_of_rest(robot, t) == rested) & ~np.isnan(travel)])
+
+
+def way_after_rest(robot: Robot, t: Trajectory) -> Array:
+    """Return the way (T+1,) [m] from each sample on, if the inputs had been those of a stop as at a plan's end.
+
+    NaN if they had not, or if they are not while the way goes on.
+    """
+    rested = _periods_of_rest(robot, t) >= resting_periods_at_end(robot)
+    return np.where(rested, ways(robot, t)[1], np.nan)
+
+
+def _periods_of_rest(robot: Robot, t: Trajectory) -> NDArray[np.intp]:
+    """Return for each sample (T+1,) for how many periods the inputs had been those of a stop."""
+    lasted = np.zeros(len(t.inputs) + 1, dtype=np.intp)
+    for i, rests in enumerate(stop_input_periods(robot, t)):
+        lasted[i + 1] = lasted[i] + 1 if rests else 0
+    return lasted
 
 
 def non_overlapping(w: Windows, length: int) -> Windows:
