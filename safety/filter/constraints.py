@@ -27,12 +27,12 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import OtherReservations, ReservationRows, reservation_half_spaces
 from brakeline.safety.filter.state_limits import StateLimits, stack_rows
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
-from brakeline.safety.model.one_step import FARTHEST as FARTHEST_SUPPORT
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
 
 Array = NDArray[np.float64]
 
+ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
 EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
 ASIDE = 0.5  # m beyond all plans: what a range image is looked at for, and so the largest margin that it tells
 
@@ -74,7 +74,7 @@ def _discs(robot: Robot, tube: Tube, known: list[_Disc] | None = None) -> list[_
         if known is None:
             layout = ObstacleRows(position, offset, directions)
         else:
-            layout = known[i].layout.around(position, offset)
+            layout = known[i].layout.around(position, offset, tube.stretch)
         found.append(_Disc(np.asarray(disc.at), disc.radius, swing, np.ascontiguousarray(position), offset, layout))
     return found
 
@@ -172,7 +172,6 @@ class TubeConstraints:
             shades.prepare()
         self.robot, self.tube, self.stands = robot, tube, model.moving
         self.widening = 1.0
-        self._farthest = 1.0 if model.one_step is None else FARTHEST_SUPPORT  # largest factor with which it verifies
         self._base: TubeConstraints | None = None
         self._free = free = len(robot.action_slew) * (robot.free_steps - robot.committed_steps)
         whole = np.ascontiguousarray
@@ -180,6 +179,7 @@ class TubeConstraints:
         self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0
         self._directions = whole(tube.directions)
         first, n = model.first, robot.state_dim
+        self._first_stretch = 1.0
         self._first = tube.first if len(tube.first) else np.zeros(n)
         transposed = whole(first.W.T), whole(first.M.T), whole(first.kappa.T)
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
@@ -211,6 +211,7 @@ class TubeConstraints:
         other.far = self.far or widening > 1.0  # the reach is that of tubes without it
         if tube is not self.tube:
             other.tube, other._first, other._base = tube, tube.first, self
+            other._directions, other._first_stretch = tube.directions, float(tube.stretch[0])
             for name in ("discs", "limits"):
                 other.__dict__.pop(name, None)
         return other
@@ -281,7 +282,7 @@ class TubeConstraints:
             extremes = np.random.default_rng(0).integers(0, 2, (EXTREMES, len(low)))
             with np.errstate(over="ignore", invalid="ignore"):  # far from the data a rollout may diverge
                 way += np.nan_to_num(np.abs(self.tube.outputs(np.where(extremes, high, low))[0]), nan=np.inf).max(0)
-            way = np.minimum(way, robot.sight)
+            way = np.minimum(ROOM_FOR_STRETCH * way, robot.sight)
         return float(np.linalg.norm(way, axis=1).max() + self.body + sizes[tube.generators :].max())
 
     def extent(self, z: Array) -> float:
@@ -296,7 +297,7 @@ class TubeConstraints:
         start, near = np.ascontiguousarray(request.state[:d]), request.obstacles
         heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
         turn = self.turn(heading)
-        beyond, reach = robot.sight, self._reach_for(request.widening * self._farthest)
+        beyond, reach = robot.sight, self._reach_for(request.widening)
         if len(near):
             beyond, counts = self._parted(near.distance(start) - near.margin, beyond, reach)
             near = near.take(counts)
@@ -339,7 +340,7 @@ class TubeConstraints:
         """Return boxes, world, that contain the discs' centers under every plan after z_0, with room to spare."""
         z = np.concatenate([z_0, inputs[0]])
         if isinstance(self.tube, RolloutTube):  # a verified plan does not leave the reach, and no box of it is smaller
-            aside = self._reach_for(widening * self._farthest) + self._beside
+            aside = self._reach_for(widening) + self._beside
             boxes = np.tile(np.stack([start - aside, start + aside])[:, None], (1, self.robot.horizon + 1, 1))
         else:
             filled = self.at(z, widening)._filled
@@ -363,7 +364,7 @@ class TubeConstraints:
             *self._next,
             self._regressor(z),
             self._first,
-            self.widening,
+            self.widening * self._first_stretch,
             np.ascontiguousarray(local_map.start),
             local_map.turn,
         )

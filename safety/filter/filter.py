@@ -183,12 +183,7 @@ class Filter:
         """Return the constraints for the plan with regressors z: of plans in place, or of all plans; exact for z."""
         if self.in_place is not None and tube_kernels.within(z, self.in_place[0]):
             return self.in_place[1].at(z, widening)
-        return self._general(z, widening)
-
-    def _general(self, z: Array, widening: float) -> TubeConstraints:
-        """Return the constraints for all plans, exact for z. Sets grow with the distance of z from the data (§14)."""
-        support = 1.0 if self.model.one_step is None else self.model.one_step.support.factor(z)
-        return self.constraints.at(z, widening * support)
+        return self.constraints.at(z, widening)
 
     # --- one decision ------------------------------------------------------------------------------------------
 
@@ -246,7 +241,7 @@ class Filter:
         constraints = self._constraints_for(z, local_map.widening)
         if everywhere and (margin := constraints.least(NO_ROWS, z)) >= max(self.clearance_margin, 0.0):
             return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-        general = self._general(z, local_map.widening) if self._turns_in_place(z) else constraints
+        general = self.constraints.at(z, local_map.widening) if self._turns_in_place(z) else constraints
         planes = constraints.planes(local_map, z)
         slack = constraints.slack(local_map, z, planes)
         margin = constraints.least(slack, z)
@@ -293,7 +288,7 @@ class Filter:
             return
         stop = self.inputs.regressors(z_0, self.inputs.nothing)
         for z in (np.concatenate([z_0, self.inputs.within(committed, z_0[-self.robot.action_dim :])]), stop):
-            constraints = self._general(z, local_map.widening)
+            constraints = self.constraints.at(z, local_map.widening)
             planes = constraints.planes(local_map, z)
             yield _Linearized(constraints, constraints.rows(local_map, z, planes), planes)
 
@@ -319,7 +314,7 @@ class Filter:
             z = self._closest(choice, z_0, proposal, record)
             if z is None:
                 return None
-            exact = self._general(z, local_map.widening)
+            exact = self.constraints.at(z, local_map.widening)
             if exact is at.constraints:  # a linear tube: the rows hold everywhere
                 if exact.margin(choice, z) < 0.0:
                     return None
@@ -388,7 +383,7 @@ class Filter:
         if self._turns_in_place(stay):  # turns have their own tube: room to stand is enough
             stay = self.inputs.regressors(z_0, self.inputs.limited(self.inputs.nothing, before))
         kept_off = self.clearance_margin * rows.keep
-        staying = self._general(stay, local_map.widening)
+        staying = self.constraints.at(stay, local_map.widening)
         there = rows if staying is at.constraints else staying.rows(local_map, stay, at.planes)
         inside = there.support(self.tube, stay) > there.bound - kept_off
         bound = np.where(inside, rows.bound, rows.bound - kept_off)
@@ -458,7 +453,7 @@ class Filter:
             )
         if self._constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
             return None
-        constraints = self._general(stand, local_map.widening)
+        constraints = self.constraints.at(stand, local_map.widening)
         planes = constraints.planes(local_map, stand, leaving=True)
         rows = constraints.rows(local_map, stand, planes)
         if not np.isfinite(rows.bound).all():  # an obstacle that is just touched, or NaN, has no known side
@@ -489,7 +484,7 @@ class Filter:
                 return None
         else:
             return None
-        margin, constraints = constraints.margin(rows, z), self._general(z, local_map.widening)
+        margin, constraints = constraints.margin(rows, z), self.constraints.at(z, local_map.widening)
         return _Candidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
 
     def _decision(self, request: Request, local_map: LocalMap, candidate: _Candidate, record: _Record) -> Decision:
@@ -541,6 +536,7 @@ class Filter:
         after = displacement(robot, past.states[0], np.vstack([past.states[1:], request.state]))
         off = np.abs(after - model.one_step.rollouts(robot, z[None])[0, :, : robot.state_dim])
         widths = self._kappa @ np.abs(z) + self._M @ np.abs(model.steps[0].W @ z) + self._w
+        widths *= model.one_step.stretches(robot, z[None])[0][:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(off > 0.0, off / widths, 0.0)
         return float(max(shares[:, : robot.position_dim].max(), shares[0].max()))

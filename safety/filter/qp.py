@@ -69,10 +69,12 @@ class ObstacleRows:
         still = np.zeros((1, *position.shape[1:]))
         return np.concatenate([still, position])[self.ends], np.concatenate([still[..., 0], offset])[self.ends]
 
-    def around(self, position: Array, offset: Array) -> ObstacleRows:
-        """Return the same rows around other centers."""
+    def around(self, position: Array, offset: Array, stretch: Array) -> ObstacleRows:
+        """Return the same rows around other centers, with sets that are wider by a factor for each period (N,)."""
         other = copy(self)
         other.maps = self._maps(position, offset)
+        directions, columns, extra = self.sets
+        other.sets = directions * np.append(1.0, stretch)[self.ends, None, None], columns, extra
         return other
 
     def rows(self, normals: Array, offsets: Array, widening: float) -> ConstraintRows:

@@ -40,6 +40,7 @@ class Tube:
         more (N, r, nz), more_directions (N, r, L), more_offset (N, r): the same for other predicted coordinates, which
             a limit or a further disc of the body needs.
         first (n,): what a predictor that is not linear adds to the prediction of all coordinates after one period.
+        stretch (N,): factors that `directions` and `more_directions` hold already, or none.
     """
 
     position: Array
@@ -52,6 +53,7 @@ class Tube:
     offset: Array
     more_offset: Array
     first: Array = field(default_factory=lambda: np.zeros(0))
+    stretch: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, z: Array) -> Tube:
         """Return a tube that equals this one for regressors z (nz,), with centers that are affine in z."""
@@ -149,8 +151,10 @@ class RolloutTube(Tube):
 
         parts = rollout_kernels.affine(*self._arguments, z, self.inputs_of, self._kept)
         position, offset, more, more_offset, first = parts
-        sets = self.W, self.M, self.m_0
-        return Tube(position, self.directions, *sets, more, self.more_directions, offset, more_offset, first)
+        stretch = self.one_step.stretches(self.robot, (self.inputs_of @ z)[None])[0]
+        sets = self.directions, self.more_directions
+        wide, more_wide = (np.ascontiguousarray(part * stretch[:, None, None]) for part in sets)
+        return Tube(position, wide, self.W, self.M, self.m_0, more, more_wide, offset, more_offset, first, stretch)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""

@@ -9,7 +9,6 @@ exactly:
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -24,8 +23,6 @@ Index = NDArray[np.int64]
 Arguments = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
 
 TENSOR = "one_step."  # prefix of the names in a file
-RECORDED = 0.999  # quantile of the recorded distances that is the radius of the support
-FARTHEST, UNKNOWN = 2.0, 1e6  # radii beyond which nothing is known, and the factor there
 WIDTHS = (0.2, 0.5)  # of saturating features, as shares of the largest recorded difference of input and speed
 
 
@@ -79,69 +76,35 @@ def features_for(robot: Robot, v: Array, degree: int, lags: int, saturating: boo
 
 
 @dataclass(frozen=True)
-class Support:
-    """Where the recorded regressors [s; input in force; first input] (q,) lie (docs/method.md §14).
-
-    Attributes:
-        center (q,), whitening (q, q): coordinates in which the recorded regressors are white.
-        radius: the distance from the center that one in a thousand of them exceeds.
-    """
-
-    center: Array
-    whitening: Array
-    radius: float
-
-    @staticmethod
-    def of(recorded: Array) -> Support:
-        """Return the support of recorded regressors (T, q). A coordinate that was constant must stay so."""
-        center, moment = recorded.mean(0), np.atleast_2d(np.cov(recorded.T))
-        values, vectors = np.linalg.eigh(moment)
-        values = np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))
-        whitening = (vectors / np.sqrt(values)).T
-        away = np.linalg.norm((recorded - center) @ whitening.T, axis=1)
-        return Support(center, np.ascontiguousarray(whitening), float(np.quantile(away, RECORDED)))
-
-    def factor(self, z: Array) -> float:
-        """Return the factor on every set of a plan with regressors z, which begin with the q that count: at least 1.
-
-        It is the distance from the center, in radii. Beyond `FARTHEST` radii it is so large that nothing is verified.
-        """
-        off = self.whitening @ (z[: len(self.center)] - self.center)
-        away = math.sqrt(off @ off) / self.radius
-        if away <= 1.0:
-            return 1.0
-        return away if away <= FARTHEST else UNKNOWN
-
-
-@dataclass(frozen=True)
 class OneStep:
     """The predictor of one period.
 
     Attributes:
         C (n, F): outputs from features: displacement and change of heading in the robot's own frame, and the other
             coordinates after the period.
-        features: φ. support: where it was fitted.
+        features: φ.
+        root (F, F): inverse of the lower Cholesky factor of the features' second moment in the data.
+        weight: how much the sets grow with the leverage of a plan (docs/method.md §14).
     """
 
     C: Array
     features: Features
-    support: Support
+    root: Array
+    weight: float = 0.0
 
     def tensors(self) -> dict[str, Array]:
         """Return the arrays of the predictor by their names in a model set's file."""
         f = self.features
         named = {"C": self.C, "scale": f.scale, "saturations": f.saturations, "terms": f.terms.astype(float)}
-        named |= {"center": self.support.center, "whitening": self.support.whitening}
-        named["radius"] = np.array([self.support.radius])
+        named |= {"root": self.root, "weight": np.array([self.weight])}
         return {TENSOR + name: value for name, value in named.items()}
 
     @staticmethod
     def of_tensors(tensors: dict[str, Array]) -> OneStep:
         """Return the predictor that a model set's file holds; KeyError without one."""
-        names = "C", "scale", "saturations", "terms", "center", "whitening", "radius"
-        C, scale, saturations, terms, center, whitening, radius = (tensors[TENSOR + name] for name in names)
-        support = Support(center, whitening, float(radius[0]))
-        return OneStep(C, Features(scale, saturations, terms.astype(np.int64)), support)
+        names = "C", "scale", "saturations", "terms", "root", "weight"
+        C, scale, saturations, terms, root, weight = (tensors[TENSOR + name] for name in names)
+        return OneStep(C, Features(scale, saturations, terms.astype(np.int64)), root, float(weight[0]))
 
     def check(self, robot: Robot) -> None:
         """Check the sizes and indices of a predictor that comes from a file.
@@ -157,9 +120,7 @@ class OneStep:
         good = good and f.terms.min() >= 0 and f.terms.max() < primitives
         pairs = f.saturations[:, :2]
         good = good and bool((pairs >= 0).all() and (pairs < variables).all() and (f.saturations[:, 2] > 0.0).all())
-        size = (variables,)
-        good = good and (self.support.center.shape, self.support.whitening.shape) == (size, size * 2)
-        if not good or not self.support.radius > 0.0:
+        if not good or self.root.shape != (len(f.terms),) * 2 or not self.weight >= 0.0:
             raise BadModel(f"the predictor of one period does not fit {robot.name}")
 
     def rollouts(self, robot: Robot, z: Array) -> Array:
@@ -167,6 +128,13 @@ class OneStep:
         from brakeline.safety.filter.kernels import rollout_kernels
 
         return rollout_kernels.rollouts(*self.arguments(robot), np.ascontiguousarray(z))
+
+    def stretches(self, robot: Robot, z: Array) -> Array:
+        """Return the factors on the sets (T, N) of windows z (T, r + N·m), at least 1: sqrt(1 + weight · leverage)."""
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        root, windows = np.ascontiguousarray(self.root), np.ascontiguousarray(z)
+        return np.asarray(np.sqrt(1.0 + self.weight * rollout_kernels.leverages(*self.arguments(robot), root, windows)))
 
     def arguments(self, robot: Robot) -> Arguments:
         """Return the arguments of the kernels that are the same for every plan."""

@@ -22,7 +22,7 @@ from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound, envelope
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
-from brakeline.safety.model.one_step import Features, OneStep, Support, features_for
+from brakeline.safety.model.one_step import Features, OneStep, features_for
 from brakeline.safety.model.windows import displacement, plan_regressor_map, predicted_outputs, way_after_rest, ways
 
 Array = NDArray[np.float64]
@@ -36,6 +36,7 @@ MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameter
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 OUTSIDE = 0.001  # share of the windows that may be outside, in every kind of driving
+WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
@@ -140,7 +141,6 @@ class _Regression:
     """Ridge regressions on all folds, or on all but one, from their second moments: gram (K, F, F), cross (K, F, n)."""
 
     features: Features
-    support: Support
     gram: Array
     cross: Array
 
@@ -148,17 +148,16 @@ class _Regression:
     def of(features: Features, s: Samples) -> _Regression:
         phi, folds = features(s.v), range(int(s.period_fold.max()) + 1)
         parts = [(phi[s.period_fold == i], s.y[s.period_fold == i]) for i in folds]
-        support = Support.of(s.leading)
-        return _Regression(
-            features, support, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts])
-        )
+        return _Regression(features, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts]))
 
-    def fit(self, ridge: float, without: int = -1) -> OneStep:
+    def fit(self, ridge: float, without: int = -1, weight: float = 0.0) -> OneStep:
         used = [i for i in range(len(self.gram)) if i != without]
         gram, cross = self.gram[used].sum(0), self.cross[used].sum(0)
         weights = ridge * np.diag(gram) + 1e-12 * gram[0, 0]
         weights[0] = 0.0  # not of the constant
-        return OneStep(np.linalg.solve(gram + np.diag(weights), cross).T, self.features, self.support)
+        gram = gram + np.diag(weights)
+        root = np.linalg.inv(np.linalg.cholesky(gram))
+        return OneStep(np.linalg.solve(gram, cross).T, self.features, root, weight)
 
     def quality(self) -> tuple[float, float]:
         """Return the smallest singular value and the condition number of the scaled features."""
@@ -235,21 +234,24 @@ class Shape:
     slopes: Array
     w: Array
 
-    def widths(self, robot: Robot, z: Array) -> Array:
-        """Return half-widths (T, N, n') for regressors z (T, nz)."""
-        parts = [spread_features(robot, z, k + 1) @ slopes.T for k, slopes in enumerate(self.slopes)]
+    def widths(self, robot: Robot, z: Array, last: bool = False) -> Array:
+        """Return half-widths (T, N, n') for regressors z (T, nz). last: of a shape of the last period alone."""
+        first = robot.horizon if last else 1
+        parts = [spread_features(robot, z, first + k) @ slopes.T for k, slopes in enumerate(self.slopes)]
         return np.asarray(np.stack(parts, axis=1) + self.w)
 
     @staticmethod
-    def around(robot: Robot, z: Array, errors: Array, inflation: float = 1.0) -> Shape:
+    def around(robot: Robot, z: Array, errors: Array, inflation: float = 1.0, last: bool = False) -> Shape:
         """Return the shape that holds all errors (T, N, n') and is tightest, on average, for plans as the filter has.
 
-        Driving that was recorded holds large inputs to the end of a window; plans brake.
+        Driving that was recorded holds large inputs to the end of a window; plans brake. last: the errors (T, 1, n')
+        are those after the last period.
         """
         _, N, n = errors.shape
         found, plans = [], _plans_from(robot, z)
         for k in range(N):
-            used, typical = spread_features(robot, z, k + 1), spread_features(robot, plans, k + 1)
+            period = robot.horizon if last else k + 1
+            used, typical = spread_features(robot, z, period), spread_features(robot, plans, period)
             found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical) for i in range(n)]
         slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
         return Shape(slopes.reshape(N, n, -1), w.reshape(N, n))
@@ -307,11 +309,13 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
     s = samples_of(data)
     chosen, candidates, regression = choose(robot, s)
-    scores, positions, others = _scores(robot, s, regression, chosen.ridge)
+    weight = _weight(robot, s, regression, chosen.ridge)
+    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight)
     kinds = driving_kinds(robot, s.z, s.start)
     factor, first = _factor(scores, kinds), _factor(others, kinds)
-    one_step = regression.fit(chosen.ridge)
-    shape = _shape(robot, s.z, s.after - one_step.rollouts(robot, s.z), s.chords)
+    one_step = regression.fit(chosen.ridge, weight=weight)
+    errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
+    shape = _shape(robot, s.z, errors, s.chords)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factor)
     first_scale = np.where(np.arange(n) < d, factor, first)
@@ -379,7 +383,32 @@ def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
     return shape
 
 
-def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> tuple[Array, Array, Array]:
+def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> float:
+    """Return the largest weight of the leverage with which the last sets of plans are nearly as narrow as with any.
+
+    Without it, one factor widens all sets because some windows at the edge of the data are predicted badly, and sets
+    outside of the data are as narrow as within.
+    """
+    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
+    z, after, fold, d = s.z[some], s.after[some, -1:, : robot.position_dim], s.fold[some], robot.position_dim
+    plans, found = _plans_from(robot, z), dict.fromkeys(WEIGHTS, 0.0)
+    for weight in WEIGHTS:
+        scores, width = np.zeros(len(z)), 0.0
+        for i in range(len(regression.gram)):
+            one_step, held = regression.fit(ridge, i, weight), fold == i
+            stretch = one_step.stretches(robot, z)[:, -1:, None]
+            errors = (after - one_step.rollouts(robot, z)[:, -1:, :d]) / stretch
+            shape = Shape.around(robot, z[~held], errors[~held], last=True)
+            scores[held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
+            wide = shape.widths(robot, plans, last=True)[:, 0] * one_step.stretches(robot, plans)[:, -1:]
+            width += float(wide.mean())
+        found[weight] = max(float(np.quantile(scores, 1.0 - OUTSIDE)), 1.0) * width
+    return max(weight for weight, width in found.items() if width <= SIMPLER * min(found.values()))
+
+
+def _scores(
+    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float
+) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
 
     Returns:
@@ -390,8 +419,8 @@ def _scores(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> 
     used = [*range(d), *extra_coordinates(robot), -1]
     for i in range(len(regression.gram)):
         held = s.fold == i
-        one_step = regression.fit(ridge, without=i)
-        errors = s.after - one_step.rollouts(robot, s.z)
+        one_step = regression.fit(ridge, i, weight)
+        errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
         shape = _shape(robot, s.z[~held], errors[~held], s.chords[~held])
         widths = shape.widths(robot, s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)

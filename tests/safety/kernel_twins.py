@@ -148,6 +148,21 @@ def rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, z):
     return np.array(found)
 
 
+def leverages(C, scale, saturations, terms, others, heading, arms, d, inputs, root, z):
+    """`rollout_kernels.leverages`."""
+    r, found = len(others), []
+    for window in z:
+        s, plan, total, rows = window[:r], window[r:].reshape(-1, inputs), 0.0, []
+        for k, (before, u) in enumerate(pairwise(plan)):
+            v = np.concatenate([s, u, before])
+            bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
+            phi = np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
+            s, total = (C @ phi)[others], total + phi
+            rows.append(np.sum((np.tril(root) @ total) ** 2) / (k + 1))
+        found.append(rows)
+    return np.array(found)
+
+
 def linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T):
     """`rollout_kernels.linearized`: the gradient by central differences."""
     parts, step = (C, scale, saturations, terms, others, heading, arms, d, inputs), 1e-6

@@ -83,6 +83,10 @@ def cases(rng, d):
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), widening, start, turn),
         "rollouts": (*rollout_parts(rng, d), 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "leverages": (
+            *(*rollout_parts(rng, d), np.tril(rng.normal(size=(12, 12)))),
+            0.5 * rng.normal(size=(5, 2 + 2 + 2 * N)),
+        ),
         "affine": (
             *(*rollout_parts(rng, d), 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0),
             np.array([d + 1, d]),

@@ -17,7 +17,6 @@ from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.driving_kinds import RESTLESS, START
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
-from brakeline.safety.model.one_step import UNKNOWN, Support
 from brakeline.safety.model.one_step_fitting import fit_one_step, samples_of
 from brakeline.safety.model.windows import FREE
 from tests.safety.asked import cylinder
@@ -72,6 +71,7 @@ def test_the_stated_shares_hold_on_fresh_driving_overall_and_in_every_kind_of_dr
     fresh = samples_of(driven(seed=77, trajectories=60))
     widths = np.stack([step.half_widths(fresh.z) for step in model.steps], axis=1)
     off = np.abs(fresh.after - model.one_step.rollouts(ROBOT, fresh.z))
+    widths *= model.one_step.stretches(ROBOT, fresh.z)[..., None]
     outside = (off[..., :2] > widths[..., :2]).any((1, 2)) | (
         fresh.chords > model.chord_deviations.half_widths(fresh.z)
     ).any(1)
@@ -170,18 +170,24 @@ def test_a_file_gives_the_same_model_set_and_a_damaged_one_is_refused(tmp_path):
         ModelSet.decode(replace(model, model_config=replace(model.model_config, mode=DIRECT)).encode())
 
 
-def test_sets_grow_outside_the_recorded_driving_and_far_outside_nothing_is_verified():
-    recorded = np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 3)) * [1.0, 0.5, 0.2]
-    support = Support.of(recorded)
-    assert np.mean([support.factor(row) > 1.0 for row in recorded]) == pytest.approx(0.001, abs=5e-4)
-    corner = np.array([1.0, 0.5, 0.2])
-    assert 1.0 <= support.factor(corner) < 1.3 and 1.0 < support.factor(1.5 * corner) < 2.0
-    assert support.factor(3.0 * corner) == UNKNOWN
-    fast = request([0.0, 0.0, 0.0, 0.6, 1.5], [0.6, 1.5], [0.6, 1.5], [cylinder(2.0, 2.0, 0.1)])
-    slow = certified()[0].one_step
-    narrow = replace(slow, support=replace(slow.support, radius=0.1 * slow.support.radius))
-    decision = Filter(replace(certified()[0], one_step=narrow)).decide(fast)
-    assert ready().decide(fast).kind == ALLOWED and decision.kind == FAILSAFE and not decision.verified
+def test_sets_grow_with_the_leverage_of_a_plan():
+    one_step = certified()[0].one_step
+    middle = np.concatenate([[0.2, 0.0, 0.2, 0.0], np.tile([0.2, 0.0], ROBOT.horizon)])
+    corner = np.concatenate([[0.6, 1.5, 0.6, 1.5], np.tile([0.6, 1.5], ROBOT.horizon)])
+    assert one_step.weight > 0.0
+    stretches = one_step.stretches(ROBOT, np.stack([middle, corner, 3.0 * corner]))
+    assert (stretches >= 1.0).all() and (stretches[1] > stretches[0]).all() and (stretches[2] > 3.0).any()
+    state = np.array([0.0, 0.0, 0.0, 0.6, 1.5])
+    ask = request(state, [0.6, 1.5], [0.6, 1.5], [cylinder(2.0, 2.0, 0.1)])
+    plain = Filter(replace(certified()[0], one_step=replace(one_step, weight=0.0)))
+    wide, narrow = (filt.decide(ask) for filt in (ready(), plain))
+    noise = np.array(ROBOT.measurement_bound[:2])
+    z = np.concatenate([state[3:], ask.input_in_force, wide.plan.ravel()])
+    expected = one_step.stretches(ROBOT, z[None])[0][:, None] * (narrow.tube_half_width - noise)
+    assert wide.tube_half_width - noise == pytest.approx(expected)
+    assert wide.predicted.half_width == pytest.approx(
+        narrow.predicted.half_width * one_step.stretches(ROBOT, z[None])[0, 0]
+    )
 
 
 def test_too_little_driving_and_stops_by_feedback_are_refused():

@@ -102,6 +102,51 @@ def rollouts(
     return found
 
 
+@compiled("f8[:,::1](f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[:,::1], f8[:,::1])")
+def leverages(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    root: Array,
+    z: Array,
+) -> Array:
+    """Return the leverages h_k (T, N) of the first k periods of windows z (T, r + m + N·m): |root Σ_{j<k} φ_j|² / k.
+
+    root (F, F): inverse of the lower Cholesky factor of the features' second moment.
+    """
+    r, F = len(others), len(terms)
+    N = (z.shape[1] - r) // inputs - 1
+    found, v, y = np.zeros((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
+    p, total = np.empty(1 + len(v) + len(saturations)), np.empty(F)
+    for t in range(len(z)):
+        total[:] = 0.0
+        v[:r] = z[t, :r]
+        for k in range(N):
+            for i in range(inputs):
+                v[r + i] = z[t, r + (k + 1) * inputs + i]
+                v[r + inputs + i] = z[t, r + k * inputs + i]
+            _primitives(scale, saturations, v, p)
+            _outputs(C, saturations, terms, p, y)
+            for f in range(F):
+                total[f] += p[terms[f, 0]] * p[terms[f, 1]] * p[terms[f, 2]]
+            square = 0.0
+            for i in range(F):
+                along = 0.0
+                for j in range(i + 1):
+                    along += root[i, j] * total[j]
+                square += along * along
+            found[t, k] = square / (k + 1)
+            for i in range(r):
+                v[i] = y[others[i]]
+    return found
+
+
 @compiled("void(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], f8[::1], f8[:,::1])")
 def _partials(C: Array, scale: Array, saturations: Array, terms: Index, p: Array, partial: Array) -> None:
     """Write the derivatives of the outputs by the variables into `partial` (n, v), from the primitives p."""
