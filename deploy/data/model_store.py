@@ -20,6 +20,7 @@ from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.methods import DDPC, METHODS, Model
+from brakeline.safety.model.model_config import AUTO, DIRECT
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -83,6 +84,8 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
         console.print(f"[yellow]recording again:[/] {error}")
         load_or_record(robot.in_lockstep(), again=True)
         data = data_for(robot)
+    if model_config.mode == AUTO:
+        model_config = replace(model_config, mode=DIRECT)  # the simulated robots' own; `path` is of this mode too
     with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
         model, report = certify(data, model_config)
     console.print(

@@ -13,8 +13,8 @@ import tyro
 from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
+from brakeline.safety.model.model_config import AUTO, ModelConfig
 from brakeline.safety.model.model_config import METHODS as FILTERS
-from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
@@ -45,7 +45,7 @@ class RunConfig:
     """Robots to train: names, or paths of robot descriptions (.toml). Each has a learner and actors of its own; all
     share the safety service."""
     method: Internal[str] = "ddpc"
-    model_config: Internal[ModelConfig] = field(default_factory=ModelConfig)
+    model_config: Internal[ModelConfig] = field(default_factory=lambda: ModelConfig(mode=AUTO))
     accept_bound: Internal[float | None] = None  # largest accepted stated bound; None: the limit of each description
     arena: str = "default"
     """Name of the arena."""

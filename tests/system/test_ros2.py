@@ -121,7 +121,7 @@ def test_raw_commands_that_ram_hit_nothing(run: Any) -> None:
     print(robot, node)
     assert robot["collisions"] == 0 and robot["closest"] > 0.0
     assert robot["driven"] > 1.0 and node["commands"] > 100 and driver["scans"] > 100
-    assert node["adjusted"] + node["failsafe"] > 50 and node["allowed"] > 50
+    assert node["adjusted"] + node["failsafe"] > 10 and node["allowed"] > 50
     assert node["left the predicted set"] <= 0.03 * node["periods"] and node["passed over"] == 0
 
 
