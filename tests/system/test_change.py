@@ -9,7 +9,7 @@ from tests.accepting import WORDS
 from tests.system.runs import Run, brakeline
 from tests.waiting import until
 
-BEFORE, DURING, AFTER = 800, 2600, 600  # steps of both actors
+BEFORE, DURING, AFTER = 800, 4000, 600  # steps of both actors
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
