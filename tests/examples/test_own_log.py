@@ -1,0 +1,53 @@
+"""examples/own_log: from minutes of driving to a filter. The table that it prints is in docs/own_log.md."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from brakeline.messaging.robot import robot_named
+
+FOLDER = Path(__file__).parents[2] / "examples" / "own_log"
+ROBOTS = ("diff", "skid", "car", "boat")
+
+
+def run(program: str, *words: str) -> str:
+    """Return what a program of the example prints, started as a person starts it."""
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    call = [sys.executable, str(FOLDER / program), *words]
+    ran = subprocess.run(call, env=alone, capture_output=True, text=True, timeout=300, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_drive_fits_its_description(name):
+    header, *rows = run("drive.py", name, "--minutes", "0.5", "--seed", "3").splitlines()
+    robot = robot_named(str(FOLDER / f"{name}.toml"))
+    labels = [label.rpartition(" [")[0] for label in (*robot.state, *robot.action)]
+    assert header.split(",") == ["time", "run", *labels]
+    assert len(rows) == 600
+    inputs = [[float(value) for value in row.split(",")[-2:]] for row in rows]
+    assert all(
+        low <= min(c) and max(c) <= high
+        for c, low, high in zip(zip(*inputs, strict=True), robot.low(), robot.high(), strict=True)
+    )
+
+
+def test_four_minutes_give_a_filter(tmp_path):
+    figures = tmp_path / "figures.json"
+    said = run("table.py", "--robots", "diff", "--minutes", "4", "--quick", "--json", str(figures))
+    (row,) = json.loads(figures.read_text())
+    assert said.count("\n") == 3 and said.splitlines()[2].startswith("| diff | 4 min |")
+    assert row["clearance"] < 0.05 and row["straight"]["set"] < 0.02
+    assert row["fresh"]["outside"] <= row["bound"] and row["fresh"]["plans"] > 1000
+    for driver, episodes in (("adversary", 20), ("planner", 10)):
+        assert row[driver]["episodes"] == episodes and row[driver]["collisions"] == 0
+    assert 0.0 < row["adversary"]["nearest"] < 0.06 and row["adversary"]["decisions"]["adjusted"] > 0.5
+    assert row["planner"]["goals"] >= 9
