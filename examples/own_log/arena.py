@@ -21,6 +21,7 @@ AHEAD = 0.5  # m: a path is followed towards the point so far ahead on it
 WHEELBASE = 0.3  # m, of the car
 AT_GOAL = 0.3  # m
 STUCK, AWAY = 2.5, 1.5  # s without motion, after which the planner backs off for so long
+ASIDE = 1.2  # rad: a car does not turn towards a point farther aside; it backs off first
 CAUTION = 0.1  # m to obstacles at which a cell costs about a third of the extra costs
 EXTRA = 3.0  # extra costs of a cell that touches an obstacle, in cells
 
@@ -120,7 +121,7 @@ class Planner:
         points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
         gaps = np.linalg.norm(points[:, :, None] - arena.centers, axis=-1) - arena.radii
         self._gap = gaps.min(-1) - room
-        self._still, self._back, self._last = 0.0, 0.0, np.full(3, 1e6)
+        self._still, self._back, self._side, self._last = 0.0, 0.0, 1.0, np.full(3, 1e6)
 
     def _cell(self, point: Array) -> tuple[int, int]:
         i, j = np.clip(np.round((point + self.edge) / CELL).astype(int), 0, self.count - 1)
@@ -167,12 +168,14 @@ class Planner:
         moved = abs(_angle(state[2] - self._last[2])) > 0.1 or math.dist(state[:2], self._last[:2]) > 0.05
         self._still = 0.0 if moved else self._still + vehicle.period
         self._last = state[:3].copy() if moved else self._last
-        if self._still > STUCK:
-            self._still, self._back = 0.0, AWAY
         target = self._ahead(state[:2])
+        bearing = _angle(math.atan2(target[1] - state[1], target[0] - state[0]) - state[2])
+        car = vehicle is VEHICLES["car"]
+        if self._back <= 0.0 and (self._still > STUCK or (car and abs(bearing) > ASIDE)):
+            self._still, self._back = 0.0, AWAY
+            self._side = math.copysign(1.0, -bearing if car else bearing)
         if self._back > 0.0:
             self._back -= vehicle.period
-            side = 1.0 if int(state[0] * 7.0) % 2 else -1.0  # not always the same one
-            return np.clip([-vehicle.high[0], side * vehicle.high[1]], vehicle.low, vehicle.high)
+            return np.clip([-vehicle.high[0], self._side * vehicle.high[1]], vehicle.low, vehicle.high)
         left = float(np.linalg.norm(self.arena.goal - state[:2]))
-        return towards(vehicle, state, target, vehicle.high[0] * min(1.0, 0.3 + left), backwards=left > 2 * AT_GOAL)
+        return towards(vehicle, state, target, vehicle.high[0] * min(1.0, 0.3 + left), backwards=False)
