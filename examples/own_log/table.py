@@ -119,18 +119,17 @@ def fresh_shares(model: ModelSet, fitted: Dataset, data: Dataset) -> dict[str, A
         return {"plans": report.windows, "outside": report.violations / report.windows, "kinds": {}}
     s = samples_of(data)
     errors = np.abs(s.after - model.one_step.rollouts(robot, s.z))
-    widths = np.stack([step.half_widths(s.z) for step in model.steps], axis=1)
+    stretch = model.one_step.stretches(robot, s.z)  # sets grow off the recorded driving
+    widths = np.stack([step.half_widths(s.z) for step in model.steps], axis=1) * stretch[..., None]
     used = [*range(robot.position_dim), *extra_coordinates(robot)]
     outside = (errors > widths)[..., used].any((1, 2)) | (errors > widths)[:, 0].any(1)
     shares = (errors / widths)[..., used].max((1, 2))
     off_chord = (s.chords > model.chord_deviations.half_widths(s.z)).any(1)
-    unlike = shares > [model.one_step.support.factor(z) for z in s.z]  # outside even of sets that grow off the data
     kinds = driving_kinds(robot, s.z, s.start)
     return {
         "plans": len(outside),
         "outside": float((outside | off_chord).mean()),
         "off_chord_only": float((off_chord & ~outside).mean()),
-        "outside_widened": float(unlike.mean()),
         "largest": float(shares.max()),
         "kinds": {
             name: {"plans": int(kind.sum()), "outside": float((outside | off_chord)[kind].mean())}
