@@ -19,6 +19,7 @@ MOST_BINS = 200
 FIRST_WIDTH = 50  # steps
 LAST = 100  # latest episodes that the report summarizes
 MOST_POINTS = 400  # points of a learner's curves
+MOST_MODELS = 1000  # versions whose first decision is kept
 CURVES = ("steps", "updates", "critic_loss", "actor_loss", "mean_q")  # of the learner
 
 COUNTED = {int(pb.ADJUSTED): "adjusted", int(pb.FAILSAFE): "failsafes"}
@@ -29,11 +30,25 @@ class Bin(Counter[str]):
 
     reward = 0.0  # of these episodes, without the intervention penalty
     closest = math.inf  # m
+    widening = 1.0  # the largest of a request
+    half_width = 0.0  # m, sum over the tubes of their largest half-width
 
     def join(self, other: Bin) -> None:
         self.update(other)
         self.reward += other.reward
         self.closest = min(self.closest, other.closest)
+        self.widening = max(self.widening, other.widening)
+        self.half_width += other.half_width
+
+    def sets(self) -> Figures:
+        """Return how much of their sets the windows in the bin used, and how wide the tubes were; None: no window."""
+        scored, tubes = self["scored"], self["tubes"]
+        return {
+            "beyond": self["beyond"] / scored if scored else None,
+            "beyond_widened": self["beyond_widened"] / scored if scored else None,
+            "widening": self.widening if scored else None,
+            "half_width": self.half_width / tubes if tubes else None,
+        }
 
 
 @dataclass
@@ -60,12 +75,15 @@ class LearningCurve:
         self._stride = 1  # learner messages per point
         self._messages = 0
         self._newest = 0
+        self._steps = 0
+        self._models: dict[str, int] = {}  # step at which a version of the model set decided first
 
     def step(self, step: pb.Step) -> None:
         now = self.bins[-1]
         if now["steps"] >= self.width:
             now = self._next()
         now["steps"] += 1
+        self._steps += 1
         kind = kind_of(step)
         if kind in COUNTED:
             now[COUNTED[kind]] += 1
@@ -92,6 +110,20 @@ class LearningCurve:
             now.reward += episode.reward
             self.last.append(self._running.pop(actor))
 
+    def exchange(self, exchange: pb.Exchange) -> None:
+        """Add an exchange of one of the actors with the safety service (docs/method.md §15)."""
+        now, decision, widening = self.bins[-1], exchange.reply.decision, max(exchange.request.widening, 1.0)
+        if decision.HasField("score"):
+            now["scored"] += 1
+            now["beyond"] += not decision.score <= 1.0
+            now["beyond_widened"] += not decision.score <= widening
+            now.widening = max(now.widening, widening)
+        if decision.tube_half_width:
+            now["tubes"] += 1
+            now.half_width += max(decision.tube_half_width)
+        if decision.model and len(self._models) < MOST_MODELS:
+            self._models.setdefault(decision.model, self._steps)
+
     def learner(self, metrics: pb.LearnerMetrics) -> None:
         """Add a learner's metrics; of many messages, evenly spaced ones become points."""
         self._newest = max(self._newest, metrics.weights_version)
@@ -114,10 +146,12 @@ class LearningCurve:
                     "reward": row.reward / episodes if episodes else None,
                 }
                 closest = finite(row.closest)
-                rows.append({"until": until, "steps": steps, **rates, "episodes": episodes, **ends, "closest": closest})
+                row_steps = {"until": until, "steps": steps, **rates, "episodes": episodes, **ends, "closest": closest}
+                rows.append(row_steps | row.sets())
         return {
             "bin_steps": self.width,
             "bins": rows,
+            "models": [{"model": model, "from": step} for model, step in self._models.items()],
             "staleness": summary(self.staleness),
             "last": self._last(),
             "learner": [dict(zip(CURVES, point, strict=True)) for point in self._learned],

@@ -82,12 +82,13 @@ class RunAnalysis:
         """Read all messages in one loop."""
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
             STEP.name: lambda series, step: self.training[series.robot].step(step),
+            EXCHANGE.name: lambda series, exchange: self.training[series.robot].exchange(exchange),
             LEARNER.name: lambda _, metrics: self.training[metrics.robot].learner(metrics),
         }
         if self.options.pictures or self.options.episode is not None:
             handlers |= {
                 STEP.name: self._step,
-                EXCHANGE.name: lambda series, exchange: self._buffer(series)[1].exchanges.append(exchange),
+                EXCHANGE.name: self._exchange,
                 EPISODE.name: lambda series, episode: self._buffer(series)[1].about.append(episode),
                 HEALTH.name: lambda _, health: self.timeline.health(health),
                 LOG.name: lambda _, line: self.timeline.line(line),
@@ -108,6 +109,10 @@ class RunAnalysis:
         sampler, buffer = self._buffer(series)
         sampler.step(buffer, step)
         self.timeline.step(step.header.wall_time)
+
+    def _exchange(self, series: LogChannel, exchange: Any) -> None:
+        self.training[series.robot].exchange(exchange)
+        self._buffer(series)[1].exchanges.append(exchange)
 
     def _buffer(self, series: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:
         """Return the sampler of the channel's robot kind, and the buffer of its actor."""

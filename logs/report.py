@@ -16,6 +16,7 @@ from brakeline.logs.reader import Paths
 from brakeline.logs.tube_stats import stated
 
 BLOCKS = "▁▂▃▄▅▆▇█"
+SETS = {"outside the sets": "beyond", "widening": "widening", "half-width [m]": "half_width"}  # rows of a curve's bins
 
 
 def analyse(paths: Paths) -> Figures:
@@ -199,10 +200,11 @@ def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:
 def _training(robot: str, training: Figures) -> Table:
     """Format the learning curves as sparklines."""
     bins, rows = _coarse(training["bins"], 60), []
-    for name in ("interventions", "goals", "reward"):
-        values = [row[name] for row in bins if row[name] is not None]
+    for name in ("interventions", "goals", "reward", *SETS):
+        values = [row[SETS.get(name, name)] for row in bins if row[SETS.get(name, name)] is not None]
         if values:
             rows.append((name, f"{values[0]:.3g}", f"{values[-1]:.3g}", _sparkline(values)))
+    rows += [("new model set", "", "", f"{row['model']} from step {row['from']}") for row in training["models"][1:]]
     stale = training["staleness"]
     if stale is not None and stale["max"] > 0:
         versions = "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
@@ -223,7 +225,8 @@ def _coarse(bins: list[Figures], most: int) -> list[Figures]:
             name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None
             for name in ("goals", "reward")
         }
-        rows.append({"interventions": interventions, **means})
+        sets = {name: max((row[name] for row in part if row[name] is not None), default=None) for name in SETS.values()}
+        rows.append({"interventions": interventions, **means, **sets})
     return rows
 
 

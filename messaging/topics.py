@@ -71,10 +71,10 @@ DECIDE = Topic("decide", "safety/{robot}/decide", pb.RequestBatch, QUERY, None, 
 JOIN = Topic("join", "learner/{robot}/join", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
              pb.JoinReply)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, BLOCK, None, ("certify",), ("safety",), True, largest=FILE)
-STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, ("actor",), ("learner",), True)
+STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, ("actor",), ("learner", "certify"), True)
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, BLOCK, None, ("feeder",), ("learner",), False, own=False)
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, BLOCK, None, ("actor",), (), True)
-EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, BLOCK, None, ("actor",), (), True)
+EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, BLOCK, None, ("actor",), ("certify",), True)
 FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, BLOCK, None, ("actor",), (), True)
 WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, DROP, None, ("learner",), ("actor", "feeder"), False,
                 largest=FILE)

@@ -53,6 +53,9 @@ class FlyCommand:
     practice: float = 0.0
     """Share of the steps at which a vehicle starts to follow its backup plan to the stop, so that the log has the stops
     that `brakeline certify LOG` needs."""
+    adapt: bool = False
+    """Certify the vehicle anew in flight: if it needs wider sets than its model set states for long, a certifier
+    process fits a model set to the last minutes and puts it to use."""
     deadline: float = 0.12
     """Time that an actor waits for an answer of the safety service [s]. The answer applies from the next control period
     (0.2 s) on."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -23,16 +24,31 @@ class SafetyCommand:
     filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
     name: str = "safety"
     """Name of the service on the bus. Each replica needs its own."""
+    adapt: bool = False
+    """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
+    process fits a model set to the last minutes and puts it to use. It hears the actors on the bus, and needs the keys
+    of `certify` in --keys. Give it to one replica."""
 
     def run(self) -> int:
         """Answer requests until SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.deploy.run.run_keys import check_adaptable, check_signer
         from brakeline.safety.service.server import SafetySettings, main
 
         model_config, accept_bound = self.filtering.model_config(), self.filtering.accept_bound
         robots = [robot_maybe_with_task(robot) for robot in self.robots]
+        bus = self.endpoints.bus()
+        if self.adapt:
+            check_signer(bus.keys)
         for robot in robots:
-            method_for(robot, self.filtering.method, model_config, accept_bound)
+            model = method_for(robot, self.filtering.method, model_config, accept_bound)
+            if self.adapt:
+                check_adaptable(model)
         paths = tuple(method_path(robot, self.filtering.method, model_config) for robot in robots)
         limits = {robot.name: robot.accept_bound for robot in robots}
-        main(SafetySettings(self.endpoints.bus(), paths, data_root(), self.name, limits, accept_bound))
+        with ExitStack() as beside:
+            if self.adapt:
+                from brakeline.deploy.run.adaptation_process import CertifierSettings, certifier_beside
+
+                beside.enter_context(certifier_beside(CertifierSettings(bus, self.robots, data_root(), accept_bound)))
+            main(SafetySettings(bus, paths, data_root(), self.name, limits, accept_bound))
         return 0

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -113,6 +114,8 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     if plans["scored"]:
         widest = f"{plans['widening']:.3g} times"
         rows.append(("windows outside sets", share(plans["beyond"], plans["scored"]), "widened by up to", widest))
+    notes = {name: note for process in figures["processes"].values() for name, note in process["notes"].items()}
+    rows += [("new model set", escape(notes[name]), "", "") for name in sorted(notes) if name.startswith("adaptation ")]
     decide, reply = (
         known("{0[p50]:.2f} / {0[p99]:.2f} ms", figures[name]) for name in ("decision_ms", "round_trip_ms")
     )

@@ -13,7 +13,7 @@ from typing import Any
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
-from brakeline.deploy.run.run_keys import KEYS, sign_models
+from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.errors import LaunchError
 from brakeline.logs.metrics import Metrics
@@ -43,12 +43,16 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
     Raises:
         LaunchError: the folder holds another run.
         TooLoose: the stated bound of a model set is above the accepted one.
+        ValueError: the run adapts, and a model set is not of mode one-step.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if config.filtered:
-        for robot in config.robots:
-            method_for(robot_maybe_with_task(robot), config.method, config.model_config, config.accept_bound)
+        for name in config.robots:
+            robot = robot_maybe_with_task(name)
+            model = method_for(robot, config.method, config.model_config, config.accept_bound)
+            if config.adapt:
+                check_adaptable(model)
     folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -63,6 +67,8 @@ class Launcher:
 
     def __init__(self, config: RunConfig, folder: Path, bus: BusSettings) -> None:
         """bus: the endpoint to listen on, and the folder with the keys of all processes, if they have any."""
+        if config.adapt:
+            check_signer(bus.keys)
         self.config, self.folder, self.bus = config, folder, bus
         self.processes = [SupervisedProcess(spec, folder) for spec in process_specs(config)]
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))

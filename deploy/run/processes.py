@@ -14,6 +14,7 @@ from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.robot import robot_named
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
+CERTIFIER = "certify.adapt"  # name of the process that certifies anew; its certificate is that of `certify`
 UNFINISHED = 75  # exit status of a process that was asked to end before its work was done
 
 
@@ -26,6 +27,7 @@ class ProcessSpec:
     robot: str = ""  # name or path of the robot, as in the configuration
     number: int = 0  # of an actor's first robot, or of an autopilot
     nice: int = 0  # the safety of robots comes before learning
+    needed: bool = True  # the run ends if the process keeps failing
 
 
 def process_specs(config: RunConfig) -> list[ProcessSpec]:
@@ -33,6 +35,8 @@ def process_specs(config: RunConfig) -> list[ProcessSpec]:
     table = [ProcessSpec("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
     if config.filtered:
         table += [ProcessSpec(f"safety-{i}", "safety") for i in range(config.replicas)]
+        if config.adapt:
+            table.append(ProcessSpec(CERTIFIER, "certifier", nice=10, needed=False))
     if config.autopilot is not None:
         several = len(config.flights) > 1
         names = [f"autopilot-{i}" if several else "autopilot" for i in range(len(config.flights))]

@@ -13,7 +13,8 @@ import tyro
 from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
-from brakeline.safety.model.model_config import AUTO, ModelConfig
+from brakeline.safety.model.model_config import AUTO, DDPC, ModelConfig
+from brakeline.safety.model.model_config import METHODS as FILTERS
 from brakeline.safety.model.model_config import METHODS as FILTERS
 from brakeline.sim.sim_conditions import Conditions
 
@@ -83,6 +84,9 @@ class RunConfig:
     change: PhysicsChange = field(default_factory=PhysicsChange)
     """A change of the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1.
     """
+    adapt: bool = False
+    """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
+    process fits a model set to the last minutes and puts it to use."""
     conditions: Internal[Conditions] = field(default_factory=Conditions)
     policy: Internal[str] = ""  # a name or a file, as `evaluate` takes it; empty: the run learns a policy
     flights: Internal[tuple[FlightSettings, ...]] = ()  # links to vehicles in real time, one for each actor
@@ -104,6 +108,8 @@ class RunConfig:
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
             )
+        if self.adapt and self.method != DDPC:
+            raise ValueError(f"--adapt certifies model sets of the method {DDPC}, not of {self.method}")
         one_robot = self.robots_per_actor == 1 and len(self.robots) == 1
         if self.deterministic and self.from_logs:
             raise ValueError("a deterministic run learns from its own actor, not from logs: leave out --from-logs")

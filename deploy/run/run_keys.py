@@ -8,10 +8,11 @@ from pathlib import Path
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.errors import BadModel
+from brakeline.errors import BadModel, Untrusted
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.methods import load
+from brakeline.safety.methods import Model, load
+from brakeline.safety.model.model_set import ONE_STEP, ModelSet
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.server import archive_path
 from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, seal_of, write_signer
@@ -20,13 +21,14 @@ log = logging.getLogger("brakeline.launcher")
 
 KEYS = "keys"  # folder in the run's folder
 OTHER_ROLES = ("launcher", "viewer", "client", "certify")  # that may join the bus, besides the run's processes
+NO_KEYS = ("autopilot", "certifier")  # kinds of processes: not on the bus; on it with the keys of `certify`
 
 
 def make_run_keys(config: RunConfig, folder: Path) -> Path:
     """Return the folder of the run's keys. Makes the keys, unless a resumed run has them already."""
     keys = folder / KEYS
     authority = Authority(keys)
-    for name in (*OTHER_ROLES, *(spec.name for spec in process_specs(config) if spec.kind != "autopilot")):
+    for name in (*OTHER_ROLES, *(spec.name for spec in process_specs(config) if spec.kind not in NO_KEYS)):
         authority.issue(name)
     write_signer(keys)
     write_key(keys)
@@ -46,6 +48,26 @@ def sign_models(config: RunConfig, folder: Path, keys: Path) -> None:
         archived = archive_path(folder, model.robot.name, model.version)
         if not seal_of(archived).exists():
             signer.sign(model).save(archived)
+
+
+def check_signer(keys: Path | None) -> None:
+    """Check that the certifier of a run or of a safety service can sign model sets.
+
+    Raises:
+        Untrusted: there are no keys, or not the one that signs.
+    """
+    if keys is None:
+        raise Untrusted("--adapt needs keys: a safety service takes no model set over a bus without keys")
+    ModelSigner.load(keys)
+
+
+def check_adaptable(model: Model) -> None:
+    """Check that requests can widen the sets of a model set, so that a change is noticed. Raises ValueError."""
+    if not isinstance(model, ModelSet) or model.one_step is None:
+        raise ValueError(
+            f"--adapt needs a model set of mode {ONE_STEP}, for {model.robot.name} another one is in use: give --mode "
+            f"{ONE_STEP}, or certify with `brakeline certify --robot {model.robot.kind} --use`"
+        )
 
 
 def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:

@@ -60,6 +60,13 @@ def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings
     return False
 
 
+def _certifier(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from brakeline.deploy.run.adaptation_process import CertifierSettings, main
+
+    main(CertifierSettings(bus, config.robots, folder, config.accept_bound, spec.name))
+    return False
+
+
 def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.learner.checkpoint import CHECKPOINT, exists, latest
 
@@ -133,11 +140,12 @@ def _feeder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings
     return main(FeederSettings(bus, config.from_logs, spec.robot, spec.name, config.actors == 0))
 
 
-# Each function returns True when its work is done, False when a signal ended it. The work of a recorder and of a safety
-# service is never done.
+# Each function returns True when its work is done, False when a signal ended it. The work of a recorder, of a safety
+# service and of a certifier is never done.
 MAIN_FUNCTIONS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = {
     "recorder": _recorder,
     "safety": _safety,
+    "certifier": _certifier,
     "learner": _learner,
     "actor": _actor,
     "autopilot": _autopilot,

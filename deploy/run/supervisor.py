@@ -67,7 +67,7 @@ class SupervisedProcess:
         """Start the process if it is time, and schedule a restart if it has failed.
 
         Raises:
-            LaunchError: it failed MOST_FAILURES times in a row.
+            LaunchError: it failed MOST_FAILURES times in a row, and the run needs it.
         """
         now = time.monotonic()
         if self.finished or self.alive:
@@ -88,9 +88,12 @@ class SupervisedProcess:
         log_file = self.folder / "logs" / f"{self.spec.name}.log"
         output = f"its last output: {last_line(log_file) or 'none'}"
         if self.failures == MOST_FAILURES:
-            raise LaunchError(
-                f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
-            )
+            said = f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
+            if self.spec.needed:
+                raise LaunchError(said)
+            self.finished = True
+            log.error("%s; the run goes on without it", said)
+            return
         backoff = min(FIRST_BACKOFF * 2.0 ** (self.failures - 1), LONGEST_BACKOFF)
         self.next_start = now + backoff
         self.restarts += 1

@@ -1,4 +1,7 @@
-"""Test a robot that changes in mid-run: violations are counted, and a new model set from its own steps ends them."""
+"""Test a robot that changes in mid-run: violations are counted, and a new model set from its own steps ends them.
+
+The new model set comes from `certify --publish` by hand, or from the certifier of `--adapt`.
+"""
 
 import json
 import signal
@@ -46,3 +49,33 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
     assert share(recorded) <= 0.01
     assert share(loaded) > 0.05, "the old model set does not know the payload"
     assert share(anew) <= published["bound_step"] < share(loaded), "the new one does, and states how well"
+
+
+def beyond(exchanges):
+    """The share of windows outside their stated sets."""
+    scores = [exchange.reply.decision.score for exchange in exchanges if exchange.reply.decision.HasField("score")]
+    return sum(not score <= 1.0 for score in scores) / len(scores)
+
+
+def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(data_folder, tmp_path):
+    change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2, "--practice", 0.1)
+    adapt = ("--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
+    with Run(tmp_path / "run", "--steps", ENDLESS, *adapt, *change, *WORDS) as run:
+        processes = run.watch().processes
+        certifier = until(lambda: processes.get("certify.adapt"), "the certifier")
+        run.until_steps(BEFORE + DURING // 2)
+        until(lambda: certifier.figures.get("published ground"), "a new model set")
+        run.until_steps(AFTER)
+        note, refused = certifier.notes["adaptation ground"], certifier.figures.get("refused ground", 0)
+        figures = run.end(signal.SIGINT)
+    version, why = note.split(" ", 1)
+    assert "minutes after the change" in why and refused <= 1
+    assert figures["collisions"] == 0 and "certify.adapt" not in figures["restarts"]
+    records = list(open_log(run.folder))
+    models = [record.message for record in records if record.topic == "model"]
+    assert [model.version for model in models] == [version] and models[0].signature
+    exchanges = [record.message for record in records if isinstance(record.message, pb.Exchange)]
+    old = [e for e in exchanges if e.request.widening > 1.3 and e.reply.decision.model != version]
+    new = [e for e in exchanges if e.reply.decision.model == version]
+    assert len(new) > 200 and max(e.request.widening for e in new[-100:]) < max(e.request.widening for e in old)
+    assert beyond(new) < 0.02 < beyond(old), "the new set knows the payload"

@@ -1,0 +1,240 @@
+"""Certify a robot again while it drives, when it is no longer the robot that was recorded (docs/method.md §15).
+
+`Adaptation` hears the steps and exchanges of all robots of one kind. It keeps the recent ones in memory, so it needs no
+log. It decides when to fit a new model set, on which driving, and whether the result may replace the one in use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.run_dataset import trajectories_of
+from brakeline.errors import BadData, BadModel, BadStep, ErrorBoundError, Implausible
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.stated_share import percent
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
+from brakeline.safety.model.windows import FREE, windows
+
+WIDENING, REQUESTS = 1.3, 100  # a robot has changed if its last 100 requests, or more, were widened by more than 1.3
+FEWEST_MINUTES = 4.0  # of driving after the change
+AGAIN = 15.0  # minutes of driving after which a model set may be replaced without a change
+MEMORY = 20.0  # minutes of driving, of all robots of the kind together
+PAUSE = 1.0  # minutes of driving from one attempt to the next
+SPARE = 1.2  # factor on the driving that the accepted bound needs: windows must not cross the ends of trajectories
+TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
+DOMAIN = 0.75  # least ratio of the recorded range of a speed or an input to that of the model set in use
+MOST_ROBOTS = 10_000
+SILENT = 30.0  # s after which a robot counts as gone
+UNUSED = ("observation", "next_observation", "proposed")  # fields of a step that no data set needs
+
+
+@dataclass(frozen=True, order=True)
+class Period:
+    """The place of a period in the driving of one robot: steps of later periods are not less."""
+
+    run: int
+    episode: int
+    step: int
+
+
+@dataclass
+class RobotState:
+    """What the requests of one robot say.
+
+    Attributes:
+        version: model set of the last decision.
+        since: first period under this version.
+        widened: first period of the requests that were widened without a break up to now; None: the last one was not.
+        requests: number of these requests.
+        widening: of the last request.
+        heard: when the last request was published [ns].
+    """
+
+    version: str
+    since: Period
+    widened: Period | None = None
+    requests: int = 0
+    widening: float = 1.0
+    heard: int = 0
+
+    @property
+    def changed(self) -> bool:
+        """Whether the robot has used more than its sets for long."""
+        return self.requests >= REQUESTS
+
+
+@dataclass(frozen=True)
+class Recertification:
+    """The result of an attempt.
+
+    Attributes:
+        text: why the model set is published, or why there is none.
+        model, data: the model set to publish, and its data; None if it may not be used.
+    """
+
+    text: str
+    model: ModelSet | None = None
+    data: Dataset | None = None
+
+
+@dataclass
+class Adaptation:
+    """The recent driving of all robots of one kind.
+
+    Attributes:
+        robot: the robot kind, with its description of today.
+        in_use: returns the model set of a version that decided. Raises BadModel if it is not known.
+        accept_bound: largest accepted bound; by default the limit in the robot's description.
+    """
+
+    robot: Robot
+    in_use: Callable[[str], ModelSet]
+    accept_bound: float | None = None
+    _steps: deque[pb.Step] = field(init=False)
+    _robots: dict[str, RobotState] = field(default_factory=dict)
+    _driven: int = 0  # periods since the last attempt
+
+    def __post_init__(self) -> None:
+        self._steps = deque(maxlen=max(self._periods(MEMORY), math.ceil(1.5 * self.needed)))
+        self._driven = self._periods(PAUSE)
+
+    def _periods(self, minutes: float) -> int:
+        return math.ceil(60.0 * minutes / self.robot.period)
+
+    def _minutes(self, periods: int) -> float:
+        return periods * self.robot.period / 60.0
+
+    @property
+    def needed(self) -> int:
+        """Periods of driving from which a model set can state the accepted bound."""
+        plans = plans_needed(accepted_bound(self.robot, self.accept_bound))
+        return max(self._periods(FEWEST_MINUTES), math.ceil(SPARE * plans * self.robot.horizon))
+
+    def step(self, step: pb.Step) -> None:
+        """Add a step, without the fields that no data set needs. Raises BadStep."""
+        robot = self.robot
+        sizes = len(step.state), len(step.action), len(step.path) % robot.position_dim
+        if sizes != (robot.state_dim, robot.action_dim, 0) or not step.path:
+            raise BadStep("state, action, path", f"of another size than those of {robot.name}")
+        if not np.isfinite([*step.state, *step.action, *step.path, step.turned]).all():
+            raise BadStep("state, action, path", "NaN or infinity")
+        for name in UNUSED:
+            step.ClearField(name)
+        self._steps.append(step)
+        self._driven += 1
+
+    def exchange(self, exchange: pb.Exchange) -> None:
+        """Add an exchange with the safety service. Raises Implausible if there are too many robots."""
+        request, decision = exchange.request, exchange.reply.decision
+        now = Period(exchange.header.run, request.episode, request.step)
+        state = self._robots.get(request.actor)
+        if state is None or state.since.run != now.run:
+            if state is None and len(self._robots) >= MOST_ROBOTS:
+                raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
+            state = self._robots[request.actor] = RobotState(decision.model, now)
+        elif decision.model and decision.model != state.version:
+            state.version, state.since = decision.model, now
+        state.widening, state.heard = max(request.widening, 1.0), exchange.header.wall_time
+        if state.widening > WIDENING:
+            state.widened, state.requests = state.widened or now, state.requests + 1
+        else:
+            state.widened, state.requests = None, 0
+
+    @property
+    def widening(self) -> float:
+        """The least widening of the robots. A model set is for all of them."""
+        return min((state.widening for state in self._driving_robots().values()), default=1.0)
+
+    @property
+    def since_change(self) -> float:
+        """Minutes of driving since all robots have changed; 0 if one of them has not."""
+        return self._minutes(len(self._since_change())) if self._changed() else 0.0
+
+    def _driving_robots(self) -> dict[str, RobotState]:
+        """Return the robots that are not silent."""
+        latest = max((state.heard for state in self._robots.values()), default=0)
+        return {name: state for name, state in self._robots.items() if latest - state.heard <= SILENT * 1e9}
+
+    def _changed(self) -> bool:
+        robots = self._driving_robots()
+        return bool(robots) and all(state.changed for state in robots.values())
+
+    def _since(self, starts: dict[str, Period]) -> list[pb.Step]:
+        """Return the steps of each robot from its start on."""
+
+        def taken() -> Iterator[pb.Step]:
+            for step in self._steps:
+                start = starts.get(step.actor)
+                run = step.header.run
+                if start is not None and run == start.run and Period(run, step.episode, step.step) >= start:
+                    yield step
+
+        return list(taken())
+
+    def _since_change(self) -> list[pb.Step]:
+        robots = self._driving_robots()
+        return self._since({name: s.widened for name, s in robots.items() if s.widened is not None})
+
+    def _since_version(self) -> list[pb.Step]:
+        return self._since({name: state.since for name, state in self._driving_robots().items()})
+
+    def attempt(self) -> Recertification | None:
+        """Fit and check a model set, if it is time; None if it is not."""
+        if self._driven < self._periods(PAUSE):
+            return None
+        if self._changed():
+            steps = self._since_change()
+            why = f"{self._minutes(len(steps)):.1f} minutes after the change, at {self.widening:.2g} times the sets"
+        else:
+            again = self._periods(AGAIN)
+            steps = self._since_version() if self._driven >= again else []
+            why = f"after {self._minutes(len(steps)):.1f} minutes without a new one"
+            if len(steps) < again:
+                return None
+        if len(steps) < self.needed:
+            return None
+        self._driven = 0
+        return self._certified(steps, why)
+
+    def _certified(self, steps: list[pb.Step], why: str) -> Recertification:
+        """Return the model set of these steps, or why it may not be used."""
+        widening = self.widening
+        version = max(self._driving_robots().values(), key=lambda state: state.heard).version
+        try:
+            data = Dataset(self.robot, tuple(trajectories_of(steps, self.robot)), {"origin": "adaptation", "why": why})
+            data.check()
+            model, report = certify(data, ModelConfig(mode=ONE_STEP))
+            looser = _looser(model, self.in_use(version), widening, data)
+        except (BadData, BadModel, ErrorBoundError, ValueError) as error:
+            return Recertification(f"none {why}: {error}")
+        if refused := refusal(self.robot, model.about, self.accept_bound) or looser:
+            return Recertification(f"none {why}: {refused}")
+        stated = (
+            f"±{1e3 * report.half_width_full:.0f} mm after a full stop, at most {percent(report.bound_plan)} outside"
+        )
+        return Recertification(f"{model.version} {why}: {stated}", model, data)
+
+
+def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -> str:
+    """Return why a model set must not replace the one in use, which the robots widen; empty if it may."""
+    if in_use.one_step is None:
+        return f"the model set in use, {in_use.version}, is not of mode {ONE_STEP}, so nothing follows a change"
+    ranges = np.ptp(in_use.domain, axis=0)
+    covered = float((np.ptp(model.domain, axis=0) / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
+    if covered < DOMAIN:
+        return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
+    z = windows(data, data.robot.horizon, FREE).z
+    d = data.robot.position_dim
+    new, old = (float(m.steps[-1].half_widths(z)[:, :d].mean()) for m in (model, in_use))
+    if new > TIGHTER * widening * old:
+        return f"its sets are {new / (widening * old):.2g} times as wide as those in use, as widened"
+    return ""

@@ -1,0 +1,145 @@
+"""PROCESS: the certifier. It hears all robots, and publishes a new model set when they have changed (`Adaptation`)."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import sys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from brakeline.deploy.interpreter import end_with_parent, spawning
+from brakeline.deploy.run.adaptation import Adaptation, Recertification
+from brakeline.deploy.run.processes import CERTIFIER
+from brakeline.errors import BadModel, BrakelineError
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.messaging.topics import EXCHANGE, MODEL, STEP
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.server import archive_path
+from brakeline.safety.service.signature import ModelSigner
+
+log = logging.getLogger("brakeline.certifier")
+
+PERIOD = 0.5  # s between two looks at the messages
+BACKLOG = 10_000  # messages that may wait during a fit; older ones are lost
+START_ALLOWANCE, TERMINATION_TIMEOUT = 60.0, 10.0  # s, of a certifier beside a safety service
+NOTE = "adaptation"  # of Health, with the robot's name: the result of the last attempt
+
+
+@dataclass(frozen=True)
+class CertifierSettings:
+    """Settings of the process.
+
+    Attributes:
+        bus: how to join the bus. Its folder of keys has the key that signs models.
+        robots: names, or paths of robot descriptions.
+        archive: folder in which the safety services keep every version.
+        accept_bound: of `Adaptation`.
+    """
+
+    bus: BusSettings
+    robots: tuple[str, ...]
+    archive: Path
+    accept_bound: float | None = None
+    name: str = CERTIFIER
+
+
+def main(settings: CertifierSettings) -> None:
+    """Follow the robots until SIGINT or SIGTERM. After a failure, the robots keep the model set in use.
+
+    Raises:
+        Untrusted: there is no key to sign with.
+    """
+    signer = ModelSigner.load(settings.bus.keys or Path())
+    with Process(settings.bus, settings.name) as process:
+        kinds = [_adaptation(robot_maybe_with_task(name), settings) for name in settings.robots]
+        inbox: deque[Sample] = deque(maxlen=BACKLOG)
+        for topic in (STEP, EXCHANGE):
+            process.bus.subscribe(topic, inbox.append)
+        process.announce()
+        log.info("ready")
+        while not process.stop.wait(PERIOD):
+            _take_in(inbox, {kind.robot.name: kind for kind in kinds}, process)
+            for kind in kinds:
+                try:
+                    if (attempt := kind.attempt()) is not None:
+                        _settle(attempt, kind.robot, signer, process)
+                    process.figures[f"widening {kind.robot.name}"] = kind.widening
+                    process.figures[f"minutes since the change {kind.robot.name}"] = kind.since_change
+                except Exception:
+                    log.exception("%s: no new model set, because of an error", kind.robot.name)
+
+
+def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:
+    def in_use(version: str) -> ModelSet:
+        if not version.isalnum():
+            raise BadModel(f"no version is called {version!r:.40}")
+        return ModelSet.load(archive_path(settings.archive, robot.name, version))
+
+    return Adaptation(robot, in_use, settings.accept_bound)
+
+
+def _take_in(inbox: deque[Sample], kinds: dict[str, Adaptation], process: Process) -> None:
+    """Give the received messages to the robot kinds that they are about."""
+    while inbox:
+        sample = inbox.popleft()
+        with process.bus.rejected.skip_on_error(sample.key):
+            message = sample.message()
+            if isinstance(message, pb.Step) and message.robot in kinds:
+                kinds[message.robot].step(message)
+            elif isinstance(message, pb.Exchange) and message.request.robot in kinds:
+                kinds[message.request.robot].exchange(message)
+
+
+def _settle(attempt: Recertification, robot: Robot, signer: ModelSigner, process: Process) -> None:
+    """Publish the model set of an attempt, if it has one, and say so."""
+    process.notes[f"{NOTE} {robot.name}"] = attempt.text
+    count = f"{'refused' if attempt.model is None else 'published'} {robot.name}"
+    process.figures[count] = process.figures.get(count, 0.0) + 1.0
+    if attempt.model is not None:
+        signed = signer.sign(attempt.model, attempt.data)
+        message = pb.Model(robot=robot.name, version=attempt.model.version, file=signed.file)
+        message.claim, message.signature = signed.claim, signed.signature
+        process.bus.publisher(MODEL, robot=robot.name).put(message)
+    log.info("%s: new model set: %s", robot.name, attempt.text)
+    process.announce()
+
+
+@contextmanager
+def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
+    """Run the certifier in a process of its own until the end of the block, or of this process.
+
+    settings: with the bus of this process, which may be a router.
+    """
+    bus = settings.bus
+    here = tuple(endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in bus.listen)
+    client = replace(bus, connect=bus.connect or here, listen=(), metrics="", patience=START_ALLOWANCE)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"  # of the certifier; NumPy of this process has its threads already
+    process = spawning().Process(target=_start_beside, args=(replace(settings, bus=client),), daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join(TERMINATION_TIMEOUT)
+        process.kill()
+
+
+def _start_beside(settings: CertifierSettings) -> None:
+    parent = multiprocessing.parent_process()
+    if parent is None or parent.pid is None or not end_with_parent(parent.pid):
+        return
+    os.nice(10)
+    try:
+        main(settings)
+    except BrakelineError as error:
+        print(f"{settings.name}: {type(error).__name__}: {error}", file=sys.stderr)

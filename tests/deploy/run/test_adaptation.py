@@ -1,0 +1,191 @@
+"""When the certifier makes a new model set of a robot that has changed, from which driving, and when it refuses."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from brakeline.deploy.data.certification import certify
+from brakeline.deploy.run import adaptation
+from brakeline.deploy.run.adaptation import REQUESTS, Adaptation
+from brakeline.errors import BadModel, BadStep
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.error_bounds import ErrorBound
+from brakeline.safety.model.model_set import ONE_STEP, ModelConfig
+from tests.safety.test_turning_in_place import ROBOT, record, wandering
+from tests.safety.unicycle import Unicycle
+
+ACCEPTED = 0.03
+MINUTE = 300  # periods
+EPISODE = 200  # periods
+
+
+@cache
+def driven(seed, episodes, slip=0.0, noise=1.0, share=1.0, stops=True):
+    """The trajectories of a robot. share: of the inputs' range that it uses."""
+    parts = []
+    for i in range(episodes):
+        rng = np.random.default_rng((seed, i))
+        robot = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng, slip=slip, noise=noise)
+        inputs = share * wandering(rng, EPISODE)
+        parts.append(robot.trajectory(inputs if stops else np.maximum(inputs, [0.05, -9.0])))
+    return tuple(parts)
+
+
+@cache
+def in_use():
+    return certify(record(1, 6), ModelConfig(mode=ONE_STEP))[0]
+
+
+def steps_of(trajectories, actor="actor-0", first=0, run=1):
+    for number, t in enumerate(trajectories, first):
+        for k in range(len(t.inputs)):
+            yield pb.Step(
+                header=pb.Header(run=run),
+                robot=ROBOT.name,
+                actor=actor,
+                episode=number,
+                step=k,
+                observation=[1.0],
+                action=t.inputs[k],
+                state=t.states[k + 1],
+                path=t.paths[k].ravel(),
+                turned=t.turned[k],
+            )
+
+
+def exchange_of(step, widening, version="old", wall_time=0):
+    request = pb.Request(actor=step.actor, episode=step.episode, step=step.step, widening=widening)
+    header = pb.Header(run=step.header.run, wall_time=wall_time)
+    return pb.Exchange(header=header, request=request, reply=pb.Reply(decision=pb.Decision(model=version)))
+
+
+def drive(kind, trajectories, widening=1.0, version="old", **options):
+    """Let a robot drive, and return what comes of the attempts."""
+    attempts = []
+    for step in steps_of(trajectories, **options):
+        kind.exchange(exchange_of(step, widening, version))
+        kind.step(step)
+        if step.step % 20 == 19 and (attempt := kind.attempt()) is not None:
+            attempts.append(attempt)
+    return attempts
+
+
+@pytest.fixture
+def kind():
+    return Adaptation(ROBOT, lambda version: in_use(), ACCEPTED)
+
+
+def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(kind):
+    assert not drive(kind, driven(1, 3))
+    attempts = drive(kind, driven(2, 7, slip=-0.15), widening=8.0, first=3)
+    assert len(attempts) == 1 and "4.0 minutes after the change, at 8 times the sets" in attempts[0].text
+    model, data = attempts[0].model, attempts[0].data
+    assert data.periods <= 4 * MINUTE and not any(
+        (t.states == driven(1, 3)[-1].states[5]).any() for t in data.trajectories
+    )
+    assert model.version != in_use().version and float(model.about["bound_plan"]) <= ACCEPTED
+    fresh = Dataset(ROBOT, driven(3, 6, slip=-0.15))
+    outside = certify(fresh, ModelConfig(mode=ONE_STEP))[0]
+    ratio = [m.steps[-1].w[:2].mean() for m in (model, outside)]
+    assert 0.5 < ratio[0] / ratio[1] < 2.0, "as if the changed robot had been recorded"
+
+
+def test_the_next_attempt_waits_for_more_driving_and_the_new_version_ends_the_change(kind):
+    (attempt,) = drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
+    assert kind.since_change > 4.0
+    assert not drive(kind, driven(4, 2, slip=-0.15), version=attempt.model.version, first=7)
+    assert kind.since_change == 0.0 and kind.widening == 1.0
+
+
+@pytest.mark.parametrize(("name", "widening", "slip"), [("a small widening", 1.29, 0.0), ("no change", 1.0, 0.0)])
+def test_nothing_is_certified_without_a_change(kind, name, widening, slip):
+    assert not drive(kind, driven(2, 10, slip=slip), widening=widening)
+
+
+def test_a_change_of_one_robot_alone_makes_no_set_for_all(kind):
+    assert not drive(kind, driven(5, 2), actor="actor-1")
+    assert not drive(kind, driven(2, 8, slip=-0.15), widening=8.0)
+    assert kind.widening == 1.0
+    for step in steps_of(driven(2, 1, slip=-0.15), first=8):
+        kind.exchange(exchange_of(step, 8.0, wall_time=10**12))
+    assert kind.attempt() is not None, "the other robot has been silent for minutes"
+
+
+def test_a_break_begins_the_change_anew(kind):
+    trajectories = driven(2, 8, slip=-0.15)
+    assert not drive(kind, trajectories[:4], widening=8.0)
+    assert not drive(kind, trajectories[4:5], first=4)
+    assert not drive(kind, trajectories[5:], widening=8.0, first=5)
+    assert kind.since_change == pytest.approx(3 * EPISODE / MINUTE)
+    assert not drive(kind, trajectories[:5], widening=8.0, run=2), "a process that was started again"
+    assert kind.since_change == pytest.approx(5 * EPISODE / MINUTE)
+
+
+@pytest.mark.parametrize(
+    ("why", "widening", "options"),
+    [
+        ("times as wide as those in use", 1.31, {"noise": 2.0}),
+        ("stops in the data", 8.0, {"slip": -0.15, "stops": False}),
+        ("of the speeds and inputs", 8.0, {"slip": -0.15, "share": 0.5}),
+    ],
+)
+def test_a_looser_an_unproven_or_a_narrow_set_is_refused_with_the_reason(kind, why, widening, options):
+    (attempt,) = drive(kind, driven(2, 7, **options), widening=widening)
+    assert attempt.model is None and attempt.data is None and why in attempt.text
+
+
+def test_what_cannot_state_the_accepted_bound_is_not_tried():
+    kind = Adaptation(ROBOT, lambda version: in_use(), 0.01)
+    assert kind.needed > 9 * MINUTE
+    assert not drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
+
+
+def test_a_set_that_states_more_than_is_accepted_is_refused(kind, monkeypatch):
+    monkeypatch.setattr(adaptation, "SPARE", 0.1)
+    kind.accept_bound = 0.005
+    (attempt,) = drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
+    assert attempt.model is None and "states only that at most" in attempt.text
+
+
+def test_a_version_that_is_not_known_is_not_replaced():
+    def unknown(version):
+        raise BadModel(f"no {version}")
+
+    (attempt,) = drive(Adaptation(ROBOT, unknown, ACCEPTED), driven(2, 7, slip=-0.15), widening=8.0)
+    assert attempt.model is None and "no old" in attempt.text
+
+
+def test_without_a_change_a_set_is_replaced_by_a_tighter_one_after_a_quarter_of_an_hour():
+    wide = replace(in_use(), steps=tuple(_wider(step) for step in in_use().steps))
+    attempts = drive(Adaptation(ROBOT, lambda version: wide, ACCEPTED), driven(6, 23))
+    assert len(attempts) == 1 and attempts[0].model is not None and "15.0 minutes without" in attempts[0].text
+
+
+def _wider(bound: ErrorBound) -> ErrorBound:
+    return replace(bound, kappa=2.0 * bound.kappa, w=2.0 * bound.w)
+
+
+def test_the_memory_is_bounded_and_steps_of_the_wrong_size_are_rejected(kind):
+    step = next(steps_of(driven(1, 3)))
+    for _ in range(21 * MINUTE):
+        kind.step(pb.Step.FromString(step.SerializeToString()))
+    assert len(kind._steps) == 20 * MINUTE and not kind._steps[-1].observation
+    for wrong in ({"state": [0.0]}, {"action": [0.0]}, {"path": [0.0]}, {"path": []}, {"turned": np.nan}):
+        broken = pb.Step.FromString(step.SerializeToString())
+        for name, value in wrong.items():
+            broken.ClearField(name)
+            broken.MergeFrom(pb.Step(**{name: value}))
+        with pytest.raises(BadStep):
+            kind.step(broken)
+
+
+def test_a_hundred_requests_make_a_change(kind):
+    steps = list(steps_of(driven(2, 7, slip=-0.15)))
+    for step in steps[: REQUESTS - 1]:
+        kind.exchange(exchange_of(step, 8.0))
+    assert not kind._changed()
+    kind.exchange(exchange_of(steps[REQUESTS - 1], 8.0))
+    assert kind._changed()
