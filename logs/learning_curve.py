@@ -79,9 +79,7 @@ class LearningCurve:
         self._models: dict[str, int] = {}  # step at which a version of the model set decided first
 
     def step(self, step: pb.Step) -> None:
-        now = self.bins[-1]
-        if now["steps"] >= self.width:
-            now = self._next()
+        now = self._bin()
         now["steps"] += 1
         self._steps += 1
         kind = kind_of(step)
@@ -112,7 +110,7 @@ class LearningCurve:
 
     def exchange(self, exchange: pb.Exchange) -> None:
         """Add an exchange of one of the actors with the safety service (docs/method.md §15)."""
-        now, decision, widening = self.bins[-1], exchange.reply.decision, max(exchange.request.widening, 1.0)
+        now, decision, widening = self._bin(), exchange.reply.decision, max(exchange.request.widening, 1.0)
         if decision.HasField("score"):
             now["scored"] += 1
             now["beyond"] += not decision.score <= 1.0
@@ -167,6 +165,10 @@ class LearningCurve:
             "reward": math.fsum(episode.reward for episode in last) / len(last) if last else None,
             "interventions": sum(episode.interventions for episode in last) / steps if steps else None,
         }
+
+    def _bin(self) -> Bin:
+        """Return the bin of the next step."""
+        return self._next() if self.bins[-1]["steps"] >= self.width else self.bins[-1]
 
     def _next(self) -> Bin:
         """Begin a bin; merge neighbours if all bins are used."""

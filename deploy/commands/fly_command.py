@@ -55,7 +55,7 @@ class FlyCommand:
     that `brakeline certify LOG` needs."""
     adapt: bool = False
     """Certify the vehicle anew in flight: if it needs wider sets than its model set states for long, a certifier
-    process fits a model set to the last minutes and puts it to use."""
+    process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
     deadline: float = 0.12
     """Time that an actor waits for an answer of the safety service [s]. The answer applies from the next control period
     (0.2 s) on."""

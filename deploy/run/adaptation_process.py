@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,22 +61,16 @@ def main(settings: CertifierSettings) -> None:
     """
     signer = ModelSigner.load(settings.bus.keys or Path())
     with Process(settings.bus, settings.name) as process:
-        kinds = [_adaptation(robot_maybe_with_task(name), settings) for name in settings.robots]
+        robots = [robot_maybe_with_task(name) for name in settings.robots]
+        kinds = {robot.name: _adaptation(robot, settings) for robot in robots}
         inbox: deque[Sample] = deque(maxlen=BACKLOG)
         for topic in (STEP, EXCHANGE):
             process.bus.subscribe(topic, inbox.append)
+        # In a thread, so that a fit does not delay the end of the process.
+        threading.Thread(target=_run, args=(inbox, kinds, signer, process), name="certifier", daemon=True).start()
         process.announce()
         log.info("ready")
-        while not process.stop.wait(PERIOD):
-            _take_in(inbox, {kind.robot.name: kind for kind in kinds}, process)
-            for kind in kinds:
-                try:
-                    if (attempt := kind.attempt()) is not None:
-                        _settle(attempt, kind.robot, signer, process)
-                    process.figures[f"widening {kind.robot.name}"] = kind.widening
-                    process.figures[f"minutes since the change {kind.robot.name}"] = kind.since_change
-                except Exception:
-                    log.exception("%s: no new model set, because of an error", kind.robot.name)
+        process.stop.wait()
 
 
 def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:
@@ -85,6 +80,13 @@ def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:
         return ModelSet.load(archive_path(settings.archive, robot.name, version))
 
     return Adaptation(robot, in_use, settings.accept_bound)
+
+
+def _run(inbox: deque[Sample], kinds: dict[str, Adaptation], signer: ModelSigner, process: Process) -> None:
+    while not process.stop.wait(PERIOD):
+        _take_in(inbox, kinds, process)
+        for kind in kinds.values():
+            _follow(kind, signer, process)
 
 
 def _take_in(inbox: deque[Sample], kinds: dict[str, Adaptation], process: Process) -> None:
@@ -97,6 +99,19 @@ def _take_in(inbox: deque[Sample], kinds: dict[str, Adaptation], process: Proces
                 kinds[message.robot].step(message)
             elif isinstance(message, pb.Exchange) and message.request.robot in kinds:
                 kinds[message.request.robot].exchange(message)
+
+
+def _follow(kind: Adaptation, signer: ModelSigner, process: Process) -> None:
+    """Make an attempt for a robot kind, if it is time. An error ends the attempt, and nothing else."""
+    name = kind.robot.name
+    try:
+        if (attempt := kind.attempt()) is not None:
+            _settle(attempt, kind.robot, signer, process)
+        process.figures[f"widening {name}"] = kind.widening
+        process.figures[f"minutes since the change {name}"] = kind.since_change
+    except Exception as error:
+        process.notes[f"{NOTE} {name}"] = f"none: {type(error).__name__}: {error}"
+        log.exception("%s: no new model set, because of an error", name)
 
 
 def _settle(attempt: Recertification, robot: Robot, signer: ModelSigner, process: Process) -> None:

@@ -86,7 +86,7 @@ class RunConfig:
     """
     adapt: bool = False
     """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
-    process fits a model set to the last minutes and puts it to use."""
+    process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
     conditions: Internal[Conditions] = field(default_factory=Conditions)
     policy: Internal[str] = ""  # a name or a file, as `evaluate` takes it; empty: the run learns a policy
     flights: Internal[tuple[FlightSettings, ...]] = ()  # links to vehicles in real time, one for each actor

@@ -30,6 +30,8 @@ from brakeline.errors import BusError
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
+PRACTICE = 0.01  # of a run that certifies anew: a model set needs stops
+
 
 def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.deploy.run.log_contents import attachments, derive_entries, metadata
@@ -96,7 +98,7 @@ def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings)
         penalty=config.penalty,
         deadline=60.0 if config.deterministic else config.deadline,
         lockstep=config.deterministic,
-        practice=config.practice,
+        practice=config.practice or (PRACTICE if config.adapt else 0.0),
         change=config.change,
         mavlink=config.mavlink,
         steps=config.steps,

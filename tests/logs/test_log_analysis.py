@@ -219,6 +219,23 @@ def test_bins_become_wider_instead_of_more() -> None:
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
 
 
+def test_a_change_shows_in_the_windows_the_widening_the_widths_and_the_model_sets() -> None:
+    training = LearningCurve()
+    for k in range(200):
+        changed, anew = k >= 50, k >= 150
+        decision = pb.Decision(model="new" if anew else "old", tube_half_width=[0.01, 0.06 if changed else 0.02])
+        decision.score = 2.0 if changed and not anew else 0.5
+        request = pb.Request(widening=3.0 if changed and not anew else 0.0)
+        training.exchange(pb.Exchange(request=request, reply=pb.Reply(decision=decision)))
+        training.step(pb.Step(actor="a", step=k))
+    figures = training.figures()
+    assert figures["models"] == [{"model": "old", "from": 0}, {"model": "new", "from": 150}]
+    rows = figures["bins"]
+    for name, values in {"beyond": (0, 1, 1, 0), "beyond_widened": (0, 0, 0, 0), "widening": (1, 3, 3, 1)}.items():
+        assert [row[name] for row in rows] == pytest.approx(values), name
+    assert [row["half_width"] for row in rows] == pytest.approx([0.02, 0.06, 0.06, 0.06])
+
+
 def test_lives_of_a_process_that_fell_silent_and_was_started_again() -> None:
     timeline = ProcessTimeline()
     for run, seconds in ((1, (0, 1, 2, 9, 10)), (2, (12, 13))):

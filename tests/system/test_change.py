@@ -58,7 +58,7 @@ def beyond(exchanges):
 
 
 def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(data_folder, tmp_path):
-    change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2, "--practice", 0.1)
+    change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2)
     adapt = ("--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
     with Run(tmp_path / "run", "--steps", ENDLESS, *adapt, *change, *WORDS) as run:
         processes = run.watch().processes

@@ -2,18 +2,23 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.run import adaptation
-from brakeline.deploy.run.adaptation import REQUESTS, Adaptation
-from brakeline.errors import BadModel, BadStep
+from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
+from brakeline.deploy.run.adaptation_process import _follow
+from brakeline.deploy.run.run_keys import check_adaptable, check_signer
+from brakeline.errors import BadModel, BadStep, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.topics import MODEL
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig
+from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
 from tests.safety.unicycle import Unicycle
 
@@ -180,6 +185,57 @@ def test_the_memory_is_bounded_and_steps_of_the_wrong_size_are_rejected(kind):
             broken.MergeFrom(pb.Step(**{name: value}))
         with pytest.raises(BadStep):
             kind.step(broken)
+
+
+class Bus:
+    """A bus that keeps what is published."""
+
+    def __init__(self):
+        self.models = []
+
+    def publisher(self, topic, robot):
+        assert topic is MODEL
+        return SimpleNamespace(put=self.models.append)
+
+
+@pytest.fixture
+def process():
+    return SimpleNamespace(bus=Bus(), notes={}, figures={}, announce=lambda: None)
+
+
+def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, process, tmp_path, monkeypatch, caplog):
+    write_signer(tmp_path)
+    signer, data = ModelSigner.load(tmp_path), Dataset(ROBOT, record(1, 6).trajectories)
+    attempts = iter(
+        (ZeroDivisionError("one of these"), None, Recertification("why", in_use(), data), Recertification("no"))
+    )
+
+    def attempt():
+        result = next(attempts)
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    monkeypatch.setattr(kind, "attempt", attempt)
+    _follow(kind, signer, process)
+    assert "one of these" in process.notes[f"adaptation {ROBOT.name}"] and "no new model set" in caplog.text
+    for _ in range(3):
+        _follow(kind, signer, process)
+    (message,) = process.bus.models
+    signed = SignedModel(message.file, message.claim, message.signature)
+    assert TrustedSigners.load(tmp_path).open(signed, ROBOT.name).version == message.version
+    assert process.figures[f"published {ROBOT.name}"] == process.figures[f"refused {ROBOT.name}"] == 1.0
+    assert process.notes[f"adaptation {ROBOT.name}"] == "no"
+
+
+def test_nothing_adapts_without_a_key_to_sign_or_with_sets_that_cannot_widen(tmp_path):
+    with pytest.raises(Untrusted, match="--adapt needs keys"):
+        check_signer(None)
+    with pytest.raises(Untrusted, match="no key to sign models with"):
+        check_signer(tmp_path)
+    check_adaptable(in_use())
+    with pytest.raises(ValueError, match="--mode one-step"):
+        check_adaptable(replace(in_use(), one_step=None))
 
 
 def test_a_hundred_requests_make_a_change(kind):

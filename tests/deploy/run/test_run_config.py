@@ -89,6 +89,10 @@ def test_the_processes_of_a_run() -> None:
         "learner",
         "actor-0",
     ]
+    certifier = process_specs(RunConfig(actors=1, adapt=True))[2]
+    assert (certifier.name, certifier.needed) == ("certify.adapt", False)
+    with pytest.raises(ValueError, match="--adapt certifies model sets of the method ddpc, not of sailr"):
+        RunConfig(adapt=True, method="sailr")
     several = process_specs(RunConfig(actors=3, robots_per_actor=4))
     assert [spec.number for spec in several if spec.kind == "actor"] == [0, 4, 8], "no robot's number comes twice"
 

@@ -63,3 +63,12 @@ def test_a_process_that_was_healthy_may_fail_any_number_of_times(
     for _ in range(3 * MOST_FAILURES):
         lives(child, clock, speaks, after)
     assert child.restarts == 3 * MOST_FAILURES and child.failures == 1
+
+
+def test_a_run_goes_on_without_a_process_that_it_does_not_need(
+    clock: list[float], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    child = Failing(ProcessSpec("certify.adapt", "certifier", needed=False), tmp_path)
+    for _ in range(MOST_FAILURES):
+        lives(child, clock, 0.5, 2.0)
+    assert child.finished and "the run goes on without it" in caplog.text
