@@ -47,7 +47,7 @@ class Bin(Counter[str]):
             "beyond": self["beyond"] / scored if scored else None,
             "beyond_widened": self["beyond_widened"] / scored if scored else None,
             "widening": self.widening if scored else None,
-            "half_width": self.half_width / tubes if tubes else None,
+            "half_width": self.half_width / tubes if tubes and scored else None,
         }
 
 

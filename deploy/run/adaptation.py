@@ -56,7 +56,7 @@ class RobotState:
         widened: first period of the requests that were widened without a break up to now; None: the last one was not.
         requests: number of these requests.
         widening: of the last request.
-        heard: when the last request was published [ns].
+        heard: when its last exchange arrived [s].
     """
 
     version: str
@@ -64,7 +64,7 @@ class RobotState:
     widened: Period | None = None
     requests: int = 0
     widening: float = 1.0
-    heard: int = 0
+    heard: float = 0.0
 
     @property
     def changed(self) -> bool:
@@ -132,8 +132,11 @@ class Adaptation:
         self._steps.append(step)
         self._driven += 1
 
-    def exchange(self, exchange: pb.Exchange) -> None:
-        """Add an exchange with the safety service. Raises Implausible if there are too many robots."""
+    def exchange(self, exchange: pb.Exchange, heard: float) -> None:
+        """Add an exchange with the safety service. Raises Implausible if there are too many robots.
+
+        heard: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
+        """
         request, decision = exchange.request, exchange.reply.decision
         now = Period(exchange.header.run, request.episode, request.step)
         state = self._robots.get(request.actor)
@@ -143,7 +146,7 @@ class Adaptation:
             state = self._robots[request.actor] = RobotState(decision.model, now)
         elif decision.model and decision.model != state.version:
             state.version, state.since = decision.model, now
-        state.widening, state.heard = max(request.widening, 1.0), exchange.header.wall_time
+        state.widening, state.heard = (request.widening if 1.0 <= request.widening < math.inf else 1.0), heard
         if state.widening > WIDENING:
             state.widened, state.requests = state.widened or now, state.requests + 1
         else:
@@ -161,8 +164,8 @@ class Adaptation:
 
     def _driving_robots(self) -> dict[str, RobotState]:
         """Return the robots that are not silent."""
-        latest = max((state.heard for state in self._robots.values()), default=0)
-        return {name: state for name, state in self._robots.items() if latest - state.heard <= SILENT * 1e9}
+        latest = max((state.heard for state in self._robots.values()), default=0.0)
+        return {name: state for name, state in self._robots.items() if latest - state.heard <= SILENT}
 
     def _changed(self) -> bool:
         robots = self._driving_robots()

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -98,7 +99,7 @@ def _take_in(inbox: deque[Sample], kinds: dict[str, Adaptation], process: Proces
             if isinstance(message, pb.Step) and message.robot in kinds:
                 kinds[message.robot].step(message)
             elif isinstance(message, pb.Exchange) and message.request.robot in kinds:
-                kinds[message.request.robot].exchange(message)
+                kinds[message.request.robot].exchange(message, time.monotonic())
 
 
 def _follow(kind: Adaptation, signer: ModelSigner, process: Process) -> None:

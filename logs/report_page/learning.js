@@ -8,6 +8,9 @@ const CURVES = [
   { title: "reward of an episode", unit: "without the intervention penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
   { title: "interventions", unit: "share of steps", of: "bins", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
   { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
+  { title: "windows outside their sets", unit: "share, without widening", of: "bins", value: (b) => b.beyond, form: percents, low: 0, weight: "steps" },
+  { title: "widening of the sets", unit: "largest factor in a bin", of: "bins", value: (b) => b.widening, form: figure },
+  { title: "half-width of a tube", unit: "cm, largest axis", of: "bins", value: (b) => b.half_width === null ? null : 100 * b.half_width, form: figure, low: 0 },
   { title: "critic loss", unit: "from the learner", of: "learner", value: (b) => b.critic_loss, form: figure },
   { title: "mean Q", unit: "discounted reward", of: "learner", value: (b) => b.mean_q, form: figure },
 ];
