@@ -34,7 +34,6 @@ TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
 DOMAIN = 0.75  # least ratio of the recorded range of a speed or an input to that of the model set in use
 MOST_ROBOTS = 10_000
 SILENT = 30.0  # s after which a robot counts as gone
-UNUSED = ("observation", "next_observation", "proposed")  # fields of a step that no data set needs
 
 
 @dataclass(frozen=True, order=True)
@@ -127,8 +126,9 @@ class Adaptation:
             raise BadStep("state, action, path", f"of another size than those of {robot.name}")
         if not np.isfinite([*step.state, *step.action, *step.path, step.turned]).all():
             raise BadStep("state, action, path", "NaN or infinity")
-        for name in UNUSED:
-            step.ClearField(name)
+        step.ClearField("observation")
+        step.ClearField("next_observation")
+        step.ClearField("proposed")
         self._steps.append(step)
         self._driven += 1
 
