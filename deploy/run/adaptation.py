@@ -37,7 +37,7 @@ SILENT = 30.0  # s after which a robot counts as gone
 
 
 @dataclass(frozen=True, order=True)
-class Period:
+class DrivenPeriod:
     """The place of a period in the driving of one robot: steps of later periods are not less."""
 
     run: int
@@ -59,8 +59,8 @@ class RobotState:
     """
 
     version: str
-    since: Period
-    widened: Period | None = None
+    since: DrivenPeriod
+    widened: DrivenPeriod | None = None
     requests: int = 0
     widening: float = 1.0
     heard: float = 0.0
@@ -138,7 +138,7 @@ class Adaptation:
         heard: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
         """
         request, decision = exchange.request, exchange.reply.decision
-        now = Period(exchange.header.run, request.episode, request.step)
+        now = DrivenPeriod(exchange.header.run, request.episode, request.step)
         state = self._robots.get(request.actor)
         if state is None or state.since.run != now.run:
             if state is None and len(self._robots) >= MOST_ROBOTS:
@@ -171,14 +171,14 @@ class Adaptation:
         robots = self._driving_robots()
         return bool(robots) and all(state.changed for state in robots.values())
 
-    def _since(self, starts: dict[str, Period]) -> list[pb.Step]:
+    def _since(self, starts: dict[str, DrivenPeriod]) -> list[pb.Step]:
         """Return the steps of each robot from its start on."""
 
         def taken() -> Iterator[pb.Step]:
             for step in self._steps:
                 start = starts.get(step.actor)
                 run = step.header.run
-                if start is not None and run == start.run and Period(run, step.episode, step.step) >= start:
+                if start is not None and run == start.run and DrivenPeriod(run, step.episode, step.step) >= start:
                     yield step
 
         return list(taken())
