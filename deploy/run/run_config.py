@@ -15,7 +15,6 @@ from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.safety.model.model_config import AUTO, DDPC, ModelConfig
 from brakeline.safety.model.model_config import METHODS as FILTERS
-from brakeline.safety.model.model_config import METHODS as FILTERS
 from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
