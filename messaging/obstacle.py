@@ -116,6 +116,8 @@ class Shapes:
             BadShape: an obstacle has another dimension than `dim`.
         """
         n, flat = len(obstacles), dim == 2
+        if n and not dim:
+            raise BadShape("position", "a robot without a position has no obstacles, only limits")
         center, axes, half, rho, rounded = [], [], [], [], []  # lists: filling arrays one number at a time is slower
         for i, obstacle in enumerate(obstacles):
             position, size = obstacle.position, obstacle.size

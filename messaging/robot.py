@@ -1,7 +1,8 @@
 """The robot model that all parts share: its vectors with names, units and bounds, its body, and how it stops.
 
 A robot is a file (`robots/NAME.toml`, or a file of your own); `brakeline.messaging.robot_description` reads it. All
-values are in SI units and ENU frames. The first `position_dim` coordinates of a state are the position.
+values are in SI units and ENU frames. The first `position_dim` coordinates of a state are the position. A robot in joint
+space has no position (`position_dim` = 0): its limits are all that a plan must respect.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class Robot:
     name: str
     period: float  # time between decisions [s]
     state: tuple[str, ...]  # "name [unit]"; the position comes first
-    position_dim: int
+    position_dim: int  # 2 or 3; 0: joint space, without obstacles, sight and body
     heading: int | None  # index of the heading in the state; None: displacements are in the world frame
     action: tuple[str, ...]  # "name [unit]"
     action_low: tuple[float, ...]
@@ -130,6 +131,34 @@ class Robot:
         return len(self.regressor) + self.action_dim
 
     @property
+    def path_dim(self) -> int:
+        """Number of coordinates of a recorded path: those of the position, or all in joint space."""
+        return self.position_dim or self.state_dim
+
+    @cached_property
+    def limit_weights(self) -> Array:
+        """The weights (C, n) of the limits."""
+        return np.array([limit.weights for limit in self.limits]).reshape(-1, self.state_dim)
+
+    @cached_property
+    def limit_scales(self) -> Array:
+        """The units (C,) in which limits of different kinds are compared.
+
+        The unit of a limit is half its distance to the opposite limit; without one, |most|; if that is zero, 1.
+        """
+        opposite = {limit.weights: limit.most for limit in self.limits}
+        scales = []
+        for limit in self.limits:
+            other = opposite.get(tuple(-weight for weight in limit.weights))
+            scale = abs(limit.most) if other is None else 0.5 * (limit.most + other)
+            scales.append(scale if scale > 0.0 else 1.0)
+        return np.array(scales)
+
+    def limit_values(self, states: Array) -> Array:
+        """Return `weights · state` of each limit (..., C), in units of `limit_scales`, for states (..., n)."""
+        return np.asarray(states @ (self.limit_weights / self.limit_scales[:, None]).T)
+
+    @property
     def committed_steps(self) -> int:
         """Number of free inputs that are already fixed when the filter decides: 1 in real time, otherwise 0."""
         return int(self.late)
@@ -154,7 +183,7 @@ class Robot:
     @cached_property
     def footprint(self) -> float:
         """Radius of the disc (sphere) about the position that contains the body in every attitude [m]."""
-        return max(disc.arm + disc.radius for disc in self.body)
+        return max((disc.arm + disc.radius for disc in self.body), default=0.0)
 
     @cached_property
     def front_extent(self) -> float:

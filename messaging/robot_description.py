@@ -23,7 +23,7 @@ from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
 MAX_NAME_LENGTH = 64
-UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "1")
+UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "Pa", "K", "1")
 UNIT_OF_ROLE = {"position": "m", "heading": "rad"}
 INPUT_ROUNDING = 1e-12
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -93,11 +93,11 @@ class DescriptionModel(_Strict):
 
     name: Annotated[str, Field(max_length=MAX_NAME_LENGTH)]
     period: Annotated[float, Field(ge=0.002, le=10.0)]
-    sight: Positive
+    sight: Positive | None = None  # required with a position, refused without one
     state: Annotated[dict[str, CoordinateModel], Field(min_length=1, max_length=32)]
     input: Annotated[dict[str, InputModel], Field(min_length=1, max_length=16)]
     plan: PlanModel
-    body: Annotated[list[DiscModel], Field(min_length=1, max_length=8)]
+    body: Annotated[list[DiscModel], Field(min_length=1, max_length=8)] | None = None  # as sight
     limit: Annotated[list[LimitModel], Field(max_length=32)] = []
     stopped: Positive | None = None
     # Below 1: a model set that states no bound counts as 1 and must always be confirmed.
@@ -181,11 +181,11 @@ def _robot(model: DescriptionModel) -> Robot:
             k for k, c in enumerate(coordinates) if (c.role == "other" if c.regressor is None else c.regressor)
         ),
         measurement_bound=tuple(c.error for c in coordinates),
-        sight=model.sight,
+        sight=model.sight or 0.0,
         horizon=model.plan.horizon,
         free_steps=model.plan.free,
         brake_steps=model.plan.brake,
-        body=tuple(Disc(tuple(disc.at), disc.radius) for disc in model.body),
+        body=tuple(Disc(tuple(disc.at), disc.radius) for disc in model.body or ()),
         stop=tuple(rules),
         follows=tuple(followers.get(name, -1) for name in model.input),
         feedback=tuple(gains) if FEEDBACK in rules else (),
@@ -243,6 +243,8 @@ def describe(robot: Robot) -> dict[str, Any]:
         "body": [{"at": list(disc.at), "radius": disc.radius} for disc in robot.body],
         "limit": [{"name": one.name, "most": one.most, "weights": nonzero(one.weights)} for one in robot.limits],
     }
+    if not robot.position_dim:
+        del description["sight"], description["body"]
     if math.isfinite(robot.stopped):
         description["stopped"] = robot.stopped
     if robot.accept_bound != DEFAULT_ACCEPT_BOUND:
@@ -282,7 +284,8 @@ def _inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
             f"of braking: at least {least}",
         )
     d = len(model.role_names("position"))
-    for i, disc in enumerate(model.body):
+    yield from _space_problems(model, d)
+    for i, disc in enumerate(model.body or ()):
         if len(disc.at) != d:
             yield f"body.{i}.at", f"{len(disc.at)} coordinates, the position has {d}"
         if any(disc.at) and not model.role_names("heading"):
@@ -294,11 +297,33 @@ def _inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
             yield f"limit.{i}.weights", f"names of state coordinates ({names}), not {', '.join(unknown)}"
 
 
+def _space_problems(model: DescriptionModel, d: int) -> Iterator[Problem]:
+    """Check what a description says about space: a robot with a position sees obstacles, another one has limits."""
+    for field in ("sight", "body"):
+        given = getattr(model, field) is not None
+        if d and not given:
+            yield field, "missing"
+        if given and not d:
+            yield field, f"a robot without a position has no {field}: leave it out, or give coordinates that role"
+    if d:
+        return
+    if not model.limit:
+        yield "limit", "a robot without a position needs a limit: there is nothing else that a plan must respect"
+    for name, c in model.state.items():
+        if c.regressor is False:
+            yield f"state.{name}.regressor", "without a position, every coordinate is a regressor"
+    for name, one in model.input.items():
+        if isinstance(one.stop, dict):
+            yield f"input.{name}.stop", "a robot without a position stops by 'ramp', 'hold' or a profile, not by gains"
+
+
 def _state_problems(model: DescriptionModel) -> Iterator[Problem]:
     roles = [c.role for c in model.state.values()]
     d = roles.count("position")
-    if d not in (2, 3) or roles[:d] != ["position"] * d:
-        yield "state", "two or three coordinates with role 'position' come first"
+    if d not in (0, 2, 3) or roles[:d] != ["position"] * d:
+        yield "state", "two or three coordinates with role 'position' come first; in joint space there is none"
+    if "heading" in roles and not d:
+        yield "state", "a heading belongs to a robot with a position: give the joint no role"
     if roles.count("heading") > 1 or ("heading" in roles and roles.index("heading") != d):
         yield "state", "one coordinate with role 'heading' at most, right after the position"
     if "heading" in roles and d == 3:

@@ -72,7 +72,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             penalty: reward for a correction as large as an input's range (`correction_penalty`).
             state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
             obstacles: (env, observation, info) -> list of at least the obstacles within `filter.reach`. All other space
-                is free. None: only a scan shows free space. Defaults to `info["obstacles"]`.
+                is free. None: only a scan shows free space. Defaults to `info["obstacles"]`. In joint space there are
+                no obstacles, so it is not called.
             actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description.
@@ -128,7 +129,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _decide(self, proposed: Array) -> tuple[Answer | None, str]:
         """Return the decision and commit to it; or None and the reason, and continue the backup plan."""
         assert self._now is not None
-        state, near = self._state(self.env, *self._now), self._obstacles(self.env, *self._now)
+        state = self._state(self.env, *self._now)
+        near = self._obstacles(self.env, *self._now) if self.client.robot.position_dim else None
         observation, known_free = request_observation(self._now[0]), near is not None
         try:
             answer = self.client.decide(

@@ -212,9 +212,12 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
             *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}", f"{s.bound_episode:.1%}", f"≤ {s.outside_hour:.0f} steps"),
-            *(width(value) for value in (s.half_width_rest, s.half_width_full, s.clearance_margin)),
+            *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
+            width(s.clearance_margin),
         )
     table.caption = "* the default; half-widths of a full stop, largest axis"
+    if any(s.unit != "m" for s, _ in rows):
+        table.caption += "; in joint space, shares of half the distance between a limit and the opposite one"
     return table
 
 
@@ -233,8 +236,9 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
             f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap)",
             f"  predictor: monomials up to degree {s.chosen.degree}, {s.chosen.lags} earlier input, "
             + ("with" if s.chosen.saturating else "without")
-            + f" saturating features: {s.chosen.features} features; 99 % of positions within "
-            f"{1e3 * s.chosen.error:.3g} mm, out of fold",
+            + f" saturating features: {s.chosen.features} features; 99 % of "
+            + ("positions" if s.unit == "m" else "the limits' values")
+            + f" within {_error(s)}, out of fold",
         ]
     if s.in_place_windows:
         lines.append(
@@ -262,8 +266,15 @@ def group_table(report: ValidationReport) -> StackingTable:
     return table
 
 
-def width(metres: float) -> str:
+def _error(s: ValidationReport) -> str:
+    assert s.chosen is not None
+    return f"{1e3 * s.chosen.error:.3g} mm" if s.unit == "m" else f"{s.chosen.error:.2%}"
+
+
+def width(metres: float, unit: str = "m") -> str:
     """Return the half-width of a tube as text. A recursion that diverges ends in numbers without meaning."""
+    if unit != "m":
+        return f"{metres:.2%}"
     if not metres < DIVERGENT:
         return "diverges"
     return f"{1e3 * metres:.1f} mm" if metres < 1.0 else f"{metres:.1f} m"

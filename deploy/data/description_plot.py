@@ -31,7 +31,7 @@ def remarks(robot: Robot) -> list[str]:
     free = [label for label, index in zip(robot.action, robot.follows, strict=True) if index < 0]
     candidates = (
         (
-            distance + robot.footprint > robot.sight,
+            robot.position_dim > 0 and distance + robot.footprint > robot.sight,
             f"sight: a stop from full speed takes about {distance:.2f} m and the body reaches {robot.footprint:.2f} m, "
             f"but the robot sees obstacles from {robot.sight:g} m only. The filter will rarely verify fast driving.",
         ),

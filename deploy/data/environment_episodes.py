@@ -23,7 +23,7 @@ from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
-from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory, bends
 from brakeline.safety.model.windows import displacement
 
 Array = NDArray[np.float64]
@@ -125,7 +125,8 @@ class _Environment:
             else:
                 seen = displacement(self.robot, built.state, state)
                 turned = 0.0 if self.robot.heading is None else float(seen[self.robot.heading])
-                path = np.asarray(info.get("subsamples", seen[None, : self.robot.position_dim]), dtype=float)
+                moved = seen[: self.robot.position_dim] if self.robot.position_dim else state - built.state
+                path = np.asarray(info.get("subsamples", moved[None]), dtype=float)
                 built.add(executed, state, path, float(info.get("turned", turned)))
             if truncated:
                 break
@@ -141,5 +142,5 @@ def _chord_deviation_bound(robot: Robot, trajectories: list[Trajectory]) -> floa
 
     The second differences of the positions are a·T².
     """
-    bends = [np.diff(t.states[:, : robot.position_dim], n=2, axis=0) for t in trajectories if len(t.inputs) > 1]
-    return max((float(np.linalg.norm(bend, axis=1).max()) for bend in bends), default=0.0) / 4.0
+    sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
+    return max((float(size.max()) for size in sizes), default=0.0) / 4.0

@@ -20,7 +20,7 @@ from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.errors import NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory, bends
 
 HOLD = 1.0  # s for which an input is valid after its last message: later its sender may be gone
 MOSTLY = 0.9  # share of a period: an input held for longer is the period's input
@@ -37,7 +37,7 @@ class ImportReport:
     periods: int
     trajectories: int
     samples: int  # positions per period in the source
-    chord_deviation: float  # m, of the path between two positions
+    chord_deviation: float  # m, of the path between two positions; in joint space, see `Dataset`
     delays: dict[str, float]  # s, for each input, to the coordinate that follows it
     uneven: float  # share of the periods in which an input changed
     notes: tuple[str, ...]
@@ -101,7 +101,7 @@ def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list
     edges: Array = np.asarray(begin + period * np.arange(count + 1), float)
     states = np.column_stack([np.interp(edges, time, values) for time, values in r.states])
     fine: Array = np.asarray(begin + period / samples * np.arange(count * samples + 1), float)
-    d = robot.position_dim
+    d = robot.path_dim
     at = np.column_stack([np.interp(fine, time, values) for time, values in r.states[:d]])
     paths = at[1:].reshape(count, samples, d) - at[:-1:samples, None]
     turned, headings = np.zeros(count), None
@@ -176,10 +176,12 @@ def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) ->
     period changes by at most the sum of the second differences D of the position before and after it, divided by T:
 
         deviation <= max (|D_k| + |D_k+1|) / 4, divided by n² with n samples per period and the same acceleration
+
+    In joint space the same holds for the value of each limit, in units of `Robot.limit_scales`.
     """
     worst = 0.0
     for t in parts:
-        D = np.linalg.norm(np.diff(t.states[:, : robot.position_dim], 2, axis=0), axis=1)
+        D = bends(robot, t.states)
         around = np.concatenate([[0.0], D]) + np.concatenate([D, [0.0]])
         worst = max(worst, float(around.max(initial=0.0)))
     return worst / 4.0 / samples**2
@@ -204,7 +206,12 @@ def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, de
         if d > robot.period
     ]
     most = f"paths leave their chords by at most {1e3 * chord_deviation:.{1 if samples == 1 else 2}f} mm"
-    if samples == 1:
+    if not robot.position_dim:
+        notes.append(
+            f"the source has {samples} states per period; between them, a limit is exceeded by at most "
+            f"{chord_deviation:.2%} of its range"
+        )
+    elif samples == 1:
         notes.append(
             f"the source has one position per period: between positions, {most} (from the measured accelerations)"
         )

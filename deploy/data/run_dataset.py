@@ -58,7 +58,7 @@ def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:
     late = robot.committed_steps
     first, rest = run[late], run[1 + late :]
     actions = _snap_to_bounds(np.array([s.action for s in run], dtype=float), robot)
-    paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.position_dim)
+    paths = np.array([s.path for s in rest], dtype=float).reshape(len(rest), -1, robot.path_dim)
     return Trajectory(
         states=np.array([first.state, *(s.state for s in rest)]),
         inputs=actions[1 : len(run) - late],

@@ -105,7 +105,8 @@ def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes
             return BlockingConstraint.nowhere(ROBOT, room, T * min(period + 1, N))
         number -= len(around.other_reservations) * rows_each
     period, limit = divmod(number, len(robot.limits))
-    return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * min(period + 1, N))
+    after = min(period + 1, N) if period <= N else period - N - 1  # ends, stop, in joint space also starts
+    return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * after)
 
 
 def _about_an_obstacle(

@@ -126,6 +126,8 @@ def turning_extent(robot: Robot, tube: Tube) -> float:
 
     Without this margin a robot may stop so close to an obstacle that no motion can be verified from there.
     """
+    if not robot.position_dim:
+        return 0.0
     in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
     state = robot.state_at_inputs(in_place)
     z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
@@ -144,6 +146,7 @@ class TubeConstraints:
 
     Attributes:
         measured (d,): half-widths of the position's measurement error [m].
+        measurement_error: their norm [m]; in joint space, the largest error of a limit's value.
         clearance_margin, reach [m]: see `Filter`. widest [m]: no tube, with the body, goes farther.
         far: a tube may leave the sensor's range, so every candidate is checked against it.
         stays: a robot that stands stays where it stands (it does not drift).
@@ -185,12 +188,18 @@ class TubeConstraints:
         self._next = whole(first.C[:n]), *transposed, first.w, whole(np.abs(first.generators[:n]))
         self._regressor = model.first_regressor
         self.measured = np.asarray(robot.measurement_bound[: robot.position_dim], dtype=float)
+        self.measurement_error = float(np.linalg.norm(self.measured))
+        if not robot.position_dim:
+            self.measurement_error = float((np.abs(robot.limit_weights) @ robot.measurement_bound).max())
         self._unturned = np.eye(robot.position_dim)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m
         self.clearance_margin = clearance_margin
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
         self._beside = self.measured + self.clearance_margin + ASIDE + farthest
         self.stays = self._stays()
+        if not robot.position_dim:  # nothing is near or far: the reach only bounds margins
+            self.widest, self.reach, self.far = 0.0, FARTHEST, False
+            return
         self.widest = self._widest(outer, domain)
         wanted = self.widest + self.clearance_margin
         self.reach = min(wanted, robot.sight) if reach is None else reach
@@ -207,8 +216,10 @@ class TubeConstraints:
         other = copy(self)
         for name in ("_reached", "_filled", "_boxes"):
             other.__dict__.pop(name, None)
-        other.widening, other.reach = widening, self._reach_for(widening)
-        other.far = self.far or widening > 1.0  # the reach is that of tubes without it
+        other.widening = widening
+        if self.robot.position_dim:
+            other.reach = self._reach_for(widening)
+            other.far = self.far or widening > 1.0  # the reach is that of tubes without it
         if tube is not self.tube:
             other.tube, other._first, other._base = tube, tube.first, self
             other._directions, other._first_stretch = tube.directions, float(tube.stretch[0])

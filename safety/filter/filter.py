@@ -44,7 +44,7 @@ from brakeline.safety.filter.request import (
     check_surroundings,
 )
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.model_set import ModelSet, extra_coordinates, scored_coordinates
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
 from brakeline.safety.model.windows import displacement
@@ -145,6 +145,7 @@ class Filter:
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         steps = model.steps if model.one_step is not None else ()
         n = robot.state_dim  # for scores: W is the same for all periods
+        self._scored = list(scored_coordinates(robot))
         self._kappa, self._M = (np.array([getattr(step, name)[:n] for step in steps]) for name in ("kappa", "M"))
         self._w = np.array([step.w[:n] for step in steps])
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
@@ -170,10 +171,18 @@ class Filter:
         return cls(model)
 
     def half_width(self, speed: Array) -> float:
-        """Return the largest half-width [m] of the last set of the tube for a full stop from inputs `speed` (m,)."""
+        """Return the largest half-width [m] of the last set of the tube for a full stop from inputs `speed` (m,).
+
+        In joint space it is the largest half-width of a limit's value, in units of `Robot.limit_scales`.
+        """
         state = self.robot.state_at_inputs(speed)
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
-        return float(self._constraints_for(z).tube.half_widths(z)[-1].max())
+        tube = self._constraints_for(z).tube
+        if not self.robot.position_dim:
+            half = np.zeros(self.robot.state_dim)
+            half[list(extra_coordinates(self.robot))] = tube.more_half_widths(z)[-1]
+            return float((np.abs(self.robot.limit_weights) @ half / self.robot.limit_scales).max())
+        return float(tube.half_widths(z)[-1].max())
 
     def _turns_in_place(self, z: Array) -> bool:
         """Return whether the plan with regressors z belongs to those in place, which have their own tube."""
@@ -448,7 +457,7 @@ class Filter:
         parked = local_map.parked
         seeming = 0.0
         if not on_a_way:
-            seeming = 2.0 * float(np.linalg.norm(self.constraints.measured)) + (
+            seeming = 2.0 * self.constraints.measurement_error + (
                 self.clearance_margin if self.constraints.stays else 0.0
             )
         if self._constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
@@ -470,6 +479,8 @@ class Filter:
         obstacle_rows = rows_each * sum(len(disc.normals) for disc in planes)
         ends = np.zeros(len(rows.bound), dtype=bool)
         ends[rows_each - 1 : obstacle_rows : rows_each] = True  # the row after the stop
+        if not robot.position_dim:
+            ends[robot.horizon * len(robot.limits) : (robot.horizon + 1) * len(robot.limits)] = True
         best = least_violating(violated, standing, ends)
         if best is not None:
             z = plans[best]
@@ -539,7 +550,7 @@ class Filter:
         widths *= model.one_step.stretches(robot, z[None])[0][:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(off > 0.0, off / widths, 0.0)
-        return float(max(shares[:, : robot.position_dim].max(), shares[0].max()))
+        return float(max(shares[:, self._scored].max(), shares[0].max()))
 
     def standing_reservation(self, state: Array) -> Reservation:
         """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""

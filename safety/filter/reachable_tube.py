@@ -83,6 +83,10 @@ class Tube:
         """Return half-widths (N, d) of the sets' interval hulls, without chord deviation and stopping distance."""
         return np.asarray(np.abs(self.directions) @ self.magnitudes(z)[: self.generators])
 
+    def more_half_widths(self, z: Array) -> Array:
+        """Return half-widths (N, r) of the other predicted coordinates."""
+        return np.asarray(np.abs(self.more_directions) @ self.magnitudes(z)[: self.generators])
+
 
 def stack_direct(
     steps: Sequence[ErrorBound],

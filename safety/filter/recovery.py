@@ -21,15 +21,26 @@ Array = NDArray[np.float64]
 SLOW = 0.3  # of the range of inputs that move the robot
 BETTER = 1e-4  # m; a smaller difference does not count
 COMPARED = 4  # violations, the worst first
+MOST_COMBINED = 4  # inputs; of more, each is tried by itself, since the combinations would be too many
 
 
 def slow_inputs(robot: Robot) -> Array:
-    """Return all combinations (C, m) of slow backward, zero and slow forward inputs within bounds."""
+    """Return all combinations (C, m) of slow backward, zero and slow forward inputs within bounds.
+
+    In joint space with more than `MOST_COMBINED` inputs, only one input at a time differs from zero.
+    """
     share = np.where(robot.translates, SLOW, 1.0)
     levels = [
         sorted({float(low), min(max(0.0, low), high), float(high)})
         for low, high in zip(share * robot.low(), share * robot.high(), strict=True)
     ]
+    if not robot.position_dim and len(levels) > MOST_COMBINED:
+        rest = robot.zero_input()
+        alone = np.array([rest] + [rest] * sum(map(len, levels)))
+        places = [(i, value) for i, values in enumerate(levels) for value in values]
+        for row, (i, value) in enumerate(places, start=1):
+            alone[row, i] = value
+        return alone
     return np.array(list(product(*levels)))
 
 

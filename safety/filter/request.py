@@ -57,7 +57,7 @@ class Request:
         widening: factor on every set, at least 1 (docs/method.md §15).
         past: the last periods of a plan's length, whose score the decision tells.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
-            it.
+            it. In joint space there is no space to describe: no request needs it.
     """
 
     state: Array
@@ -180,12 +180,16 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         BadRequest: the description is missing or does not fit the robot. It has the field's name.
     """
     moving = request.movers is not None and len(request.movers)
-    if not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
+    if not robot.position_dim:
+        _check_no_space(robot, request)
+    elif not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
         raise BadRequest("obstacles", NOTHING_KNOWN)
     if not 1.0 <= request.widening < math.inf:  # a smaller factor would make sets smaller than stated
         raise BadRequest("widening", f"a widening is a finite factor of at least 1, not {request.widening:g}")
     if request.past is not None:
         _check_past(robot, request.past)
+    if not robot.position_dim:
+        return
     if request.obstacles.center.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
@@ -194,6 +198,16 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+
+
+def _check_no_space(robot: Robot, request: Request) -> None:
+    """Check that a request about a robot in joint space describes nothing that only a robot with a position can hit."""
+    named = {"scan": request.scan, "reservation": request.reservation, "fleet": request.other_reservations}
+    given = [name for name, value in named.items() if value is not None]
+    if len(request.obstacles) or request.movers is not None:
+        given.append("obstacles")
+    if given:
+        raise BadRequest(given[0], f"a {robot.name} robot has no position: a request about it has no {given[0]}")
 
 
 def _check_past(robot: Robot, past: PastWindow) -> None:

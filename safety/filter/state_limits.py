@@ -24,12 +24,16 @@ class StateLimits:
         weights · y_k = a·p_0 + b θ_0 + (aᵀR) p_k + rest        a: weights of the position, b: of the heading
 
     so each period gives a row `gradient z + spread m(z) <= most - a·p_0 - b θ_0 - |weights|·Z_v`.
+
+    In joint space, every limit holds within the periods and after the stop: the chord deviation of a period is how far
+    a limit's value exceeds its values at both ends of the period, in units of `Robot.limit_scales`. So each period also
+    gives a row for its start. The order of the rows is: ends, stop, starts; each for all limits.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
         d, n, N = robot.position_dim, robot.state_dim, tube.horizon
         self.count, self.heading = len(robot.limits), robot.heading
-        weights = np.array([limit.weights for limit in robot.limits]).reshape(-1, n)
+        weights = robot.limit_weights
         self.most = np.array([limit.most for limit in robot.limits]) - np.abs(weights) @ robot.measurement_bound
         self.place, self.turn = weights[:, :d], np.zeros(self.count)
         if robot.heading is not None:
@@ -37,6 +41,13 @@ class StateLimits:
         kept = [i for i in extra_coordinates(robot) if i < n]
         self.other, self.which = weights[:, kept], [extra_coordinates(robot).index(i) for i in kept]
         self.nz, self.extra, self.ends = tube.position.shape[2], np.eye(N + 1), np.append(np.arange(N), N - 1)
+        self.way = np.linalg.norm(self.place, axis=1) if d else robot.limit_scales
+        self.now: Array | None = None  # the map of the first period's start, in joint space
+        if not d:
+            self.now = np.zeros((1, self.count, self.nz + tube.generators + 1))
+            self.now[0, :, : len(robot.regressor)] = weights[:, list(robot.regressor)]
+            starts = np.append(N, np.arange(N - 1))  # row N of the maps is the one of now
+            self.ends, self.extra = np.append(self.ends, starts), np.vstack([self.extra, self.extra[:N]])
         self._around(tube)
 
     def _around(self, tube: Tube) -> None:
@@ -58,12 +69,11 @@ class StateLimits:
         widening: factor on the sets.
         """
         both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L + 1)
-        both = both[self.ends]
+        both = (both if self.now is None else np.concatenate([both, self.now]))[self.ends]
         bound = self.most - self.place @ start - self.turn * heading - both[..., -1]
-        way = np.linalg.norm(self.place, axis=1)
         # The chord deviation of every period, and the stopping distance at the last end.
-        extra = self.extra[:, None, :] * way[None, :, None]
-        gradient = both[..., : self.nz].reshape(-1, self.nz)
+        extra = self.extra[:, None, :] * self.way[None, :, None]
+        gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)
         spread = widening * np.concatenate([np.abs(both[..., self.nz : -1]), extra], axis=2)
         count = len(gradient)
         return ConstraintRows(gradient, spread.reshape(count, -1), bound.ravel(), np.zeros(count))

@@ -32,7 +32,7 @@ class Trajectory:
         states (T+1, n): measured states.
         inputs (T, m): executed inputs.
         paths (T, S, d): S positions within each period [m], relative to its start and in the frame of its start, from
-            dead reckoning.
+            dead reckoning. In joint space (T, S, n): S states within each period, relative to its start.
         turned (T,): heading change over each period [rad], from dead reckoning.
         before (m,): the input in force at the start. None if the robot stood still.
         headings (T, S): heading changes [rad] since the period's start, at the times of `paths`. None if unknown.
@@ -54,7 +54,8 @@ class Dataset:
         robot: the robot's description.
         trajectories: recordings, each uninterrupted.
         about: the origin of the data: noise levels, seed, payload and more.
-        chord_deviation: how far the path may leave the straight line between two samples of the source [m].
+        chord_deviation: how far the path may leave the straight line between two samples of the source [m]. In joint
+            space, how far a limit's value may exceed its values at both samples, in units of `Robot.limit_scales`.
     """
 
     robot: Robot
@@ -82,7 +83,7 @@ class Dataset:
             wanted = (
                 (periods + 1, robot.state_dim),
                 (periods, robot.action_dim),
-                (periods, samples, robot.position_dim),
+                (periods, samples, robot.path_dim),
                 (periods,),
             )
             if shapes != wanted or not periods:
@@ -213,6 +214,17 @@ class Dataset:
             for part in (t.before, t.headings):
                 sha.update(b"" if part is None else part.tobytes())
         return sha.hexdigest()[:12]
+
+
+def bends(robot: Robot, states: Array) -> Array:
+    """Return the sizes (T-1,) of the second differences of the position [m] in states (T+1, n).
+
+    In joint space, of the limits' values, in units of `Robot.limit_scales`.
+    """
+    second = np.diff(states, 2, axis=0)
+    if not robot.position_dim:
+        return np.asarray(np.abs(robot.limit_values(second)).max(1))
+    return np.asarray(np.linalg.norm(second[:, : robot.position_dim], axis=1))
 
 
 def _jump(robot: Robot, t: Trajectory) -> Array:

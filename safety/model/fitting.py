@@ -50,6 +50,8 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         ErrorBoundError: the data do not support this kind of error bound.
     """
     robot, kind = data.robot, model_config.windows
+    if not robot.position_dim:
+        raise ErrorBoundError(f"{robot.name} has no position, so this mode predicts nothing of it: use mode one-step")
     if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):
         raise ErrorBoundError("the recursion knows no body of discs beside the regressed position: use mode direct")
     if kind == FREE and robot.feedback:

@@ -308,6 +308,14 @@ def extra_coordinates(robot: Robot) -> tuple[int, ...]:
     return (*sorted(limited), *range(n, n + discs))
 
 
+def scored_coordinates(robot: Robot) -> tuple[int, ...]:
+    """Return the coordinates that a plan must predict after every period: the position, or in joint space the limited.
+
+    The other predicted coordinates count after one period only.
+    """
+    return tuple(range(robot.position_dim)) or extra_coordinates(robot)
+
+
 def whitening_of(step: ErrorBound, basis: Array) -> Array:
     """Return the basis B for a step; regressors of the recursion have more coordinates than z (the heading)."""
     if step.C.shape[1] == len(basis):

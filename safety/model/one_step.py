@@ -141,7 +141,7 @@ class OneStep:
         f, d = self.features, robot.position_dim
         heading = -1 if robot.heading is None else robot.heading
         arms = [disc.at for disc in robot.body if disc.arm > 0.0 and heading >= 0]
-        others, centers = np.array(robot.regressor, dtype=np.int64), np.array(arms, dtype=float).reshape(-1, d)
+        others, centers = np.array(robot.regressor, dtype=np.int64), np.array(arms, dtype=float).reshape(len(arms), d)
         whole = np.ascontiguousarray
         predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(f.terms)
         return *predictor, others, heading, centers, d, robot.action_dim

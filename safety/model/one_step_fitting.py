@@ -124,7 +124,8 @@ class Candidate:
 
     Attributes:
         error [m]: the 99 % quantile of the distance between predicted and measured position, over all windows and
-            periods, each predicted without its fold.
+            periods, each predicted without its fold. In joint space, of the largest error of a limit's value, in units
+            of `Robot.limit_scales`.
         features: number of features.
     """
 
@@ -192,15 +193,23 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
             continue
         regression = _Regression.of(features, s)
         for ridge in RIDGES:
-            off = regression.out_of_fold(robot, few_windows, ridge)[..., : robot.position_dim]
-            with np.errstate(over="ignore", invalid="ignore"):  # a rollout may diverge
-                error = float(np.quantile(np.linalg.norm(off, axis=-1), QUANTILE))
+            off = _distances(robot, regression.out_of_fold(robot, few_windows, ridge))
+            with np.errstate(invalid="ignore"):
+                error = float(np.quantile(off, QUANTILE))
             found.append((Candidate(degree, lags, saturating, ridge, error, count), regression))
     found = [pair for pair in found if np.isfinite(pair[0].error)]
     least = min(c.error for c, _ in found)
     good = [pair for pair in found if pair[0].error <= SIMPLER * least]
     chosen, regression = min(good, key=lambda pair: (pair[0].features, pair[0].error))
     return chosen, sorted((c for c, _ in found), key=lambda c: c.error), regression
+
+
+def _distances(robot: Robot, errors: Array) -> Array:
+    """Return the error of the position (...,) [m], or in joint space the largest of a limit, of errors (..., n')."""
+    if not robot.position_dim:
+        return np.asarray(np.abs(robot.limit_values(errors)).max(-1))
+    with np.errstate(over="ignore", invalid="ignore"):  # a rollout may diverge
+        return np.asarray(np.linalg.norm(errors[..., : robot.position_dim], axis=-1))
 
 
 def spread_features(robot: Robot, z: Array, k: int) -> Array:
@@ -313,6 +322,8 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight)
     kinds = driving_kinds(robot, s.z, s.start)
     factor, first = _factor(scores, kinds), _factor(others, kinds)
+    if not robot.position_dim:  # the limited coordinates are scored with the plan
+        first = max(factor, first)
     one_step = regression.fit(chosen.ridge, weight=weight)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
     shape = _shape(robot, s.z, errors, s.chords)
@@ -378,7 +389,10 @@ def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2))
     shape.slopes[:, -1] *= CHORD_INFLATION
-    least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
+    if robot.position_dim:
+        least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
+    else:
+        least = LEAST_CHORD * float((np.abs(robot.limit_weights) @ shape.w[-1, :-1] / robot.limit_scales).mean())
     shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], least)
     return shape
 
@@ -425,7 +439,7 @@ def _scores(
         widths = shape.widths(robot, s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = shares[..., used].max((1, 2))
-        scores[1, held] = shares[:, 0, :d].max(1)
+        scores[1, held] = shares[:, 0, :d].max(1, initial=0.0)
         scores[2, held] = shares[:, 0, d:-1].max(1, initial=0.0)
     return scores[0], scores[1], scores[2]
 

@@ -94,7 +94,7 @@ class ValidationReport:
     bound_episode: float  # the same for any of `EPISODE` steps, from bound_step, if steps were independent
     outside_episode: float  # bound on the mean number of steps outside in `EPISODE` steps, from bound_step
     outside_hour: float  # the same for an hour of driving
-    half_width_rest: float  # m, for a full stop, largest axis, without the position noise of the estimate
+    half_width_rest: float  # in `unit`, for a full stop, largest axis, without the position noise of the estimate
     half_width_full: float
     clearance_margin: float  # m, distance to obstacles that leaves the robot room to turn in place
     excess: float  # largest ratio of an error to its bound in any held-out plan; above 1: outside
@@ -107,6 +107,7 @@ class ValidationReport:
     groups: tuple[GroupStatement, ...] = ()  # mode one-step: the statement by kind of driving
     chosen: Candidate | None = None  # mode one-step: the chosen features
     candidates: tuple[Candidate, ...] = ()  # mode one-step: all features tried, from the best to the worst
+    unit: str = "m"  # of half-widths and errors of candidates; in joint space "1": shares of a limit's range
 
     def figures(self) -> dict[str, Any]:
         return asdict(self)
@@ -270,6 +271,7 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
             for name, kind in driving_kinds(robot, s.z, s.start).items()
             if kind.any()
         ),
+        unit="m" if robot.position_dim else "1",
         chosen=calibration.chosen,
         candidates=calibration.candidates,
     )

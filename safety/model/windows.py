@@ -138,7 +138,8 @@ def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArra
 def ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
     """Return the chord deviation of each period and the stopping distance from each sample on.
 
-    The result is cached for each trajectory, since windows of all lengths need it.
+    In joint space they are the excursions of the limits (`_excursions`). The result is cached for each trajectory,
+    since windows of all lengths need it.
 
     Returns:
         The largest distance of the path from its chord (T,) [m], and the way while stopping (T+1,) [m]; NaN where the
@@ -146,7 +147,10 @@ def ways(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
     """
     known = _found.get(t)
     if known is None or known[0] != robot:
-        known = _found[t] = robot, _farthest_off_chord(robot, t), _rest_travel(robot, t)
+        if robot.position_dim:
+            known = _found[t] = robot, _farthest_off_chord(robot, t), _rest_travel(robot, t)
+        else:
+            known = _found[t] = robot, *_excursions(robot, t)
     return known[1:]
 
 
@@ -209,13 +213,36 @@ def _off_chord(paths: Array) -> Array:
     return np.asarray(np.sqrt(((paths - along * chord) ** 2).sum(-1)).max(1))
 
 
+def _excursions(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+    """Return how far the values of the limits exceed those at the periods' ends, in units of `Robot.limit_scales`.
+
+    Returns:
+        The most by which any limit's value within a period exceeds the larger of its values at the period's two ends
+        (T,). The most by which it grows from each sample on while the inputs stay those of a stop (T+1,); NaN where
+        they are not.
+    """
+    values, travel = robot.limit_values(t.paths), np.full(len(t.inputs) + 1, np.nan)
+    within = (values - np.maximum(values[:, -1:], 0.0)).max((1, 2))
+    start = robot.limit_values(t.states[:-1])
+    highest = start + values.max(1)
+    for begin, end in _stops(robot, t):
+        later = np.maximum.accumulate(highest[begin:end][::-1])[::-1]
+        travel[begin:end] = np.maximum(later - start[begin:end], 0.0).max(1)
+    return np.maximum(within, 0.0), travel
+
+
+def _stops(robot: Robot, t: Trajectory) -> list[tuple[int, int]]:
+    """Return the first period of each stop, and the first one after it."""
+    zero = stop_input_periods(robot, t)
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], zero, [False]]).astype(int))).tolist()
+    return list(zip(runs[::2], runs[1::2], strict=True))
+
+
 def _rest_travel(robot: Robot, t: Trajectory) -> Array:
     """Return the way (T+1,) [m] from each period on while the inputs stay those of a stop; NaN if they are not."""
     travel = np.full(len(t.inputs) + 1, np.nan)
     arm = max(disc.arm for disc in robot.body)
-    zero = stop_input_periods(robot, t)
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], zero, [False]]).astype(int)))
-    for begin, end in zip(runs[::2], runs[1::2], strict=True):
+    for begin, end in _stops(robot, t):
         turned = np.concatenate([[0.0], np.cumsum(t.turned[begin:end])[:-1]])
         paths = t.paths[begin:end]
         if paths.shape[-1] >= 2:

@@ -229,8 +229,8 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
     return Decision(
         kind=KIND_NAMES[m.kind],
         plan=array_of(m.plan).reshape(robot.horizon, robot.action_dim),
-        tube_center=tube[0].reshape(-1, d),
-        tube_half_width=tube[1].reshape(-1, d),
+        tube_center=tube[0].reshape(-1 if d else 0, d),  # in joint space there are no boxes
+        tube_half_width=tube[1].reshape(-1 if d else 0, d),
         predicted=Prediction(array_of(m.predicted_center), array_of(m.predicted_half_width), m.predicted_heading),
         **{name: getattr(m, name) for name in SAME_FIELDS},
         blocked_by=stopped,

@@ -35,7 +35,9 @@ def column_names(robot: Robot) -> tuple[list[str], list[str]]:
 
 
 def quantities(robot: Robot) -> dict[str, str]:
-    """Return the quantity of each column whose role and unit determine it."""
+    """Return the quantity of each column whose role and unit determine it. In joint space there is none."""
+    if not robot.position_dim:
+        return {}
     states, inputs = column_names(robot)
     frame = "velocity" if robot.heading is None else "body"
     found: dict[str, str] = {}
