@@ -1,8 +1,8 @@
 """The robot model that all parts share: its vectors with names, units and bounds, its body, and how it stops.
 
 A robot is a file (`robots/NAME.toml`, or a file of your own); `brakeline.messaging.robot_description` reads it. All
-values are in SI units and ENU frames. The first `position_dim` coordinates of a state are the position. A robot in joint
-space has no position (`position_dim` = 0): its limits are all that a plan must respect.
+values are in SI units and ENU frames. The first `position_dim` coordinates of a state are the position. A robot in
+joint space has no position (`position_dim` = 0): its limits are all that a plan must respect.
 """
 
 from __future__ import annotations
