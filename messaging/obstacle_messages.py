@@ -44,6 +44,8 @@ def obstacle_of(message: pb.Obstacle, dim: int) -> Obstacle:
     Raises:
         BadShape: a value is wrong; `field` names it.
     """
+    if not dim:
+        raise BadShape("position", "a robot without a position has no obstacles, only limits")
     if len(message.position) != dim:
         raise BadShape("position", f"{len(message.position)} coordinates; this robot's obstacles have {dim}")
     motion = _motion_of(message.motion) if message.HasField("motion") else None

@@ -225,6 +225,12 @@ class RobotWithTask(Robot):
         return layout == self.learning_layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
+NO_SPACE = (
+    "has no position, and a task leads a robot to a place among obstacles: record it with a program of your own, "
+    "import the log, and put the filter in front of your own policy"
+)
+
+
 def with_task(robot: Robot, task: Task) -> RobotWithTask:
     """Return the robot together with a task."""
     return RobotWithTask(**{item.name: getattr(robot, item.name) for item in fields(Robot)}, task=task)
@@ -244,7 +250,10 @@ def robot_with_task(name: str) -> RobotWithTask:
         UnknownRobot: no robot has this name, or its description has mistakes.
         UnknownTask: the robot has no such task, or the task's file has mistakes.
     """
-    return with_task(robot_named(name), read_task(task_path(name)))
+    robot = robot_named(name)
+    if not robot.position_dim:
+        raise UnknownTask(f"{robot.name} {NO_SPACE}")
+    return with_task(robot, read_task(task_path(name)))
 
 
 def robot_maybe_with_task(name: str) -> Robot:
@@ -261,6 +270,8 @@ def needs_task(robot: Robot) -> RobotWithTask:
         UnknownTask: the robot has no task.
     """
     if not isinstance(robot, RobotWithTask):
+        if not robot.position_dim:
+            raise UnknownTask(f"{robot.name} {NO_SPACE}")
         raise UnknownTask(
             f"{robot.name} has no task: write its observation, rewards and arenas to {robot.kind}.task.toml"
         )

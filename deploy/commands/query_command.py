@@ -71,7 +71,7 @@ class QueryCommand:
         figures["plan"] = answer.plan.tolist()
         figures["tube"] = {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()}
         clearance = " for clearance: the proposal is verified too," if answer.for_clearance else ""
-        margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f} m"
+        margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f}{' m' if robot.position_dim else ''}"
         print_result(
             self.json,
             figures,
@@ -98,11 +98,13 @@ def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:
 
     Args:
         words: kind and numbers.
-        dim: number of position coordinates, 2 or 3.
+        dim: number of position coordinates, 2 or 3; 0 for a robot without a position, which has no obstacles.
 
     Raises:
         ValueError: the words are no obstacle; the message says how to write one.
     """
+    if not dim:
+        raise ValueError("a robot without a position has no obstacles, only limits: leave out --obstacle")
     kind = words[0] if words else ""
     if kind not in KINDS:
         raise ValueError(f"{kind!r}: {OBSTACLE_FORM}")

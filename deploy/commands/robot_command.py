@@ -63,12 +63,13 @@ class RobotCommand:
                 errors.print(str(error), markup=False)
             return 1
         remarks = summary(robot)["remarks"]
+        collect = f", or `brakeline collect {self.file}`" if robot.position_dim else ""
         print_result(
             self.json,
             {"file": self.file, "problems": [], "remarks": remarks},
             f"{robot.name}: {len(robot.state)} coordinates, {len(robot.action)} inputs, no mistake",
             *(f"  {line}" for line in (*remarks, _task_text(self.file))),
-            f"next: `brakeline import LOG --robot {self.file}`, or `brakeline collect {self.file}`",
+            f"next: `brakeline import LOG --robot {self.file}`{collect}",
         )
         return 0
 
@@ -92,6 +93,8 @@ class RobotCommand:
 
 def _task_text(name: str) -> str:
     robot = robot_maybe_with_task(name)
+    if not robot.position_dim:
+        return "no position: the filter keeps its limits in joint space, without obstacles and tasks"
     if not isinstance(robot, RobotWithTask):
         return "no task file beside it: you can certify and filter; to train, write NAME.task.toml (docs/your_robot.md)"
     task = robot.task

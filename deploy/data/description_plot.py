@@ -57,9 +57,7 @@ def summary(robot: Robot) -> dict[str, Any]:
         },
         "plan_s": robot.horizon * robot.period,
         "braking_s": robot.brake_steps * robot.period,
-        "way_to_a_stop_m": nominal_stopping_distance(robot),
-        "footprint_m": robot.footprint,
-        "discs": len(robot.body),
+        **(_figures_of_position(robot) if robot.position_dim else {}),
         "limits": [limit.name for limit in robot.limits],
         "regressors": [robot.state[i] for i in robot.regressor],
         "layout": robot.layout(),
@@ -67,20 +65,29 @@ def summary(robot: Robot) -> dict[str, Any]:
     }
 
 
+def _figures_of_position(robot: Robot) -> dict[str, Any]:
+    distance = nominal_stopping_distance(robot)
+    return {"way_to_a_stop_m": distance, "footprint_m": robot.footprint, "discs": len(robot.body)}
+
+
 def draw_description(robot: Robot, path: Path) -> None:
-    """Plot the body from above and the stop of each input, and write the image to `path`."""
+    """Plot the body from above (in joint space, the limits) and the stop of each input into the image `path`."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     body, plan = figure.subplots(1, 2)
-    for disc in robot.body:
-        body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
-    body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
-    body.annotate("", (robot.footprint, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
-    body.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body and footprint")
-    reach = 1.2 * robot.footprint
-    body.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    if robot.position_dim:
+        for disc in robot.body:
+            body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
+        body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
+        body.annotate("", (robot.footprint, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
+        body.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body and footprint")
+        reach = 1.2 * robot.footprint
+        body.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    else:
+        body.barh([limit.name for limit in robot.limits], [limit.most for limit in robot.limits], alpha=0.3)
+        body.set(xlabel="largest value", title=f"{robot.name}: limits")
     times = robot.period * np.arange(robot.horizon + 1)
     for label, rule, values in zip(robot.action, robot.stop, full_stop_inputs(robot).T, strict=True):
         how = {RAMP: "ramp", HOLD: "held", FEEDBACK: "by feedback"}.get(str(rule), "profile")

@@ -265,7 +265,8 @@ class Filter:
         kept = self._with_clearance_margin(local_map, proposed, z_0, proposal)
         if margin >= 0.0 and general.margin(kept, z) >= 0.0:
             return allowed
-        record.reason = f"the proposal's tube comes within {margin:.3g} m of the free space's edge"
+        edge = "m of the free space's edge" if self.robot.position_dim else "(in its own unit) of a limit"
+        record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
         kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
         record.blocked_by = constraints.worst_of(local_map, z, slack, planes, kept_off)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would

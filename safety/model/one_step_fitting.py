@@ -404,14 +404,15 @@ def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> 
     outside of the data are as narrow as within.
     """
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
-    z, after, fold, d = s.z[some], s.after[some, -1:, : robot.position_dim], s.fold[some], robot.position_dim
+    used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
+    z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
     plans, found = _plans_from(robot, z), dict.fromkeys(WEIGHTS, 0.0)
     for weight in WEIGHTS:
         scores, width = np.zeros(len(z)), 0.0
         for i in range(len(regression.gram)):
             one_step, held = regression.fit(ridge, i, weight), fold == i
             stretch = one_step.stretches(robot, z)[:, -1:, None]
-            errors = (after - one_step.rollouts(robot, z)[:, -1:, :d]) / stretch
+            errors = (after - one_step.rollouts(robot, z)[:, -1:][..., used]) / stretch
             shape = Shape.around(robot, z[~held], errors[~held], last=True)
             scores[held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
             wide = shape.widths(robot, plans, last=True)[:, 0] * one_step.stretches(robot, plans)[:, -1:]

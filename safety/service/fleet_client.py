@@ -41,11 +41,13 @@ class FleetClient(BusClient):
         """Make a client for robots of one kind; names: of the robots.
 
         Raises:
-            ValueError: there are fewer than two names, or two are equal.
+            ValueError: there are fewer than two names, or two are equal, or the robot has no position.
         """
         if len(names) < 2 or len(set(names)) < len(names):
             raise ValueError(f"a fleet needs two robots or more with different names, not {list(names)}")
         super().__init__(bus, robot, deadline)
+        if not self.robot.position_dim:
+            raise ValueError(f"{self.robot.name} has no position, so it reserves no space: use a SafetyClient for each")
         self.names = tuple(names)
         self.backup_plans = [BackupPlan(self.robot) for _ in self.names]
         self._episode = self._step = 0

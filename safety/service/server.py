@@ -187,6 +187,8 @@ class BatchHandler:
         if not isinstance(method, Filter):
             raise BadRequest("fleet", "only the filter makes reservations: the rivals predict nothing")
         robot = method.robot
+        if not robot.position_dim:
+            raise BadRequest("fleet", f"{robot.name} has no position, so it reserves no space: ask without a fleet")
         if robot.late:
             why = f"{robot.name}: a robot in real time gets its decisions too late for reservations"
             raise BadRequest("fleet", why)

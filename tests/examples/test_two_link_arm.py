@@ -22,4 +22,4 @@ def test_it_certifies_its_own_log_and_never_exceeds_a_limit(tmp_path):
     behind, without = ran.stdout.splitlines()[-2:]
     assert "'episodes': 10, 'steps': 500, 'episodes beyond a limit': 0" in behind, behind
     assert float(re.search(r"'nearest to a limit \[rad\]': ([\d.e-]+)", behind)[1]) < 0.15
-    assert "'episodes beyond a limit': 10" in without and picture.stat().st_size > 1000
+    assert int(re.search(r"'episodes beyond a limit': (\d+)", without)[1]) >= 5 and picture.stat().st_size > 1000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 
 from brakeline.messaging.robot_description import robot_from_description
@@ -57,6 +58,29 @@ class Joints:
             q, dq = q + 0.5 * step * (dq + faster), faster
             states.append(np.concatenate([q, dq]))
         self.true = np.array(states)
+
+
+class JointEnvironment(gymnasium.Env):
+    """The joints as an environment that tells its measured state and nothing about space."""
+
+    def __init__(self, robot):
+        self.robot = robot
+        self.action_space = gymnasium.spaces.Box(robot.low().astype(np.float32), robot.high().astype(np.float32))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (robot.state_dim,))
+
+    def _seen(self):
+        state = self.arm.measured()
+        return state.astype(np.float32), {"state": state}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.arm = Joints(self.robot, self.np_random)
+        return self._seen()
+
+    def step(self, action):
+        self.arm.drive(np.asarray(action, float))
+        observation, info = self._seen()
+        return observation, 0.0, False, False, info
 
 
 def record(robot, seed=0, trajectories=6, periods=400):

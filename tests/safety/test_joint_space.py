@@ -9,32 +9,34 @@ import pytest
 
 from brakeline.deploy.cli import main as brakeline
 from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.environment_episodes import collect
 from brakeline.errors import BadDescription, BadRequest, BadShape, ErrorBoundError
-from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot_description import describe, robot_from_description
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.recovery import slow_inputs
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
 from brakeline.safety.filter.reservation import Reservation
+from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig, ModelSet
 from brakeline.safety.model.one_step_fitting import samples_of
 from brakeline.safety.model.windows import ways
-from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
-from brakeline.safety.service.wire import decision_reply, request_of
 from tests.safety.asked import cylinder
-from tests.safety.joints import MOST, Joints, description, joints, record
+from tests.safety.joints import MOST, JointEnvironment, Joints, description, joints, record
+from tests.safety.served import ServiceClient
 
 ARM = Path(__file__).parents[2] / "examples/two_link_arm/two_link_arm.toml"
 
 
 @cache
 def certified(n=2):
-    return certify(record(joints(n)), ModelConfig(mode=ONE_STEP))
+    return certify(record(joints(n), trajectories=6 if n == 2 else 2), ModelConfig(mode=ONE_STEP))
 
 
 @cache
@@ -71,7 +73,11 @@ def test_a_description_without_a_position_has_neither_sight_nor_body():
         ({"limit": []}, "limit", "needs a limit"),
         ({"state": {"q": {"unit": "rad", "error": 0.0, "regressor": False}}}, "state.q.regressor", "every coordinate"),
         ({"state": {"q": {"unit": "rad", "error": 0.0, "role": "heading"}}}, "state", "heading belongs"),
-        ({"input": {"w": {"unit": "rad/s", "low": -1, "high": 1, "stop": {"q0": -1.0}}}}, "input.w.stop", "not by gains"),
+        (
+            {"input": {"w": {"unit": "rad/s", "low": -1, "high": 1, "stop": {"q0": -1.0}}}},
+            "input.w.stop",
+            "not by gains",
+        ),
     ],
 )
 def test_a_mistake_in_a_description_without_a_position_is_told(changes, field, word):
@@ -111,7 +117,7 @@ def test_an_excursion_is_how_far_a_limit_is_exceeded_between_two_ends():
 
 def test_the_stated_shares_hold_on_fresh_driving():
     model, report = certified()
-    fresh = samples_of(record(model.robot, seed=9, trajectories=40))
+    fresh = samples_of(record(model.robot, seed=9, trajectories=15))
     off = np.abs(fresh.after - model.one_step.rollouts(model.robot, fresh.z))
     widths = np.stack([step.half_widths(fresh.z) for step in model.steps], axis=1)
     outside = (off[..., :2] > widths[..., :2]).any((1, 2))
@@ -143,7 +149,7 @@ def test_the_linear_modes_are_refused(mode):
 def test_an_adversary_never_exceeds_a_limit_not_even_between_two_ends():
     robot, generator = joints(2), np.random.default_rng(3)
     arm, client, kinds, nearest = Joints(robot, generator), safety(), [], np.inf
-    for _ in range(20):
+    for _ in range(10):
         client.reset()
         arm.reset(generator.uniform(-0.8, 0.8, 2))
         for step in range(40):
@@ -154,7 +160,7 @@ def test_an_adversary_never_exceeds_a_limit_not_even_between_two_ends():
             arm.drive(answer.action)
             nearest = min(nearest, MOST - np.abs(arm.true[:, :2]).max())
     assert 0.0 < nearest < 0.05
-    assert kinds.count(ADJUSTED) > 200 and kinds.count(FAILSAFE) < 0.05 * len(kinds)
+    assert kinds.count(ADJUSTED) > 100 and kinds.count(FAILSAFE) < 0.05 * len(kinds)
 
 
 def test_a_proposal_is_allowed_inside_and_adjusted_at_the_limit_that_blocks_it():
@@ -213,9 +219,10 @@ def test_an_arm_that_stands_beyond_a_limit_recovers():
 
 
 def test_any_number_of_joints():
-    model = certified(4)[0]
-    answer = InProcess(Filter(model), accept_bound=1.0).decide([0.85] * 4 + [0.0] * 4, [1.0, -1.0, 1.0, -1.0])
-    assert answer.kind == ADJUSTED and answer.action[[1, 3]] == pytest.approx([-1.0, -1.0], abs=1e-2)
+    answer = safety(3).decide([0.85] * 3 + [0.0] * 3, [1.0, -1.0, 1.0])
+    assert answer.kind == ADJUSTED and answer.action[1] == pytest.approx(-1.0, abs=1e-2)
+    alone = slow_inputs(joints(7))
+    assert len(alone) == 1 + 3 * 7 and (np.count_nonzero(alone, axis=1) <= 1).all()
 
 
 # --- space is no word ---------------------------------------------------------------------------------------------
@@ -243,12 +250,32 @@ def test_a_client_that_gives_an_obstacle_is_told_so():
         safety().decide([0.0] * 4, [0.0, 0.0], [cylinder(1.0, 0.0, 0.1)])
 
 
-def test_a_request_and_its_reply_go_over_the_wire():
-    client = safety()
-    message = request_message(client.backup_plan, [0.85, 0.0, 0.0, 0.0], [1.0, 0.0])
-    decision = ready().decide(request_of(pb.Request.FromString(message.SerializeToString()), client.robot))
-    reply = decision_reply(decision, 0.0)
-    reply.robot = client.robot.name
-    answer = read_reply(pb.Reply.FromString(reply.SerializeToString()), message, client.robot)
-    assert answer.kind == ADJUSTED and answer.action == pytest.approx(decision.plan[0])
-    assert answer.tube_center.shape == (0, 0) and answer.blocked_by.by == "q0 up"
+def test_a_service_decides_as_the_filter_does_in_process():
+    client = ServiceClient(certified()[0])
+    answer = client.decide([0.85, 0.0, 0.0, 0.0], [1.0, 0.0])
+    alone = safety().decide([0.85, 0.0, 0.0, 0.0], [1.0, 0.0])
+    assert (answer.kind, answer.blocked_by.by) == (ADJUSTED, "q0 up") and (answer.plan == alone.plan).all()
+    assert answer.tube_center.shape == (0, 0)
+    fleet = request_message(client.backup_plan, np.zeros(4), np.zeros(2), actor="a", fleet=["a"])
+    assert "reserves no space" in client.service.error(fleet).message
+    obstacle = request_message(client.backup_plan, np.zeros(4), np.zeros(2), [cylinder(1.0, 0.0, 0.1)])
+    assert "only limits" in client.service.error(obstacle).message
+
+
+def test_a_gymnasium_environment_needs_no_obstacles():
+    env = SafetyWrapper(JointEnvironment(joints(2)), ready(), accept_bound=1.0)
+    env.reset(seed=0)
+    kinds = [env.step(np.array([1.0, -1.0], np.float32))[4]["safety"].kind for _ in range(20)]
+    assert kinds[0] == ALLOWED and kinds[-1] == ADJUSTED and np.abs(env.unwrapped.arm.true).max() < MOST
+
+
+def test_a_gymnasium_environment_records_its_own_data():
+    robot = joints(2)
+    data = collect(JointEnvironment(robot), robot, 200)
+    assert data.periods == 200 and data.trajectories[0].paths.shape[1:] == (1, 4) and data.chord_deviation > 0.0
+
+
+@pytest.mark.parametrize("words", [["collect"], ["evaluate"], ["train"]])
+def test_what_needs_a_task_is_refused(words, capsys):
+    assert brakeline([*words, str(ARM)]) != 0
+    assert "has no position" in "".join(capsys.readouterr())
