@@ -13,7 +13,7 @@ from tests.system.runs import Run
 from tests.waiting import until
 
 # An untrained robot hardly ever reaches a goal: its episodes have 300 steps, so the run ends at 600.
-SHORT = ("--deterministic", "--steps", 400, "--learner.td3.warmup", 100, "--learner.checkpoint-every", 200)
+SHORT = ("--deterministic", "--steps", 400, "--learner.td3.warmup", 100, "--learner.checkpoint-every", 100)
 
 
 def weights(run: Run) -> bytes:
