@@ -4,6 +4,7 @@ The new model set comes from `certify --publish` by hand, or from the certifier 
 """
 
 import json
+import shutil
 import signal
 
 from brakeline.logs.reader import open_log
@@ -57,7 +58,9 @@ def beyond(exchanges):
     return sum(not score <= 1.0 for score in scores) / len(scores)
 
 
-def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(data_folder, tmp_path):
+def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(data_folder, tmp_path, monkeypatch):
+    shutil.copytree(data_folder, tmp_path / "data")  # other tests' runs take the newest model set of the shared folder
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2)
     adapt = ("--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
     with Run(tmp_path / "run", "--steps", ENDLESS, *adapt, *change, *WORDS) as run:
