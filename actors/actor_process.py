@@ -27,7 +27,7 @@ from brakeline.actors.episode_runner import (
     decide,
 )
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder, MessageSink
-from brakeline.actors.policies import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, Stop
+from brakeline.actors.proposers import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, Stop
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process

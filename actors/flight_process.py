@@ -37,7 +37,7 @@ from brakeline.actors.mavlink.frame_recorder import MessageSink
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
-from brakeline.actors.policies import PolicyFactory, Stop
+from brakeline.actors.proposers import PolicyFactory, Stop
 from brakeline.errors import BusError, Mismatch, TakeoffNotVerified
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot

@@ -35,8 +35,8 @@ from benchmarks import (
     solvers,
 )
 from benchmarks.timing import Figures, Words
-from brakeline.logs.console_tables import StackingTable
-from tests.faults import chaos, crowd, disturbances, link_faults, link_loss
+from brakeline.logs.stacking_table import StackingTable
+from tests.faults import autopilot_disturbances, chaos, crowd, link_faults, link_loss
 from tests.fuzz import message_fuzz
 
 
@@ -95,7 +95,7 @@ BENCHMARKS = {
     "fuzz": Benchmark(message_fuzz, lambda given: message_fuzz.fuzz(given.messages, given.seed), named=True),
     "manners": Benchmark(autopilot_conformance, lambda _: autopilot_conformance.run(), named=True),
     "flights": Benchmark(flights, lambda given: flights.run(given.minutes, given.folder), named=True),
-    "upsets": Benchmark(disturbances, lambda given: disturbances.run(given.folder), named=True),
+    "upsets": Benchmark(autopilot_disturbances, lambda given: autopilot_disturbances.run(given.folder), named=True),
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),

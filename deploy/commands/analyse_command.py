@@ -11,8 +11,8 @@ from typing import Any
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs
 from brakeline.deploy.progress import under_way
+from brakeline.logs.figure_tables import show, show_episode
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
-from brakeline.logs.report import show, show_episode
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.progress import under_way
 from brakeline.errors import Unsupported
-from brakeline.logs.console_tables import StackingTable
+from brakeline.logs.stacking_table import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.robot import Robot

@@ -8,8 +8,8 @@ from typing import Any
 
 from rich.console import Console, RenderableType
 
-from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.json_values import finite
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 
 # The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
 console = Console(highlight=False, soft_wrap=True)

@@ -10,7 +10,7 @@ from brakeline.deploy.commands.command_output import conditions_table, errors, p
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.deploy.progress import under_way
 from brakeline.logs.episode_stats import EpisodeStats
-from brakeline.logs.report import show
+from brakeline.logs.figure_tables import show
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 

@@ -18,7 +18,7 @@ from brakeline.deploy.data.coverage import Coverage, coverage
 from brakeline.deploy.data.coverage_plot import draw_coverage
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.resample import HOLD
-from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import robot_named
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed
 from brakeline.errors import BadScan
-from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage

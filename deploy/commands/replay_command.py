@@ -17,8 +17,8 @@ from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.replay_run import ROUNDING, Replacement, replay
-from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.log_length import count
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.topics import EXCHANGE
 from brakeline.safety.filter.filter import Filter

@@ -13,7 +13,7 @@ from brakeline.deploy.commands.command_output import errors, print_json, print_r
 from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.errors import BadDescription
-from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.robot_description import NAME
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task

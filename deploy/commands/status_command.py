@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import BusOptions, Json, Unprefixed
-from brakeline.logs.console_tables import PLAIN, StackingTable
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.topics import HEALTH, LEARNER
 

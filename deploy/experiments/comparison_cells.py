@@ -30,7 +30,7 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import ResultError
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
-from brakeline.logs.report import analyse
+from brakeline.logs.figure_tables import analyse
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.methods import DDPC, Model
 from brakeline.safety.model.model_set import ModelConfig

@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.deploy.run.launcher import Launcher
-from brakeline.logs.console_tables import PLAIN
-from brakeline.logs.report import show
+from brakeline.logs.figure_tables import show
+from brakeline.logs.stacking_table import PLAIN
 from brakeline.logs.tube_stats import stated
 
 REFRESH = 0.5  # s between updates of the table

@@ -19,7 +19,7 @@ from brakeline.deploy.cli import COMMANDS, command_class, main
 from brakeline.deploy.commands.certify_command import validation_table
 from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
 from brakeline.errors import BadScan
-from brakeline.logs.report import analyse
+from brakeline.logs.figure_tables import analyse
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage

@@ -22,15 +22,15 @@ PLANTED = [
     ("actors/episode_runner.py", "from brakeline.safety.filter import qp_solver", "safety.filter.qp_solver"),
     ("logs/reader.py", "import brakeline.sim.arena", "sim.arena"),
     ("learner/learner.py", "import brakeline.logs.reader", "logs.reader"),
-    ("safety/filter/filter.py", "import brakeline.actors.policies", "actors.policies"),
+    ("safety/filter/filter.py", "import brakeline.actors.proposers", "actors.proposers"),
     ("sim/arena.py", "import brakeline.safety.filter.filter", "safety.filter.filter"),
     ("messaging/robot.py", "def late():\n    import brakeline.sim.arena", "sim.arena"),
     ("messaging/process_runtime.py", "import zenoh", "zenoh"),
-    ("actors/policies.py", "import torch", "torch"),
+    ("actors/proposers.py", "import torch", "torch"),
     ("deploy/commands/fly_command.py", "from pymavlink import mavutil", "pymavlink"),
     ("safety/filter/filter.py", "import mujoco", "mujoco"),
     ("messaging/topics.py", "import requests", "requests"),
-    ("actors/policies.py", "from brakeline import Filter", "the public names"),
+    ("actors/proposers.py", "from brakeline import Filter", "the public names"),
 ]
 
 

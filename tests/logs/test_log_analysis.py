@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from brakeline.logs.episode_sampler import SPREAD
+from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.intervention_map import MOST_CELLS, InterventionMap
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import by_run, find, open_log
-from brakeline.logs.report import analyse, show, show_episode
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
 

@@ -10,11 +10,11 @@ import pytest
 
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
+from brakeline.logs.figure_tables import analyse, for_clearance, show
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.quantiles import spread
 from brakeline.logs.recorder import entry
-from brakeline.logs.report import analyse, for_clearance, show
 from brakeline.logs.run_plots import draw
 from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb

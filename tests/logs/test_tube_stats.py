@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.logs.episode_stats import closed_loop
+from brakeline.logs.figure_tables import show
 from brakeline.logs.metrics import Metrics
-from brakeline.logs.report import show
 from brakeline.logs.tube_stats import TubeStats, figures, stated
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import printed

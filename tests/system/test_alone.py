@@ -2,7 +2,7 @@
 
 import signal
 
-from brakeline.logs.report import analyse
+from brakeline.logs.figure_tables import analyse
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle

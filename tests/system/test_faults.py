@@ -16,8 +16,8 @@ from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run.processes import CONFIG
 from brakeline.deploy.run.run_config import EXPERIMENTS, encode
 from brakeline.learner.checkpoint import exists
+from brakeline.logs.figure_tables import analyse
 from brakeline.logs.reader import open_log, read
-from brakeline.logs.report import analyse
 from tests.robots import GROUND
 from tests.system.runs import Run, alive, brakeline
 from tests.waiting import PATIENCE, until

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline.deploy.run.run_config import EXPERIMENTS, load
-from brakeline.logs.report import analyse
+from brakeline.logs.figure_tables import analyse
 from brakeline.messaging.policy_weights import MLP
 from tests.robots import GROUND
 from tests.system.runs import brakeline

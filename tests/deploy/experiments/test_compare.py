@@ -14,7 +14,7 @@ from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds
 from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.learner.rival_networks import FitConfig
-from brakeline.logs.report import analyse
+from brakeline.logs.figure_tables import analyse
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_set import ModelConfig

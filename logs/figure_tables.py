@@ -9,10 +9,10 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from brakeline.logs.console_tables import PLAIN, StackingTable
 from brakeline.logs.episode_stats import CONTACTS, KINDS, Figures
 from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.reader import Paths
+from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.logs.tube_stats import stated
 
 BLOCKS = "▁▂▃▄▅▆▇█"

@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from brakeline.logs.console_tables import StackingTable
+from brakeline.logs.stacking_table import StackingTable
 
 CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
 
