@@ -28,6 +28,7 @@ from benchmarks import (
     flights,
     learning_speed,
     log_reading,
+    model_peers,
     perception_cost,
     reachability,
     recording_cost,
@@ -98,6 +99,7 @@ BENCHMARKS = {
     "upsets": Benchmark(autopilot_disturbances, lambda given: autopilot_disturbances.run(given.folder), named=True),
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
+    "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }
