@@ -24,6 +24,7 @@ from benchmarks import (
     autopilot_conformance,
     costs,
     decide,
+    driving_groups,
     environment_speed,
     flights,
     learning_speed,
@@ -59,6 +60,8 @@ class Bench:
     """Delay of chaos, each way between actors and routers [s]."""
     messages: int = 1_000_000
     """Messages of fuzz."""
+    plans: int = driving_groups.PLANS
+    """Plans of each group of groups."""
     rate: int = crowd.JUNK
     """Junk messages of each sender of crowd [1/s]."""
     minutes: float = 10.0
@@ -100,6 +103,7 @@ BENCHMARKS = {
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
     "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
+    "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }

@@ -67,7 +67,7 @@ class FlyCommand:
     def run(self) -> int:
         """Fly. Returns the exit status."""
         config, folder = self.config(), self.out or dated_folder()
-        prepare(config, folder, resume=False)
+        config = prepare(config, folder, resume=False)
         with Display(errors if self.json else console, config.steps * len(config.flights)) as display:
             figures = Launcher(config, folder, self.meeting.settings(config, folder)).run(display)
         actors = [f"actor-{i}" for i in range(len(config.flights))]

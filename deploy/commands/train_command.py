@@ -104,7 +104,7 @@ def train(config: RunConfig, folder: Path, resume: bool, meeting: options.RunBus
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
 
-    prepare(config, folder, resume)
+    config = prepare(config, folder, resume)
     if resume:
         shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
     with Display(shown, config.steps * len(config.robots)) as display:

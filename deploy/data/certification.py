@@ -33,7 +33,7 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
     """Fit a model set and validate it on driving that it was not fitted to.
 
     Mode one-step predicts every window without its fold (cross-conformal calibration, docs/method.md §13). The other
-    modes fit 70 % of the trajectories and validate the result on the held-out ones.
+    modes leave out the restless trajectories, fit 70 % of the others and validate the result on the held-out ones.
 
     If the bound is above the robot's limit (`accept_bound`), widen the envelopes by the smallest factor that brings it
     within the limit (split conformal prediction, docs/method.md §12). The number of violations that the limit allows
@@ -56,6 +56,7 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         model, calibration = fit_one_step(data, model_config)
         report = validate_one_step(model, calibration)
         return _stated(model, report, data), report
+    data = data.steady()
     fitted, held_out = data.split((1.0 - HELD_OUT, HELD_OUT))
     model = fit_model_set(fitted, model_config)
     report, scores = validate_plans(model, fitted, held_out)

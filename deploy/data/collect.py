@@ -7,34 +7,36 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from brakeline.deploy.data.excitation import excitation
+from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.dataset import RESTLESS, Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-PERIODS = 300  # per trajectory
+PERIODS, RESTLESS_PERIODS = 300, 60  # per trajectory; the restless ones are short, so there are many starts
 ORIGIN = "collect"
 
 
 def record(
-    robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0
+    robot: RobotWithTask, trajectories: int, restless: int, seed: int, conditions: Conditions, first: int = 0
 ) -> Iterator[Trajectory]:
-    """Yield trajectories `first` to `trajectories` - 1 from the robot's simulator.
+    """Yield trajectories from the robot's simulator, and after them `restless` short ones of restless driving.
 
     Each one begins at rest and has its own random generator, seeded with (seed, number). Therefore a recording that
-    was interrupted can continue and give the same data.
+    was interrupted can continue and give the same data: `first` trajectories exist already.
 
     Raises:
         RuntimeError: the robot touched something.
     """
-    for number in range(first, trajectories):
-        rng = np.random.default_rng((seed, number))
+    for number in range(first, trajectories + restless):
+        steady = number < trajectories
+        rng = np.random.default_rng((seed, number) if steady else (seed, number - trajectories, 1))
         vehicle = vehicle_in_empty_arena(robot, rng, conditions)
         built = TrajectoryBuilder(vehicle.measured)
-        for u in itertools.islice(excitation(robot, rng), PERIODS):
+        inputs = excitation(robot, rng) if steady else restless_excitation(robot, rng)
+        for u in itertools.islice(inputs, PERIODS if steady else RESTLESS_PERIODS):
             period = vehicle.step(u)
             if period.collision:
                 raise RuntimeError(
@@ -44,13 +46,13 @@ def record(
         yield built.trajectory()
 
 
-def dataset(robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions) -> Dataset:
-    """Return the trajectories as a checked data set, with its origin in `about`."""
-    data = Dataset(robot, tuple(trajectories), origin(seed, conditions))
+def dataset(robot: Robot, trajectories: list[Trajectory], about: dict[str, str]) -> Dataset:
+    """Return the trajectories as a checked data set; about: its `origin`."""
+    data = Dataset(robot, tuple(trajectories), about)
     data.check()
     return data
 
 
-def origin(seed: int, conditions: Conditions) -> dict[str, str]:
-    """Return the `about` entries of a simulated recording: conditions, seed and origin."""
-    return conditions.describe() | {"seed": str(seed), "origin": ORIGIN}
+def origin(seed: int, conditions: Conditions, restless: int) -> dict[str, str]:
+    """Return the `about` entries of a recording: conditions, seed, origin, number of restless trajectories."""
+    return conditions.describe() | {"seed": str(seed), "origin": ORIGIN, RESTLESS: str(restless)}

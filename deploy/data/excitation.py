@@ -1,4 +1,7 @@
-"""Generate inputs for recording: random driving that covers all states, then plans like the filter's, then standing."""
+"""Generate inputs for recording: random driving that covers all states, then plans like the filter's, then standing.
+
+Restless driving also jumps between bounds, as exploring and adversarial policies do.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ MOST_HELD = 3  # periods for which a target is held, in addition to the periods 
 SHORT_STOP, LONG_STOP = 2, 15  # periods of standing after a plan
 LONG_STOPS = 0.1  # share of long stops
 RESTLESS = 0.3  # share of lead-ins that jump between bounds every period, as exploring and adversarial policies do
+JUMPS = 2.0 / 3.0  # probability of a jump in each period of restless inputs
 HASTE = 0.5  # share of targets that the robot leaves before it reaches them, as learning policies do
 EXTREMES = 0.45  # share of inputs at a bound or zero: a uniform draw would have too few
 
@@ -57,21 +61,48 @@ def excitation(
         before = yield from manoeuvre(robot, rng, before, held)
 
 
+def restless_excitation(robot: Robot, rng: np.random.Generator) -> Generator[Array, Array | None, None]:
+    """Yield inputs (m,) without end, as `excitation` does; each manoeuvre begins with restless inputs.
+
+    Some of them start at full speed: all inputs at a bound together, such as turning or climbing at speed.
+    """
+    before, lead = np.zeros(robot.action_dim), MOST_HELD + _across(robot)
+    while True:
+        state: Array | None = None
+        first = int(rng.integers(lead + 1))
+        target = _bounds(robot, rng)
+        for period in range(first + int(rng.integers(2 * robot.horizon + 1))):
+            if period >= first and rng.random() < JUMPS:
+                target = _bounds(robot, rng)
+            before = limit_slew(robot, before, target)
+            state = yield before
+        before = yield from manoeuvre(robot, rng, before, state=state)
+
+
+def _bounds(robot: Robot, rng: np.random.Generator) -> Array:
+    """Draw an input (m,) of which each coordinate is at a bound."""
+    return np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high())
+
+
+def _across(robot: Robot) -> int:
+    """Return the periods that an input takes from bound to bound."""
+    return math.ceil(((robot.high() - robot.low()) / np.asarray(robot.action_slew)).max())
+
+
 def manoeuvre(
-    robot: Robot, rng: np.random.Generator, before: Array, held: int = MOST_HELD
+    robot: Robot, rng: np.random.Generator, before: Array, held: int = MOST_HELD, state: Array | None = None
 ) -> Generator[Array, Array | None, Array]:
     """Yield a lead-in, a plan (free inputs, then braking) and standing; return the last input.
 
     A lead-in drives to several targets and may leave each early, so that every speed occurs with every acceleration.
+
+    state: (n,) as measured after the last input, which a robot that stops by feedback needs.
     """
-    state: Array | None = None
     if held > MOST_HELD and rng.random() < RESTLESS:
         for _ in range(rng.integers(held + 1)):
-            bounds = np.where(rng.random(robot.action_dim) < 0.5, robot.low(), robot.high())
-            before = limit_slew(robot, before, bounds)
+            before = limit_slew(robot, before, _bounds(robot, rng))
             state = yield before
-    across = (robot.high() - robot.low()) / np.asarray(robot.action_slew)  # periods from bound to bound
-    longest_lead = held + math.ceil(across.max())
+    longest_lead = held + _across(robot)
     for _ in range(rng.integers(MOST_LEAD + 1)):
         target = random_target(robot, rng)
         hasty = longest_lead > MOST_HELD and rng.random() < HASTE

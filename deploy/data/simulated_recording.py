@@ -20,6 +20,7 @@ from brakeline.sim.sim_conditions import Conditions
 PACE = 0.25  # s per trajectory, on a core that other processes share
 SAVE_EVERY = 20.0  # s: a killed recording loses no more than this
 SEED = 20260
+RESTLESS_SHARE = 0.5  # restless trajectories, in addition, for each other one
 
 
 def load_or_record(
@@ -31,6 +32,9 @@ def load_or_record(
     again: bool = False,
 ) -> Dataset:
     """Load the data set at `path`. Record it first if the file is missing, or if `again`.
+
+    A recording ends with restless trajectories, half as many as others. The linear forms are not fitted to them, so
+    that their model sets stay what they are (`Dataset.steady`).
 
     Raises:
         BadData: `again` would overwrite data that do not come from the simulator.
@@ -48,29 +52,31 @@ def load_or_record(
 
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
-    driven = _load_partial(part, robot, collect.origin(seed, conditions))[:trajectories]
+    restless = math.ceil(RESTLESS_SHARE * trajectories)
+    about, total = collect.origin(seed, conditions, restless), trajectories + restless
+    driven = _load_partial(part, robot, about)
     before = f"{len(driven)} of them recorded before" if driven else _duration(PACE * trajectories)
     console.print(
-        f"recording {robot.name} once, into {path}: {trajectories} trajectories, {before}. You can interrupt it: the "
+        f"recording {robot.name} once, into {path}: {total} trajectories, {before}. You can interrupt it: the "
         "next call continues.",
         markup=False,
     )
-    rest = collect.record(robot, trajectories, seed, conditions, len(driven))
+    rest = collect.record(robot, trajectories, restless, seed, conditions, len(driven))
     saved = time.monotonic()
     try:
-        for trajectory in each(rest, f"recording {robot.name}", trajectories, len(driven)):
+        for trajectory in each(rest, f"recording {robot.name}", total, len(driven)):
             driven.append(trajectory)
             if time.monotonic() - saved > SAVE_EVERY:
-                collect.dataset(robot, driven, seed, conditions).save(part)
+                collect.dataset(robot, driven, about).save(part)
                 saved = time.monotonic()
     except KeyboardInterrupt:
         if driven:
-            collect.dataset(robot, driven, seed, conditions).save(part)
+            collect.dataset(robot, driven, about).save(part)
             console.print(
-                f"[yellow]kept {len(driven)} of {trajectories} trajectories[/]: run the same command again to continue"
+                f"[yellow]kept {len(driven)} of {total} trajectories[/]: run the same command again to continue"
             )
         raise
-    data = collect.dataset(robot, driven, seed, conditions)
+    data = collect.dataset(robot, driven, about)
     _check_replaceable(path, robot)  # an import may have written the file in the meantime
     data.save(path)
     part.unlink(missing_ok=True)

@@ -194,7 +194,7 @@ def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
     """Return the cost of pre-training. Our data are recorded in an empty yard, where no collision is possible."""
     if isinstance(model, Pretrained):
         return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
-    return {"samples": str(load_or_record(robot).periods), "collisions": "0"}
+    return {"samples": str(load_or_record(robot).steady().periods), "collisions": "0"}
 
 
 def _checked(table: EpisodeTable, log_file: Path) -> dict[str, Any]:

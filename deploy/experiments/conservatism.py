@@ -45,7 +45,7 @@ class Conservatism:
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """Return one row per error bound and mode; a row without a model set gives the reason."""
         robot = robot_with_task(self.robot)
-        data = load_or_record(robot)
+        data = load_or_record(robot).steady()
         rows = []
         for certificate in KINDS:
             for mode in MODES:

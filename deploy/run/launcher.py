@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
+from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed_run
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.errors import LaunchError
 from brakeline.logs.metrics import Metrics
@@ -23,8 +23,8 @@ from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.messaging.topics import RECORDED
+from brakeline.safety.methods import Model
 from brakeline.safety.service.plan_token import write_key
 
 log = logging.getLogger("brakeline.launcher")
@@ -37,23 +37,29 @@ SILENCE = 0.5  # s without a message after which the launcher takes the last mes
 FIGURES = "figures.json"
 
 
-def prepare(config: RunConfig, folder: Path, resume: bool) -> None:
-    """Make the run's folder, and the model sets if there are none.
+def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
+    """Make the run's folder, with the models that the run begins with, and those models if there are none.
+
+    Returns:
+        The configuration to run: of a new run, with the mode of its model sets.
 
     Raises:
         LaunchError: the folder holds another run.
+        BadModel: the folder of a resumed run lacks a model.
         TooLoose: the stated bound of a model set is above the accepted one.
         ValueError: the run adapts, and a model set is not of mode one-step.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
-    if config.filtered:
-        for name in config.robots:
-            robot = robot_maybe_with_task(name)
-            model = method_for(robot, config.method, config.model_config, config.accept_bound)
-            if config.adapt:
-                check_adaptable(model)
+    models: list[Model] = []
+    if config.filtered and resume:
+        models = models_of_resumed_run(config, folder)
+    elif config.filtered:
+        config, models = models_of_new_run(config, folder)
+    for model in models if config.adapt else ():
+        check_adaptable(model)
     folder.mkdir(parents=True, exist_ok=True)
+    return config
 
 
 class Launcher:

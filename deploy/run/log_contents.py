@@ -6,9 +6,9 @@ import json
 from importlib.metadata import version
 from pathlib import Path
 
-from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.run.mavlink_json import Derive, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig, encode
+from brakeline.deploy.run.run_models import model_in_run
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -17,8 +17,8 @@ from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import DDPC, load
 
 
-def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
-    """Return the metadata of the log: named groups of named texts."""
+def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
+    """Return the metadata of the log of the run in a folder: named groups of named texts."""
     run = {
         "method": config.method,
         "policy": config.policy or "learning",
@@ -38,7 +38,7 @@ def metadata(config: RunConfig) -> dict[str, dict[str, str]]:
     robots = [robot_maybe_with_task(name) for name in config.robots]
     groups["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
     for robot in robots if config.filtered else ():
-        model = load(method_path(robot, config.method, config.model_config))
+        model = load(model_in_run(config, folder, robot))
         groups[f"model {robot.name}"] = {"version": model.version, **model.about}
     return groups
 
@@ -49,7 +49,7 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
         return {}
     files = {}
     for name in config.robots:
-        model = load(method_path(robot_maybe_with_task(name), config.method, config.model_config))
+        model = load(model_in_run(config, folder, robot_maybe_with_task(name)))
         files[model_attachment_name(model.robot.name, model.version)] = model.encode()
         robot = robot_named(name).name
         archived = (folder / robot / "models").glob("*.safetensors")

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
-from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.errors import BadModel, Untrusted
+from brakeline.deploy.run.run_models import model_in_run
+from brakeline.errors import Untrusted
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import Model, load
 from brakeline.safety.model.model_set import ONE_STEP, ModelSet
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.server import archive_path
-from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, seal_of, write_signer
-
-log = logging.getLogger("brakeline.launcher")
+from brakeline.safety.service.signature import KEY, ModelSigner, seal_of, write_signer
 
 KEYS = "keys"  # folder in the run's folder
 OTHER_ROLES = ("launcher", "viewer", "client", "certify")  # that may join the bus, besides the run's processes
@@ -44,7 +41,7 @@ def sign_models(config: RunConfig, folder: Path, keys: Path) -> None:
         return
     signer = ModelSigner.load(keys)
     for name in config.robots if config.filtered else ():
-        model = load(method_path(robot_maybe_with_task(name), config.method, config.model_config))
+        model = load(model_in_run(config, folder, robot_maybe_with_task(name)))
         archived = archive_path(folder, model.robot.name, model.version)
         if not seal_of(archived).exists():
             signer.sign(model).save(archived)
@@ -68,25 +65,3 @@ def check_adaptable(model: Model) -> None:
             f"--adapt needs a model set of mode {ONE_STEP}, for {model.robot.name} another one is in use: give --mode "
             f"{ONE_STEP}, or certify with `brakeline certify --robot {model.robot.kind} --use`"
         )
-
-
-def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:
-    """Return the model that a service of this run used last, so that a restarted service uses it again.
-
-    Args:
-        trust: the accepted signers, on a bus with keys. The function skips models that others signed.
-
-    Returns:
-        The file; None if there is none.
-    """
-    versions = archive_path(folder, robot, "*")
-    newest = sorted(versions.parent.glob(versions.name), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-    for path in newest:
-        try:
-            if trust is not None:
-                trust.load_model(path)
-        except BadModel as error:
-            log.warning("model not used: %s", error)
-            continue
-        return path
-    return None

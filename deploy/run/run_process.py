@@ -41,24 +41,23 @@ def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettin
     robots = RecordedRobots(robot_maybe_with_task(name) for name in config.robots)
     derive = derive_entries(config.pictures, robots)
     files = attachments(config, folder)
-    settings = recorder.LogSettings(folder / LOG, metadata(config), files, derive, config.rotation)
+    settings = recorder.LogSettings(folder / LOG, metadata(config, folder), files, derive, config.rotation)
     recorder.main(bus, settings, spec.name)
     return False
 
 
 def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
-    from brakeline.deploy.data.data_paths import method_path
-    from brakeline.deploy.run.run_keys import KEYS, newest_model
+    from brakeline.deploy.run.run_keys import KEYS
+    from brakeline.deploy.run.run_models import model_in_run
     from brakeline.safety.service.server import SafetySettings, main
     from brakeline.safety.service.signature import TrustedSigners
 
     robots = [robot_maybe_with_task(robot) for robot in config.robots]
     limits = {robot.name: robot.accept_bound for robot in robots}
-    models = tuple(method_path(robot, config.method, config.model_config) for robot in robots)
     trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
-    newest = (newest_model(folder, robot.name, trust) or path for robot, path in zip(robots, models, strict=True))
+    models = tuple(model_in_run(config, folder, robot, trust) for robot in robots)
     accepted = config.accept_bound
-    main(SafetySettings(bus, tuple(newest), folder, spec.name, limits, accepted, secrets=folder / KEYS))
+    main(SafetySettings(bus, models, folder, spec.name, limits, accepted, secrets=folder / KEYS))
     return False
 
 

@@ -22,6 +22,7 @@ from brakeline.safety.model.tensor_file import pack, unpack
 Array = NDArray[np.float64]
 
 ENTRY = "dataset"
+RESTLESS = "restless"  # entry in `about`: the number of restless trajectories, which are the last ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +67,12 @@ class Dataset:
     @property
     def periods(self) -> int:
         return sum(len(t.inputs) for t in self.trajectories)
+
+    def steady(self) -> Dataset:
+        """Return the data set without the restless trajectories, which only mode one-step is fitted to."""
+        restless = int(self.about.get(RESTLESS, "0"))
+        about = {name: value for name, value in self.about.items() if name != RESTLESS}
+        return replace(self, trajectories=self.trajectories[: len(self.trajectories) - restless], about=about)
 
     def check(self) -> None:
         """Check shapes, finite values, the bounds of inputs, and that no position jumps.

@@ -11,7 +11,7 @@ from brakeline.safety.model.error_causes import REGIMES, regimes
 Array = NDArray[np.float64]
 
 START, RESTLESS = "first period of an episode", "restless inputs"
-JUMP = 0.5  # share of the largest change that range and slew allow; a change above it is a jump
+JUMP = 0.5  # share of the largest change that range and slew allow; a change that differs by more is a jump
 RESTLESS_SHARE = 0.3  # of a plan's periods with a jump
 
 
@@ -24,7 +24,8 @@ def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str,
         start (T, 2): trajectory and first period.
     """
     inputs = z[:, len(robot.regressor) :].reshape(len(z), -1, robot.action_dim)
-    changes = np.abs(np.diff(inputs, axis=1)) / np.minimum(robot.high() - robot.low(), np.asarray(robot.action_slew))
-    kinds = {START: start[:, 1] == 0, RESTLESS: (changes.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
+    changes = np.diff(inputs, axis=1) / np.minimum(robot.high() - robot.low(), np.asarray(robot.action_slew))
+    bends = np.abs(np.diff(changes, axis=1, prepend=0.0))  # a steady ramp changes its input but does not jump
+    kinds = {START: start[:, 1] == 0, RESTLESS: (bends.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
     driving = regimes(robot, z)
     return kinds | {name: driving == name for name in REGIMES}

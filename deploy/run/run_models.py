@@ -1,0 +1,112 @@
+"""Keep the models of a run in its folder, so that a resumed run goes on with them.
+
+The data folder holds the models in use, which `certify --use` replaces at any time. A run begins with copies of them,
+and its safety service adds each version that it is sent.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from brakeline.deploy.data.data_paths import method_path
+from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.progress import console
+from brakeline.deploy.run.run_config import RunConfig
+from brakeline.errors import BadModel
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.safety.methods import Model, load
+from brakeline.safety.model.model_config import AUTO
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.stated_bound import check_bound
+from brakeline.safety.service.server import archive_path
+from brakeline.safety.service.signature import TrustedSigners, seal_of
+
+log = logging.getLogger("brakeline.launcher")
+
+
+def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[Model]]:
+    """Copy the models in use to the folder of a new run; build those that are missing.
+
+    Returns:
+        The configuration, with the mode of the model sets in place of `AUTO` if it is the same for all; the models.
+
+    Raises:
+        TooLoose: the stated bound of a model set is above the accepted one.
+    """
+    models = []
+    for name in config.robots:
+        robot = robot_maybe_with_task(name)
+        model = method_for(robot, config.method, config.model_config, config.accept_bound)
+        source, kept = (
+            method_path(robot, config.method, config.model_config),
+            archive_path(folder, robot.name, model.version),
+        )
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        for path in (source, seal_of(source)):
+            if path.exists():
+                shutil.copyfile(path, kept.with_suffix(path.suffix))
+        models.append(model)
+    modes = {model.model_config.mode for model in models if isinstance(model, ModelSet)}
+    if config.model_config.mode == AUTO and len(modes) == 1:
+        config = replace(config, model_config=replace(config.model_config, mode=modes.pop()))
+    return config, models
+
+
+def models_of_resumed_run(config: RunConfig, folder: Path) -> list[Model]:
+    """Return the models that a run used last, and say if others are in use meanwhile.
+
+    Raises:
+        BadModel: a model is missing in the run's folder, or damaged.
+        TooLoose: the stated bound of a model set is above the accepted one.
+    """
+    models = []
+    for name in config.robots:
+        robot = robot_maybe_with_task(name)
+        kept, in_use = newest_model(folder, robot.name, None), method_path(robot, config.method, config.model_config)
+        if kept is None:
+            missing = archive_path(folder, robot.name, "*")
+            raise BadModel(f"{folder} can't be resumed: no model of {robot.name} in {missing.parent}. Start a new run")
+        model = load(kept)
+        check_bound(model, robot, config.accept_bound)
+        if not in_use.exists() or load(in_use).version != model.version:
+            console.print(
+                f"{robot.name}: the run goes on with its own model {model.version}, in {kept.parent}. {in_use} is "
+                "another one: start a new run to use it.",
+                markup=False,
+            )
+        models.append(model)
+    return models
+
+
+def model_in_run(config: RunConfig, folder: Path, robot: Robot, trust: TrustedSigners | None = None) -> Path:
+    """Return the model that a run used last; the one in use in the data folder if the run's folder has none.
+
+    trust: see `newest_model`.
+    """
+    return newest_model(folder, robot.name, trust) or method_path(robot, config.method, config.model_config)
+
+
+def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:
+    """Return the model that a service of this run used last, so that a restarted service uses it again.
+
+    Args:
+        trust: the accepted signers, on a bus with keys. The function skips models that others signed.
+
+    Returns:
+        The file; None if there is none.
+    """
+    versions = archive_path(folder, robot, "*")
+    newest = sorted(versions.parent.glob(versions.name), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+    for path in newest:
+        try:
+            if trust is not None:
+                trust.load_model(path)
+        except BadModel as error:
+            log.warning("model not used: %s", error)
+            continue
+        return path
+    return None

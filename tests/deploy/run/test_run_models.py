@@ -1,0 +1,78 @@
+"""A run begins with copies of the models in use, and goes on with them when it is resumed."""
+
+import json
+import os
+from dataclasses import replace
+
+import pytest
+
+from brakeline.deploy.data.data_paths import model_path
+from brakeline.deploy.run.launcher import prepare
+from brakeline.deploy.run.processes import CONFIG
+from brakeline.deploy.run.run_config import RunConfig, encode, load
+from brakeline.deploy.run.run_models import model_in_run
+from brakeline.errors import BadModel, TooLoose
+from brakeline.safety.model.model_config import AUTO, DIRECT, ONE_STEP
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from tests.robots import GROUND
+
+SHIPPED = ModelSet.load("ground")
+
+
+def use(mode: str, factor: float, age: float = 0.0) -> ModelSet:
+    """Put a model set of a mode to use, as old as asked. factor: on its bounds."""
+    first = SHIPPED.steps[0]
+    model = replace(SHIPPED, steps=(replace(first, w=factor * first.w), *SHIPPED.steps[1:]))
+    path = model_path(GROUND, ModelConfig(mode=mode))
+    model.save(path)
+    os.utime(path, (1e9 - age, 1e9 - age))
+    return model
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    return tmp_path / "run"
+
+
+def begun(folder):
+    """Return the configuration with which a run in a folder begins, as saved."""
+    config = prepare(RunConfig(), folder, resume=False)
+    (folder / CONFIG).write_text(encode(config))
+    return load(folder / CONFIG)
+
+
+def test_a_run_pins_the_mode_and_the_model_set_that_it_begins_with(folder, capsys):
+    assert RunConfig().model_config.mode == AUTO
+    first = use(DIRECT, 1.0)
+    config = begun(folder)
+    assert config.model_config.mode == DIRECT
+    assert json.loads((folder / CONFIG).read_text())["model_config"]["mode"] == DIRECT
+    second = use(ONE_STEP, 1.1, age=-10.0)
+    assert model_path(GROUND, ModelConfig(mode=AUTO)) == model_path(GROUND, ModelConfig(mode=ONE_STEP)), "the newer one"
+    third = use(DIRECT, 1.2)
+    assert len({model.version for model in (first, second, third)}) == 3
+    capsys.readouterr()
+    resumed = prepare(config, folder, resume=True)
+    said = " ".join(capsys.readouterr().err.split())
+    assert resumed == config
+    assert f"goes on with its own model {first.version}" in said and "start a new run to use it" in said
+    assert ModelSet.load(model_in_run(config, folder, GROUND)).version == first.version
+
+
+def test_a_resumed_run_says_nothing_if_its_model_set_is_still_in_use(folder, capsys):
+    use(DIRECT, 1.0)
+    config = begun(folder)
+    capsys.readouterr()
+    prepare(config, folder, resume=True)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_whose_model_set_is_lost_or_too_loose_is_not_resumed(folder):
+    use(DIRECT, 1.0)
+    config = begun(folder)
+    with pytest.raises(TooLoose):
+        prepare(replace(config, accept_bound=1e-6), folder, resume=True)
+    model_in_run(config, folder, GROUND).unlink()
+    with pytest.raises(BadModel, match=r"can't be resumed: no model of ground.*Start a new run"):
+        prepare(config, folder, resume=True)
