@@ -197,7 +197,7 @@ class ActorRunner:
             proposal = self.proposer.propose(runner.observation, runner.info)
             if not np.isfinite(proposal).all():
                 log.error("the policy with weights %d proposes %s", self.proposer.version, proposal)
-            self.proposal = self.practice.proposal(runner, proposal)
+            self.proposal = self.practice.proposal(runner, runner.slow_down.proposal(proposal))
         return self.proposal
 
     def settle(self, outcome: DecisionOutcome) -> DecisionOutcome:

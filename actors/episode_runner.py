@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask, DecisionOutcome, at_rest, next_input, request_decisions
+from brakeline.actors.slow_down import SlowDown
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.task import RobotWithTask
@@ -106,6 +107,7 @@ class EpisodeRunner:
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
         self.backup_plan = BackupPlan(robot)
+        self.slow_down = SlowDown(robot, identity.actor)
         self._memory = memory_of(robot)
         self.index = 0  # steps recorded so far, over all episodes
         self.running = False  # whether an episode is running
@@ -139,7 +141,7 @@ class EpisodeRunner:
 
     def request(self, proposal: Array) -> pb.Request:
         """Return the request about a proposal (m,) in the current state."""
-        return request_message(
+        message = request_message(
             self.backup_plan,
             self.info["state"],
             proposal,
@@ -153,6 +155,8 @@ class EpisodeRunner:
             observation=self.observation.tolist(),
             fleet=self.fleet,
         )
+        message.slow = self.slow_down.share
+        return message
 
     def decide(self, proposal: Array, ask: Ask | None) -> DecisionOutcome | None:
         """Ask for a decision on a proposal (m,). Return None if there is no filter (`ask` is None)."""
@@ -172,7 +176,10 @@ class EpisodeRunner:
         if outcome is None:
             proposal = proposal if np.isfinite(proposal).all() else self.robot.zero_input()
             return np.asarray(np.clip(proposal, self.robot.low(), self.robot.high()))
-        return next_input(self.backup_plan, outcome)
+        action = next_input(self.backup_plan, outcome)
+        if outcome.answer is not None:
+            self.slow_down.update(self.backup_plan.widening.left, outcome.answer.bound)
+        return action
 
     def may_wait(self, outcome: DecisionOutcome) -> bool:
         """Return whether the robot stands and got no answer: it can then ask again before the episode goes on."""
@@ -357,7 +364,7 @@ def run_episode(
     group.begin(episode)
     while group.running:
         proposals = [
-            np.asarray(policy(runner.observation, runner.info), dtype=float)
+            runner.slow_down.proposal(np.asarray(policy(runner.observation, runner.info), dtype=float))
             if runner.running
             else runner.robot.zero_input()
             for runner, policy in zip(group.runners, policies, strict=True)

@@ -18,11 +18,12 @@ from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import Evaluation, in_process, prepare_evaluation
 from brakeline.deploy.progress import under_way
+from brakeline.messaging.obstacle import Array
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_config import ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.sim.scripted_policies import Array, Observation, Policy
+from brakeline.sim.scripted_policies import Observation, Policy
 
 ROBOTS = ("ground", "quadrotor")
 PLANS = 2500  # of each group

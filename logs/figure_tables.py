@@ -16,7 +16,11 @@ from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.logs.tube_stats import stated
 
 BLOCKS = "▁▂▃▄▅▆▇█"
-SETS = {"outside the sets": "beyond", "widening": "widening", "half-width [m]": "half_width"}  # rows of a curve's bins
+# Rows of a curve's bins.
+SETS = {
+    **{"outside the sets": "beyond", "widening": "widening", "half-width [m]": "half_width"},
+    "slowed down": "slowed",
+}
 
 
 def analyse(paths: Paths) -> Figures:
@@ -141,6 +145,8 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
     if plans.get("scored"):
         wide = f"{_share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
         yield "windows outside the stated sets", f"{_share(plans['beyond'], plans['scored'])}; {wide}"
+    if plans.get("slowed"):
+        yield "slowed down", f"{_share(plans['slowed'], figures['steps'])} of the steps, {plans['slow_downs']} times"
     for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):
         if figures.get(name):
             yield f"[red]{label}[/]", str(figures[name])

@@ -41,13 +41,17 @@ class Bin(Counter[str]):
         self.half_width += other.half_width
 
     def sets(self) -> Figures:
-        """Return how much of their sets the windows in the bin used, and how wide the tubes were; None: no window."""
+        """Return how much of their sets the windows in the bin used, and how wide the tubes were.
+
+        None: no window; of `slowed`, no limited proposal (`brakeline.actors.slow_down`).
+        """
         scored, tubes = self["scored"], self["tubes"]
         return {
             "beyond": self["beyond"] / scored if scored else None,
             "beyond_widened": self["beyond_widened"] / scored if scored else None,
             "widening": self.widening if scored else None,
             "half_width": self.half_width / tubes if tubes and scored else None,
+            "slowed": self["slowed"] / scored if self["slowed"] else None,
         }
 
 
@@ -116,6 +120,7 @@ class LearningCurve:
             now["beyond"] += not decision.score <= 1.0
             now["beyond_widened"] += not decision.score <= widening
             now.widening = max(now.widening, widening)
+            now["slowed"] += exchange.request.slow > 0.0
         if decision.tube_half_width:
             now["tubes"] += 1
             now.half_width += max(decision.tube_half_width)

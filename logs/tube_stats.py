@@ -38,6 +38,8 @@ class TubeStats:
         scored: number of windows of a plan's length that the filter scored, whatever the plans were.
         beyond, beyond_widened: how many of them left the stated sets, and the sets as widened at their end.
         widening: largest widening of a request.
+        slowed: number of requests whose proposals were limited (`brakeline.actors.slow_down`).
+        slow_downs: how often that began.
     """
 
     robots: RecordedRobots = field(default_factory=RecordedRobots)
@@ -49,6 +51,9 @@ class TubeStats:
     beyond: int = 0
     beyond_widened: int = 0
     widening: float = 1.0
+    slowed: int = 0
+    slow_downs: int = 0
+    _slow: bool = False  # whether the last request's proposal was limited
     _own: pb.Exchange | None = None  # latest exchange whose own proposal was verified
     _tube: tuple[Array, Array] | None = None  # centers and half-widths (N, d), once the actor follows the plan
     _periods: int = 0  # since `_own`
@@ -58,6 +63,10 @@ class TubeStats:
         """Add the actor's next exchange."""
         decision = exchange.reply.decision
         self.widening = max(self.widening, exchange.request.widening)
+        slow = exchange.request.slow > 0.0
+        self.slowed += slow
+        self.slow_downs += slow and not self._slow
+        self._slow = slow
         if decision.HasField("score"):
             self.scored += 1
             self.beyond += not decision.score <= 1.0
@@ -137,6 +146,8 @@ def figures(parts: Iterable[TubeStats]) -> Figures:
         "beyond": sum(part.beyond for part in every),
         "beyond_widened": sum(part.beyond_widened for part in every),
         "widening": max((part.widening for part in every), default=1.0),
+        "slowed": sum(part.slowed for part in every),
+        "slow_downs": sum(part.slow_downs for part in every),
     }
 
 

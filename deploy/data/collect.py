@@ -20,7 +20,7 @@ ORIGIN = "collect"
 
 
 def record(
-    robot: RobotWithTask, trajectories: int, restless: int, seed: int, conditions: Conditions, first: int = 0
+    robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0, restless: int = 0
 ) -> Iterator[Trajectory]:
     """Yield trajectories from the robot's simulator, and after them `restless` short ones of restless driving.
 
@@ -46,13 +46,15 @@ def record(
         yield built.trajectory()
 
 
-def dataset(robot: Robot, trajectories: list[Trajectory], about: dict[str, str]) -> Dataset:
-    """Return the trajectories as a checked data set; about: its `origin`."""
-    data = Dataset(robot, tuple(trajectories), about)
+def dataset(
+    robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions, restless: int = 0
+) -> Dataset:
+    """Return the trajectories as a checked data set, with its origin in `about`."""
+    data = Dataset(robot, tuple(trajectories), origin(seed, conditions, restless))
     data.check()
     return data
 
 
-def origin(seed: int, conditions: Conditions, restless: int) -> dict[str, str]:
-    """Return the `about` entries of a recording: conditions, seed, origin, number of restless trajectories."""
+def origin(seed: int, conditions: Conditions, restless: int = 0) -> dict[str, str]:
+    """Return the `about` entries of a recording: conditions, seed, origin, and how many trajectories are restless."""
     return conditions.describe() | {"seed": str(seed), "origin": ORIGIN, RESTLESS: str(restless)}

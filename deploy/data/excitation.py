@@ -86,7 +86,7 @@ def _bounds(robot: Robot, rng: np.random.Generator) -> Array:
 
 def _across(robot: Robot) -> int:
     """Return the periods that an input takes from bound to bound."""
-    return math.ceil(((robot.high() - robot.low()) / np.asarray(robot.action_slew)).max())
+    return math.ceil(float(((robot.high() - robot.low()) / np.asarray(robot.action_slew)).max()))
 
 
 def manoeuvre(

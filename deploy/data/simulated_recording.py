@@ -53,30 +53,30 @@ def load_or_record(
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     restless = math.ceil(RESTLESS_SHARE * trajectories)
-    about, total = collect.origin(seed, conditions, restless), trajectories + restless
-    driven = _load_partial(part, robot, about)
+    total = trajectories + restless
+    driven = _load_partial(part, robot, collect.origin(seed, conditions, restless))
     before = f"{len(driven)} of them recorded before" if driven else _duration(PACE * trajectories)
     console.print(
         f"recording {robot.name} once, into {path}: {total} trajectories, {before}. You can interrupt it: the "
         "next call continues.",
         markup=False,
     )
-    rest = collect.record(robot, trajectories, restless, seed, conditions, len(driven))
+    rest = collect.record(robot, trajectories, seed, conditions, len(driven), restless)
     saved = time.monotonic()
     try:
         for trajectory in each(rest, f"recording {robot.name}", total, len(driven)):
             driven.append(trajectory)
             if time.monotonic() - saved > SAVE_EVERY:
-                collect.dataset(robot, driven, about).save(part)
+                collect.dataset(robot, driven, seed, conditions, restless).save(part)
                 saved = time.monotonic()
     except KeyboardInterrupt:
         if driven:
-            collect.dataset(robot, driven, about).save(part)
+            collect.dataset(robot, driven, seed, conditions, restless).save(part)
             console.print(
                 f"[yellow]kept {len(driven)} of {total} trajectories[/]: run the same command again to continue"
             )
         raise
-    data = collect.dataset(robot, driven, about)
+    data = collect.dataset(robot, driven, seed, conditions, restless)
     _check_replaceable(path, robot)  # an import may have written the file in the meantime
     data.save(path)
     part.unlink(missing_ok=True)

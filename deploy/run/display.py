@@ -114,6 +114,8 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     if plans["scored"]:
         widest = f"{plans['widening']:.3g} times"
         rows.append(("windows outside sets", share(plans["beyond"], plans["scored"]), "widened by up to", widest))
+    if plans["slowed"]:
+        rows.append(("slowed down", share(plans["slowed"], steps), "began", f"{plans['slow_downs']} times"))
     notes = {name: note for process in figures["processes"].values() for name, note in process["notes"].items()}
     rows += [("new model set", escape(notes[name]), "", "") for name in sorted(notes) if name.startswith("adaptation ")]
     decide, reply = (

@@ -11,6 +11,7 @@ const CURVES = [
   { title: "windows outside their sets", unit: "share, without widening", of: "bins", value: (b) => b.beyond, form: percents, low: 0, weight: "steps" },
   { title: "widening of the sets", unit: "largest factor in a bin", of: "bins", value: (b) => b.widening, form: figure },
   { title: "half-width of a tube", unit: "cm, largest axis", of: "bins", value: (b) => b.half_width === null ? null : 100 * b.half_width, form: figure, low: 0 },
+  { title: "slowed down", unit: "share of steps", of: "bins", value: (b) => b.slowed, form: percents, low: 0, weight: "steps" },
   { title: "critic loss", unit: "from the learner", of: "learner", value: (b) => b.critic_loss, form: figure },
   { title: "mean Q", unit: "discounted reward", of: "learner", value: (b) => b.mean_q, form: figure },
 ];

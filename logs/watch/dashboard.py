@@ -32,7 +32,8 @@ SETUP = ("run", "method", "arena", "seed", "steps")  # the launcher's notes abou
 
 
 NO_DECISION: dict[str, Any] = {
-    "tube": [], "margin": None, "at_least": False, "said": "", "trust": "", "inputs": [], "arrows": [], "edge": []
+    "tube": [], "margin": None, "at_least": False, "said": "", "trust": "", "inputs": [], "arrows": [], "edge": [],
+    "slow": 0.0,
 }  # fmt: skip
 
 
@@ -97,6 +98,7 @@ class RobotPanel:
             "margin": decision.margin,
             "at_least": decision.at_least,
             "around": view.perceived_json(),
+            "slow": exchange.request.slow,
         }
         self.fleet = list(exchange.request.fleet)
         self.reservation = boxes_from_above(reserved_boxes(self.robot, exchange))

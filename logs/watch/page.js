@@ -51,6 +51,7 @@ function drawRobot(robot) {
   episode.textContent = `episode ${robot.number}`;
   const words = [robot.kind || "no filter", `reward ${number(robot.reward, 1)}`, `${robot.marks.length} interventions`];
   if (robot.margin !== null) words.push(`margin ${robot.at_least ? "> " : ""}${number(100 * robot.margin, 1)} cm`);
+  if (robot.slow) words.push(`slowed down to ${number(100 * robot.slow)} % of its inputs: more plans left their tubes than stated`);
   if (robot.height !== null) words.push(`height ${number(robot.height, 1)} m`);
   if (robot.ended) words.push(`last episode: ${robot.ended}`);
   status.textContent = words.join(" · ");

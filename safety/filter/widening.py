@@ -18,6 +18,7 @@ from brakeline.messaging.robot import Robot
 Array = NDArray[np.float64]
 
 WINDOWS = 600  # last windows whose scores count
+PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets
 MOST = 1e3  # beyond it nothing is verified anyway, and a request needs a finite factor
 RESERVE = 1.1  # factor on the largest score
 
@@ -36,22 +37,32 @@ class PastWindow:
 
 
 class Widening:
-    """The last measured states and executed inputs of one robot, and the factor that follows from their scores."""
+    """The last measured states and executed inputs of one robot, and the factor that follows from their scores.
+
+    Attributes:
+        left: of the last `PLANS` windows that do not overlap, whether each left its sets as they were widened.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.forget()
         self.interrupt()
+        self.forget()
 
     def forget(self) -> None:
         """Drop all scores: another model set is in use."""
         self._scores: deque[tuple[int, float]] = deque()  # falling scores, each the largest since the one before it
         self._count = 0
+        self.left: deque[bool] = deque(maxlen=PLANS)
+        self._uncounted = 0  # periods since the last window in `left` ended
+        self._asked = 1.0  # the factor of the last request
+        self._factors.extend(1.0 for _ in range(len(self._factors)))
 
     def interrupt(self) -> None:
         """Begin a new window: an episode has ended, or a period had no measurement. The scores stay."""
         self._states: deque[Array] = deque(maxlen=self.robot.horizon)
         self._inputs: deque[Array] = deque(maxlen=self.robot.horizon + 1)
+        self._factors: deque[float] = deque(maxlen=self.robot.horizon)  # of the requests at the periods' starts
+        self._uncounted = 0
 
     def executed(self, state: Array, before: Array, action: Array) -> None:
         """Add a period: the measured state (n,) at its start, the input before it and its own input (m,)."""
@@ -59,6 +70,9 @@ class Widening:
             self._inputs.append(before.copy())
         self._states.append(state.copy())
         self._inputs.append(action.copy())
+        self._factors.append(self._asked)
+        self._asked = self.factor
+        self._uncounted += 1
 
     @property
     def past(self) -> PastWindow | None:
@@ -70,6 +84,9 @@ class Widening:
     def judge(self, score: float) -> None:
         """Add the score of a window that has ended. A score that is no number counts as infinite."""
         score = score if score == score else np.inf
+        if self._factors and self._uncounted >= self.robot.horizon:
+            self.left.append(score > self._factors[0])
+            self._uncounted = 0
         self._count += 1
         while self._scores and self._scores[-1][1] <= score:
             self._scores.pop()

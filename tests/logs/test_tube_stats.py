@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from brakeline.logs.episode_stats import closed_loop
 from brakeline.logs.figure_tables import show
+from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.tube_stats import TubeStats, figures, stated
 from brakeline.messaging import brakeline_pb2 as pb
@@ -97,7 +98,7 @@ def test_malformed_exchanges_raise_no_error(data):
     assert plans.outside <= plans.flown
 
 
-NOT_SCORED = {"scored": 0, "beyond": 0, "beyond_widened": 0, "widening": 1.0}
+NOT_SCORED = {"scored": 0, "beyond": 0, "beyond_widened": 0, "widening": 1.0, "slowed": 0, "slow_downs": 0}
 
 
 def test_plans_are_among_the_figures_of_a_run():
@@ -142,3 +143,18 @@ def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_w
 def test_the_table_of_a_run_shows_both():
     shown = printed(show(closed_loop([]) | {"plans": left(0.26)}))
     assert "1, left their tube: 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown
+
+
+def test_steps_whose_proposal_was_limited_are_counted_and_told():
+    exchanges = [asked(k, pb.ALLOWED) for k in range(6)]
+    for exchange, slow in zip(exchanges, (0.0, 0.5, 0.5, 0.0, 0.0, 0.5), strict=True):
+        exchange.request.slow, exchange.reply.decision.score = slow, 0.5
+    found = figures([of(*exchanges)])
+    assert (found["slowed"], found["slow_downs"]) == (3, 2)
+    shown = printed(show(closed_loop([]) | {"plans": found, "steps": 6}))
+    assert "slowed down" in shown and "3 (50.0%) of the steps, 2 times" in shown
+    curve = LearningCurve()
+    for exchange in exchanges:
+        curve.exchange(exchange)
+    curve.step(pb.Step(actor="a"))
+    assert curve.figures()["bins"][0]["slowed"] == 0.5

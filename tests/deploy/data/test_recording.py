@@ -85,7 +85,7 @@ def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_
     restless = data.trajectories[len(steady.trajectories) :]
     assert len(restless) == (len(steady.trajectories) + 1) // 2 == int(data.about["restless"])
     assert {len(t.inputs) for t in restless} == {60}
-    first = next(collect.record(GROUND, 1, 0, simulated_recording.SEED, Conditions()))
+    first = next(collect.record(GROUND, 1, simulated_recording.SEED, Conditions()))
     assert (first.states == steady.trajectories[0].states).all()
     assert "restless" not in steady.about
     assert certify(data, ModelConfig())[0].version == certify(steady, ModelConfig())[0].version
@@ -209,7 +209,7 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys
     assert not data_paths.record_path(GROUND).exists()
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 2 of 6" in told
     whole = simulated_recording.load_or_record(GROUND, trajectories=4)
-    assert elsewhere[-1][-1] == 2, "only what was missing is driven"
+    assert elsewhere[-1][4] == 2, "only what was missing is driven"
     assert {path.name for path in data_paths.record_path(GROUND).parent.iterdir()} == {"record.safetensors", LOCK}
     again = data_paths.record_path(GROUND).with_name("fresh.safetensors")
     fresh = simulated_recording.load_or_record(GROUND, again, trajectories=4)
