@@ -15,6 +15,7 @@ class PhysicsChange:
     after: int = -1  # steps until the change; -1: never
     payload_kg: float | None = None
     floor_friction: float | None = None
+    weak_motor: float | None = None  # share of its force that one motor still has, in (0, 1]
     wind_speed: float | None = None  # m/s
     gust: float | None = None  # m/s
 

@@ -17,6 +17,7 @@ from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle, clip_input
+from brakeline.sim.weak_motor import WeakMotor
 
 GROUND = robot_named("ground")
 MODEL = Path(__file__).with_name("ground.xml").read_text()
@@ -52,12 +53,18 @@ class TurtleBot(SimulatedVehicle):
         self.arena, self._model = arena, model
         self._base = model.body(f"{prefix(number)}base").id
         self._bare_mass, self._bare_inertia = float(model.body_mass[self._base]), model.body_inertia[self._base].copy()
+        self._left_motor = WeakMotor(model, u)
         self._wheel_geoms = [model.geom(f"{prefix(number)}{side} wheel").id for side in ("left", "right")]
         self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
         self._ctrl = data.ctrl[u : u + GROUND.action_dim]
 
     def setters(self) -> dict[str, Callable[[float], None]]:
-        return {"payload_kg": self.set_payload, "floor_friction": self.set_friction}
+        """Return what `alter` can change: a payload, the floor, and the force of the left wheel's motor."""
+        return {
+            "payload_kg": self.set_payload,
+            "floor_friction": self.set_friction,
+            "weak_motor": self._left_motor.set,
+        }
 
     def set_payload(self, kg: float) -> None:
         """Add a payload [kg] to the bare robot, at its centre of mass."""

@@ -20,6 +20,7 @@ from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorN
 from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
 from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
+from brakeline.sim.weak_motor import WeakMotor
 from brakeline.sim.wind import Wind, WindProcess
 
 QUADROTOR = robot_named("quadrotor")
@@ -62,6 +63,7 @@ class Quadrotor(SimulatedVehicle):
         self.arena = arena
         self._model = _build(arena, floor)
         self._data = mujoco.MjData(self._model)
+        self._first_rotor = WeakMotor(self._model, 0)
         self.timestep: float = self._model.opt.timestep
         self._steps_per_sample = round(QUADROTOR.period / SAMPLES / self.timestep)
         self.controller = FlightController(self.timestep, OUTER_EVERY)
@@ -115,9 +117,14 @@ class Quadrotor(SimulatedVehicle):
         return self._report(self.collided, np.array(self._path), path, 0.0, *self._movers.contacts)
 
     def setters(self) -> dict[str, Callable[[float], None]]:
-        """Return what `alter` can change: a payload at the centre of mass, and the wind [m/s]."""
+        """Return what `alter` can change: a payload at the centre of mass, the wind [m/s], and one rotor's thrust."""
         speed, gust = partial(self._set_wind, "speed"), partial(self._set_wind, "gust")
-        return {"payload_kg": self._set_payload, "wind_speed": speed, "gust": gust}
+        return {
+            "payload_kg": self._set_payload,
+            "weak_motor": self._first_rotor.set,
+            "wind_speed": speed,
+            "gust": gust,
+        }
 
     def _set_payload(self, kg: float) -> None:
         self._model.body_mass[self._model.body("base").id] = self._body.mass + kg

@@ -104,13 +104,25 @@ def test_payload_and_friction_change_the_motion_during_a_run() -> None:
     assert moved(robot(payload_kg=2.0), 0.25, 0.0) < 0.85 * moved(robot(), 0.25, 0.0)
 
 
+def test_a_weak_motor_turns_the_robot_aside_as_it_speeds_up_until_it_is_whole_again() -> None:
+    vehicle, turned = robot(), []
+    for share in (1.0, 0.3, 1.0):
+        vehicle.alter(weak_motor=share)
+        before = vehicle.true[2]
+        drive(vehicle, 0.25, 0.0)
+        turned.append(abs(vehicle.true[2] - before))
+        drive(vehicle, 0.0, 0.0, 3)
+    whole, weak, again = turned
+    assert weak > 0.02 and max(whole, again) < 1e-3
+
+
 @pytest.mark.parametrize("bad", [[0.1], [0.1, math.nan], [math.inf, 0.0], [0.1, 0.0, 0.0]])
 def test_an_input_that_is_not_two_finite_numbers_is_refused(bad: list[float]) -> None:
     with pytest.raises(BadInput):
         robot().step(np.array(bad))
 
 
-@pytest.mark.parametrize("change", [{"payload_kg": -1.0}, {"floor_friction": 0.0}, {"wings": 2.0}])
+@pytest.mark.parametrize("change", [{"payload_kg": -1.0}, {"floor_friction": 0.0}, {"weak_motor": 1.1}, {"wings": 2.0}])
 def test_an_impossible_change_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(change))):
         robot().alter(**change)

@@ -161,6 +161,8 @@ def test_payload_and_wind_can_change_and_invalid_changes_are_refused() -> None:
     vehicle = quadrotor()
     vehicle.alter(payload_kg=0.2, wind_speed=3.0)
     assert np.abs(fly(vehicle, (0, 0, 0), 40)[-1][:3] - [0, 0, 500]).max() < 1.0
+    vehicle.alter(payload_kg=0.0, wind_speed=0.0, weak_motor=0.9)
+    assert np.abs(fly(vehicle, (0, 0, 0), 40)[-1][3:6]).max() < 0.5
     with pytest.raises(ValueError, match="floor_friction"):
         vehicle.alter(floor_friction=0.5)
     with pytest.raises(ValueError, match="0 or more"):
