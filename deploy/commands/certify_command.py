@@ -54,6 +54,9 @@ class CertifyCommand:
     few: bool = False
     """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled by 1.5
     instead of 1.15, as after `collect --url`."""
+    outside: float = ModelConfig.outside
+    """Share of the recorded plans that may leave their sets in mode one-step. More makes the sets narrower and the stated
+    bound larger."""
     until_held: bool = False
     """Widen each envelope until no held-out plan leaves its set, and no further."""
     robot: str = "ground"
@@ -83,7 +86,7 @@ class CertifyCommand:
             for kind, mode in forms:
                 advance(0, f"certifying {kind}, {mode}")
                 try:
-                    config = ModelConfig(kind, mode)
+                    config = ModelConfig(kind, mode, outside=self.outside)
                     config = config.of_minutes() if self.few else config
                     model, report, unsupported = certify_supported(data, config, self.windows, self.until_held)
                 except Unsupported as error:
@@ -166,7 +169,8 @@ class CertifyCommand:
                 raise ValueError(f"no data set at {self.data}: `brakeline collect {self.robot} --out FILE` records one")
             path, data = self.data, Dataset.load(self.data)
             if robot.kind == data.robot.kind:  # today's description sets the limit, not the one that was recorded
-                data = replace(data, robot=replace(data.robot, accept_bound=robot.accept_bound))
+                recorded = data.robot.in_lockstep().in_real_time() if robot.late else data.robot
+                data = replace(data, robot=replace(recorded, accept_bound=robot.accept_bound))
         else:
             return self.data, *from_log(self.data, robot, self.last)
         return path, data, f"{data.periods} recorded periods of {data.robot.name}"

@@ -17,6 +17,7 @@ PLAN, FREE = "plan", "free"
 WINDOWS = (PLAN, FREE)
 DDPC, SECAS, SAILR = "ddpc", "secas", "sailr"
 METHODS = (DDPC, SECAS, SAILR)  # of a safety service
+MOST_OUTSIDE = 0.1  # of the windows: sets that more leave promise nothing
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class ModelConfig:
     seed: int = 0  # for the recursion's random heading offsets
     windows: str = PLAN  # PLAN, or FREE for recorded driving that follows no plan
     fewest: int = 200  # least number of windows of each length
+    outside: float = 0.001  # share of the windows that may leave the sets of mode ONE_STEP, in every kind of driving
 
     def __post_init__(self) -> None:
         if self.certificate not in KINDS:
@@ -39,6 +41,8 @@ class ModelConfig:
             raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < math.inf:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
+        if not 0.0 < self.outside <= MOST_OUTSIDE:
+            raise ValueError(f"a share of {self.outside:g} of the windows outside is not between 0 and {MOST_OUTSIDE:g}")
 
     def of_minutes(self) -> ModelConfig:
         """Return these settings for minutes of driving instead of hours: fewer windows, envelopes scaled by 1.5."""

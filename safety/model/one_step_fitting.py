@@ -35,7 +35,6 @@ SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor l
 MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameters
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
-OUTSIDE = 0.001  # share of the windows that may be outside, in every kind of driving
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
@@ -318,10 +317,10 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
     s = samples_of(data)
     chosen, candidates, regression = choose(robot, s)
-    weight = _weight(robot, s, regression, chosen.ridge)
+    weight = _weight(robot, s, regression, chosen.ridge, model_config.outside)
     scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight)
     kinds = driving_kinds(robot, s.z, s.start)
-    factor, first = _factor(scores, kinds), _factor(others, kinds)
+    factor, first = (_factor(each, kinds, model_config.outside) for each in (scores, others))
     if not robot.position_dim:  # the limited coordinates are scored with the plan
         first = max(factor, first)
     one_step = regression.fit(chosen.ridge, weight=weight)
@@ -348,16 +347,16 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     return model, Calibration(chosen, tuple(candidates), factor, *relative, s, *regression.quality())
 
 
-def _factor(scores: Array, kinds: dict[str, NDArray[np.bool_]]) -> float:
-    """Return the least factor that leaves at most a share `OUTSIDE` of the windows of every kind outside, at least 1.
+def _factor(scores: Array, kinds: dict[str, NDArray[np.bool_]], outside: float) -> float:
+    """Return the least factor that leaves at most a share `outside` of the windows of every kind outside, at least 1.
 
-    This is the ⌈(n + 1)(1 - OUTSIDE)⌉-th score of n windows, and the largest one if they are few (docs/method.md §14).
+    This is the ⌈(n + 1)(1 - outside)⌉-th score of n windows, and the largest one if they are few (docs/method.md §14).
     """
     found = [1.0]
     for kind in (np.ones(len(scores), dtype=bool), *kinds.values()):
         ordered = np.sort(scores[kind])
         if len(ordered):
-            found.append(float(ordered[min(math.ceil((len(ordered) + 1) * (1.0 - OUTSIDE)), len(ordered)) - 1]))
+            found.append(float(ordered[min(math.ceil((len(ordered) + 1) * (1.0 - outside)), len(ordered)) - 1]))
     return max(found)
 
 
@@ -397,7 +396,7 @@ def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
     return shape
 
 
-def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> float:
+def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float, outside: float) -> float:
     """Return the largest weight of the leverage with which the last sets of plans are nearly as narrow as with any.
 
     Without it, one factor widens all sets because some windows at the edge of the data are predicted badly, and sets
@@ -417,7 +416,7 @@ def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float) -> 
             scores[held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
             wide = shape.widths(robot, plans, last=True)[:, 0] * one_step.stretches(robot, plans)[:, -1:]
             width += float(wide.mean())
-        found[weight] = max(float(np.quantile(scores, 1.0 - OUTSIDE)), 1.0) * width
+        found[weight] = max(float(np.quantile(scores, 1.0 - outside)), 1.0) * width
     return max(weight for weight, width in found.items() if width <= SIMPLER * min(found.values()))
 
 

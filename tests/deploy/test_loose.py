@@ -69,6 +69,19 @@ def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
     assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{certified['residual']['bound_plan']:.6g}"
 
 
+def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(few, capsys):
+    words = ("certify", few / "ground" / "record.safetensors", "--robot", "ground-late", "--accept-bound", "0.5")
+    found = [
+        json.loads(run(capsys, *words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
+        for outside in ("0.001", "0.05")
+    ]
+    assert ModelSet.load(few / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
+    assert found[1]["inflation"] < found[0]["inflation"] and found[1]["half_width_rest"] < found[0]["half_width_rest"]
+    assert found[1]["bound_plan"] > found[0]["bound_plan"] and found[1]["marginal"] > found[0]["marginal"]
+    status, _, err = run(capsys, *words, "--outside", "0.5")
+    assert status == 1 and "between 0 and 0.1" in err
+
+
 @pytest.mark.parametrize(
     "words",
     [
