@@ -55,8 +55,8 @@ class CertifyCommand:
     """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled by 1.5
     instead of 1.15, as after `collect --url`."""
     outside: float = ModelConfig.outside
-    """Share of the recorded plans that may leave their sets in mode one-step. More makes the sets narrower and the stated
-    bound larger."""
+    """Share of the recorded plans that may leave their sets in mode one-step. A larger share makes the sets narrower
+    and the stated bound larger."""
     until_held: bool = False
     """Widen each envelope until no held-out plan leaves its set, and no further."""
     robot: str = "ground"

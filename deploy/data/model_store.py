@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 M = TypeVar("M")
 
 
-def model_for(robot: Robot, model_config: ModelConfig, accept_bound: float | None = None) -> ModelSet:
+def model_for(
+    robot: Robot, model_config: ModelConfig, accept_bound: float | None = None, build: bool = True
+) -> ModelSet:
     """Load the model set in use. If the file is missing or of another layout, record data and certify first.
 
     Args:
@@ -39,15 +41,21 @@ def model_for(robot: Robot, model_config: ModelConfig, accept_bound: float | Non
         model_config: error bound and mode.
         accept_bound: largest accepted bound on the share of plans that leave their tubes, in [0, 1]. Defaults to the
             limit in the robot's description.
+        build: False for a vehicle that is not simulated here. Data from the simulator say nothing about it, so
+            there must be a model set.
 
     Raises:
+        BadModel: there is no model set for this description, and `build` is False.
         TooLoose: the model set states a larger bound, or none.
         ValueError: `accept_bound` is not in [0, 1].
     """
     accepted_bound(robot, accept_bound)
     path = model_path(robot, model_config)
-    build = partial(_build_model_set, path, robot, model_config)
-    model = _load_or_build(path, partial(_load_model_set, path, robot), build, "building the model set")
+    if build:
+        make = partial(_build_model_set, path, robot, model_config)
+        model = _load_or_build(path, partial(_load_model_set, path, robot), make, "building the model set")
+    else:
+        model = _existing(path, robot)
     check_bound(model, robot, accept_bound)
     limit = robot.accept_bound  # of today's description, not of the description at certification
     return replace(model, robot=replace(model.robot, accept_bound=limit))
@@ -74,6 +82,16 @@ def _load_model_set(path: Path, robot: Robot) -> ModelSet:
     return model
 
 
+def _existing(path: Path, robot: Robot) -> ModelSet:
+    try:
+        return _load_model_set(path, robot)
+    except BadModel as error:
+        raise BadModel(
+            f"there is no model set of this vehicle: {error}. `brakeline collect {robot.kind} --url URL` flies it for "
+            f"the first time; `brakeline certify DATA --robot {robot.name} --use` puts a model set of its data to use"
+        ) from error
+
+
 def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
     from brakeline.deploy.data.certification import certify
     from brakeline.deploy.data.simulated_recording import data_for, load_or_record
@@ -97,17 +115,20 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
     return model
 
 
-def method_for(robot: Robot, method: str, model_config: ModelConfig, accept_bound: float | None = None) -> Model:
+def method_for(
+    robot: Robot, method: str, model_config: ModelConfig, accept_bound: float | None = None, build: bool = True
+) -> Model:
     """Return the model that a method needs: a model set for ours, trained networks for a rival.
 
-    A missing model is built first.
+    A missing model is built first, unless `build` is False.
 
     Raises:
+        BadModel: see `model_for`.
         ValueError: the method does not exist, or it does not support robots in real time.
         TooLoose: the model set states a bound above the limit (`model_for`).
     """
     if method == DDPC:
-        return model_for(robot, model_config, accept_bound)
+        return model_for(robot, model_config, accept_bound, build)
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}; choose one of {', '.join(METHODS)}")
     if robot.late:

@@ -45,7 +45,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
 
     Raises:
         LaunchError: the folder holds another run.
-        BadModel: the folder of a resumed run lacks a model.
+        BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
         ValueError: the run adapts, and a model set is not of mode one-step.
     """

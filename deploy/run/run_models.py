@@ -35,12 +35,14 @@ def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[
         The configuration, with the mode of the model sets in place of `AUTO` if it is the same for all; the models.
 
     Raises:
+        BadModel: a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
     """
     models = []
+    simulated = not config.flights or config.autopilot is not None
     for name in config.robots:
         robot = robot_maybe_with_task(name)
-        model = method_for(robot, config.method, config.model_config, config.accept_bound)
+        model = method_for(robot, config.method, config.model_config, config.accept_bound, build=simulated)
         source, kept = (
             method_path(robot, config.method, config.model_config),
             archive_path(folder, robot.name, model.version),

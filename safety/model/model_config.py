@@ -42,7 +42,7 @@ class ModelConfig:
         if not 1.0 <= self.inflation < math.inf:
             raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
         if not 0.0 < self.outside <= MOST_OUTSIDE:
-            raise ValueError(f"a share of {self.outside:g} of the windows outside is not between 0 and {MOST_OUTSIDE:g}")
+            raise ValueError(f"a share of {self.outside:g} of windows outside is not between 0 and {MOST_OUTSIDE:g}")
 
     def of_minutes(self) -> ModelConfig:
         """Return these settings for minutes of driving instead of hours: fewer windows, envelopes scaled by 1.5."""

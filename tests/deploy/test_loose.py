@@ -69,13 +69,16 @@ def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
     assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{certified['residual']['bound_plan']:.6g}"
 
 
-def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(few, capsys):
+def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(
+    few, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     words = ("certify", few / "ground" / "record.safetensors", "--robot", "ground-late", "--accept-bound", "0.5")
     found = [
         json.loads(run(capsys, *words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
-        for outside in ("0.001", "0.05")
+        for outside in ("0.001", "0.1")
     ]
-    assert ModelSet.load(few / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
+    assert ModelSet.load(tmp_path / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
     assert found[1]["inflation"] < found[0]["inflation"] and found[1]["half_width_rest"] < found[0]["half_width_rest"]
     assert found[1]["bound_plan"] > found[0]["bound_plan"] and found[1]["marginal"] > found[0]["marginal"]
     status, _, err = run(capsys, *words, "--outside", "0.5")
@@ -129,3 +132,17 @@ def test_a_description_can_set_its_own_limit(tmp_path):
     plain = read_robot(tmp_path / "plain.toml")
     assert plain == robot and plain.layout() == robot.layout(), "it says nothing about vectors"
     assert plain.accept_bound == 0.01 and "accept_bound" not in plain.description
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_vehicle_behind_a_link_is_not_flown_with_a_model_set_of_the_simulator(damaged, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    file = tmp_path / "quadrotor-late" / "residual-one-step.safetensors"
+    if damaged:
+        file.parent.mkdir()
+        file.write_bytes(b"damaged")
+    words = ("fly", "--url", "udpin:127.0.0.1:14999", "--accept-bound", "1", "--out", tmp_path / "run")
+    status, _, err = run(capsys, *words)
+    assert status == 1 and "no model set of this vehicle" in err and "collect quadrotor --url" in err
+    assert not (tmp_path / "quadrotor").exists() and not (tmp_path / "run").exists()
+    assert not damaged or file.read_bytes() == b"damaged"
