@@ -25,8 +25,9 @@ from scipy.optimize import linprog
 from brakeline.messaging.robot import Robot
 from brakeline.safety.compilation import compiled
 from brakeline.safety.model.error_bounds import envelope, least_squares, whitening
+from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features
-from brakeline.safety.model.one_step_fitting import OUTSIDE, Samples
+from brakeline.safety.model.one_step_fitting import Samples
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Noise:
         bounds = [envelope(np.abs(s.v), np.abs(column), 1.0) for column in off.T]
         noise = Noise(np.array([kappa for kappa, _ in bounds]), np.array([w for _, w in bounds]))
         scores = np.sort((np.abs(off) / noise.sizes(s.v)).max(1))
-        factor = scores[min(math.ceil((len(scores) + 1) * (1.0 - OUTSIDE)), len(scores)) - 1]
+        factor = scores[min(math.ceil((len(scores) + 1) * (1.0 - ModelConfig.outside)), len(scores)) - 1]
         return Noise(factor * noise.kappa, factor * noise.w)
 
 
