@@ -3,11 +3,12 @@
 Both hold every matrix A with y_t = A φ_t + e_t, |e_t| <= noise_t, for the recorded periods t, and propagate boxes:
 
 - zonotopic recursive least squares (Naderi Akhormeh et al., "Online data-driven reachability analysis using zonotopic
-  recursive least squares"; TUM-CPS-HN/ZRLS): with forgetting λ, K = P φ / (φᵀ P φ + λ R), P ← (I − K φᵀ) P / λ,
-  centre ← centre + K (y − centre φ), generators ← generators (I − K φᵀ)ᵀ / √λ, and a new one −K noise for each output.
-- constrained matrix zonotopes (Alanwar et al., "Data-driven reachability analysis from noisy data", IEEE TAC 2023;
-  aalanwar/Data-Driven-Reachability-Analysis): A = (Y − W) Φ⁺, with the noise W in a matrix zonotope and
-  (Y − W) Φ⊥ = 0. These are the matrices that are consistent with all samples.
+  recursive least squares", arXiv 2509.17058; TUM-CPS-HN/ZRLS): with forgetting λ, K = P φ / (φᵀ P φ + λ R),
+  P ← (I − K φᵀ) P / λ, centre ← centre + K (y − centre φ), generators ← generators (I − K φᵀ)ᵀ / √λ, and a new one,
+  −K noise, for each output.
+- constrained matrix zonotopes (Alanwar et al., "Data-driven reachability analysis from noisy data", IEEE TAC 2023,
+  arXiv 2105.07229; aalanwar/Data-Driven-Reachability-Analysis): A = (Y − W) Φ⁺, with the noise W in a matrix zonotope
+  and (Y − W) Φ⊥ = 0. These are the matrices that are consistent with all samples.
 
 Both handle polynomial systems as here: φ are monomials, and a box of states gives a box of φ.
 """

@@ -240,12 +240,13 @@ def run() -> Words:
             minutes = recording.kind == FREE  # as `brakeline certify` treats imported logs
             figures[f"{recording.name}: {name}"], model = ours(recording, config.of_minutes() if minutes else config)
             if config.mode == ONE_STEP and recording.kind == FREE:
-                figures[f"{recording.name}: filter"] = decisions(Filter(model), EPISODES, SEED)
+                figures[f"{recording.name}: filter"] = decisions("diff", Filter(model), EPISODES, SEED)
         for name, fit in PEERS.items():
             figures[f"{recording.name}: {name}"] = peer(recording, fit)
     tuning = tuned()
-    barrier = UnicycleBarrier(robot_named(str(OWN_LOG / "diff.toml")), tuning)
-    figures[f"diff: CBF-QP, unicycle, {tuning}"] = decisions(barrier, EPISODES, SEED)
+    for name in ("diff", "skid"):  # the skid steer has the same inputs, but is late and slips
+        barrier = UnicycleBarrier(robot_named(str(OWN_LOG / f"{name}.toml")), tuning)
+        figures[f"{name}: CBF-QP, unicycle, {tuning}"] = decisions(name, barrier, EPISODES, SEED)
     return figures
 
 
@@ -265,10 +266,10 @@ class Timed:
         return decision
 
 
-def decisions(method: Method, episodes: int, seed: int) -> dict[str, float | str]:
-    """Return how the adversary and the planner fare behind a method, in the arenas of examples/own_log."""
+def decisions(name: str, method: Method, episodes: int, seed: int) -> dict[str, float | str]:
+    """Return how the adversary and the planner of a robot fare behind a method, in the arenas of examples/own_log."""
     table = own_log()
-    vehicle = table.VEHICLES["diff"]
+    vehicle = table.VEHICLES[name]
     timed = Timed(method)
     adversary = table.episodes(vehicle, timed, episodes, "adversary", 10_000 + seed)
     planner = table.episodes(vehicle, method, episodes // 2, "planner", 20_000 + seed)
@@ -284,6 +285,6 @@ def tuned() -> Tuning:
     """Return the settings with the fewest collisions, most goals and nearest approach, in episodes of other seeds."""
     robot, found = robot_named(str(OWN_LOG / "diff.toml")), {}
     for tuning in TUNINGS:
-        had = decisions(UnicycleBarrier(robot, tuning), TUNING_EPISODES, SEED + 5000)
+        had = decisions("diff", UnicycleBarrier(robot, tuning), TUNING_EPISODES, SEED + 5000)
         found[tuning] = had["collisions"], -int(str(had["goals"]).split()[0]), float(had["nearest cm"])
     return min(found, key=found.__getitem__)
