@@ -68,9 +68,9 @@ def replayed(path: Path, robot: RobotWithTask) -> Policy:
     Raises:
         NoSource: the file can't be read, or lacks an input of the robot.
     """
-    from brakeline.deploy.data.sources.column_files import read_csv  # imports pyarrow, which no other policy needs
+    from brakeline.deploy.data.importer import tables_of  # imports pyarrow, which no other policy needs
 
-    (table,) = read_csv(path)
+    (table,) = tables_of(path)
     names = column_names(robot)[1]
     if missing := [name for name in names if name not in table.columns]:
         raise NoSource(f"{path}: no column {', '.join(missing)}; there are: {', '.join(table.columns)}")

@@ -17,6 +17,7 @@ from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.coverage import Coverage, coverage
 from brakeline.deploy.data.coverage_plot import draw_coverage
 from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import HOLD
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import robot_named
@@ -33,7 +34,12 @@ class ImportCommand:
     out: Path | None = None
     """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
     map: tuple[str, ...] = ()
-    """Places of coordinates and inputs in the log, each as NAME=TABLE/FIELD, if they are not at their usual places."""
+    """Places of coordinates, inputs and the time in the log, each as NAME=TABLE/FIELD (of a file of columns:
+    NAME=COLUMN), if they are not at their usual places."""
+    unit: tuple[str, ...] = ()
+    """Units of the log, each as NAME=UNIT, where they are not SI: heading=deg, speed=km/h, time=ms."""
+    topics: tuple[str, ...] = ()
+    """Topics or message types to take, where several hold the same quantity."""
     delay: float = 0.0
     """Time by which the inputs are stamped too early [s]. The report says how much later than its inputs the robot
     moves."""
@@ -46,7 +52,8 @@ class ImportCommand:
     def run(self) -> int:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         robot = robot_named(self.robot)
-        imported = importer.import_sources(self.sources, robot, self.map, self.delay, self.hold)
+        options = LogOptions.parse(self.map, self.unit, self.topics)
+        imported = importer.import_sources(self.sources, robot, options, self.delay, self.hold)
         covered = coverage(imported.data)
         path = self.out or record_path(robot)
         if self.picture is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,10 +13,11 @@ from rich.markup import escape
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json
 from brakeline.deploy.data.description_plot import draw_description, summary
-from brakeline.errors import BadDescription
+from brakeline.deploy.data.log_options import LogOptions
+from brakeline.errors import BadDescription, NoSource
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
-from brakeline.messaging.robot_description import NAME
+from brakeline.messaging.robot_description import NAME, robot_from_description
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 
@@ -27,9 +29,16 @@ class RobotCommand:
     """new writes a description with comments, check lists all mistakes in one, show prints what follows from it."""
     file: Annotated[str, tyro.conf.Positional]
     """The description (.toml). With check and show also the name of a robot that comes with the program."""
-    from_: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """With new: infer values from this log (CSV, Parquet, ROS 2 bags, logs of autopilots). The log of a run contains
-    the whole description."""
+    from_: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
+    """With new: infer values from these logs of one robot (CSV, Parquet, ROS 2 bags, logs of autopilots). The log of a
+    run contains the whole description."""
+    map: tuple[str, ...] = ()
+    """With --from: names of coordinates, inputs and the time, and where they are in the log, each as NAME=TABLE/FIELD
+    (of a file of columns: NAME=COLUMN; then no other column is taken). The name of an input begins with `command `."""
+    unit: tuple[str, ...] = ()
+    """With --from: units of the log, each as NAME=UNIT, where they are not SI: heading=deg, speed=km/h, time=ms."""
+    topics: tuple[str, ...] = ()
+    """With --from: topics or message types to take, where several hold the same quantity."""
     picture: Path | None = None
     """With show: draw the body and the stop into this image."""
     json: Json = False
@@ -46,10 +55,14 @@ class RobotCommand:
             raise ValueError(f"{path} exists: check it with `brakeline robot check {path}`, or choose another name")
         text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
-        if self.from_ is not None:
-            text, notes = _from_log(self.from_, text, path.stem)
+        options = LogOptions.parse(self.map, self.unit, self.topics)
+        if self.from_:
+            text, notes = _from_logs(self.from_, text, path.stem, options)
         path.write_text(text)
         following = f"{path}: fill it in, then `brakeline robot check {path}`"
+        if words := options.words():
+            logs = " ".join(map(str, self.from_))
+            following += f" and `brakeline import {logs} --robot {path} {words}`"
         print_result(self.json, {"file": str(path), "notes": list(notes)}, *notes, following)
         return 0
 
@@ -101,14 +114,29 @@ def _task_text(name: str) -> str:
     return f"its task: {task.observation_dim} observed values, arenas {', '.join(task.arenas)}"
 
 
-def _from_log(source: Path, template: str, name: str) -> tuple[str, tuple[str, ...]]:
-    """Return the text of a description, and notes on what the log does not show. Raises NoSource, LogError."""
+def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: LogOptions) -> tuple[str, tuple[str, ...]]:
+    """Return the text of a description, and notes on what the logs do not show.
+
+    Raises:
+        NoSource: a log cannot be used, or does not show enough for a description without mistakes.
+        LogError: the log of a run cannot be read.
+    """
     from brakeline.deploy.data.description_template import fill_template
     from brakeline.deploy.data.embedded_description import read_embedded_description
     from brakeline.deploy.data.importer import own_log, tables_of
     from brakeline.deploy.data.schema_inference import infer_schema
 
-    if own_log(source):
-        return read_embedded_description(source, name), ()
-    schema = infer_schema(tables_of(source))
-    return fill_template(template, schema, source.name), schema.notes
+    if own_log(sources[0]):
+        return read_embedded_description(sources[0], name), ()
+    names = ", ".join(source.name for source in sources)
+    schema = infer_schema(*(tables_of(source, options) for source in sources), options=options)
+    text = fill_template(template, schema, names)
+    try:
+        robot_from_description(tomllib.loads(text), name)
+    except (BadDescription, tomllib.TOMLDecodeError) as error:
+        problems = "\n  ".join((*schema.notes, str(error)))
+        raise NoSource(
+            f"{names}: no description without mistakes follows from it. Drive so that every input takes several values "
+            f"and the robot moves and turns, or name columns with --map:\n  {problems}"
+        ) from error
+    return text, schema.notes

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.beat import Beat, find_beat
+from brakeline.deploy.data.sources.quantity_names import Places
+from brakeline.deploy.data.sources.source_table import Array
 from brakeline.errors import NoSource
 
 Indices = NDArray[np.intp]
@@ -20,7 +23,8 @@ FEWEST_ROWS = 20  # shorter runs are left out
 class AlignedLog:
     """The rows of all runs of a log, one run after the other, and the roles of the columns.
 
-    time (T,) in s, with a gap of `BETWEEN_RUNS` between two runs; columns: (T,) each.
+    time (T,) in s, with a gap of `BETWEEN_RUNS` between two runs; columns: (T,) each; input_step: time in s between two
+    messages of the inputs, if they have stamps of their own; changes (C,): times in s of the changes of any input.
     """
 
     time: Array
@@ -29,15 +33,18 @@ class AlignedLog:
     inputs: list[str]
     heading: str = ""
     units: dict[str, str] = field(default_factory=dict)
+    input_step: float = 0.0
+    changes: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        """Unwrap the heading, and find the sampling time and the period: the median time between input changes."""
+        """Unwrap the heading, and find the sampling time. The period is at first the sampling time."""
         self.step = self.period = float(np.median(np.diff(self.time)))
-        if self.inputs:
-            changed = np.any([np.diff(self.columns[name]) != 0.0 for name in self.inputs], axis=0)
-            if np.count_nonzero(changed) > 1:
-                self.period = max(float(np.median(np.diff(self.time[1:][changed]))), self.step)
         self.set_heading(self.heading)
+
+    def beat(self) -> Beat | None:
+        """Return the beat of the inputs; None if they hardly change, or at any time."""
+        between = np.diff(self.changes)
+        return find_beat(between[between < BETWEEN_RUNS / 2.0], self.input_step or self.step)
 
     def set_heading(self, name: str) -> None:
         """Take a column as the heading, and unwrap it."""
@@ -66,7 +73,7 @@ class AlignedLog:
 
 
 def align(
-    fields: dict[str, tuple[Table, str]],
+    fields: Places,
     positions: list[str],
     inputs: list[str],
     units: dict[str, str],
@@ -79,6 +86,7 @@ def align(
     """
     first = next(iter(fields.values()))[0]
     times: list[Array] = []
+    changes: list[Array] = []
     rows: dict[str, list[Array]] = {name: [] for name in fields}
     for run in np.unique(first.run) if len(first.run) else [0]:
         series = {name: table.series(column, int(run)) for name, (table, column) in fields.items()}
@@ -90,12 +98,43 @@ def align(
         if len(clock) < FEWEST_ROWS:
             continue
         for name, (time, values) in series.items():
-            held = name in inputs
-            rows[name].append(
-                values[np.searchsorted(time, clock + 1e-9, "right") - 1] if held else np.interp(clock, time, values)
-            )
-        times.append(clock - clock[0] + (times[-1][-1] + BETWEEN_RUNS if times else 0.0))
+            if name in inputs:
+                rows[name].append(values[np.searchsorted(time, clock + 1e-9, "right") - 1])
+            else:
+                rows[name].append(np.interp(clock, time, np.unwrap(values) if name == heading else values))
+        offset = (times[-1][-1] + BETWEEN_RUNS if times else 0.0) - clock[0]
+        times.append(clock + offset)
+        at = [time[1:][np.diff(values) != 0.0] for time, values in (series[name] for name in inputs)]
+        moments = np.unique(np.concatenate([clock[:0], *at]))
+        changes.append(moments[(moments >= clock[0]) & (moments <= clock[-1])] + offset)
     if not times:
         raise NoSource(f"fewer than {FEWEST_ROWS} rows have values in all columns")
     columns = {name: np.concatenate(parts) for name, parts in rows.items()}
-    return AlignedLog(np.concatenate(times), columns, positions, inputs, heading, units)
+    own = [fields[name][0].time for name in inputs if fields[name][0] is not first]
+    input_step = min((float(np.median(np.diff(time))) for time in own if len(time) > 1), default=0.0)
+    every = np.concatenate(changes)
+    # Messages of one moment have stamps that differ a little.
+    every = every[np.diff(every, prepend=-np.inf) > 0.5 * input_step]
+    return AlignedLog(np.concatenate(times), columns, positions, inputs, heading, units, input_step, every)
+
+
+def joined(logs: Sequence[AlignedLog]) -> AlignedLog:
+    """Return several logs of one robot as one; a column that one of them lacks is left out."""
+    first = logs[0]
+    names = [name for name in first.columns if all(name in log.columns for log in logs)]
+    times: list[Array] = []
+    changes: list[Array] = []
+    for log in logs:
+        offset = (times[-1][-1] + BETWEEN_RUNS if times else 0.0) - log.time[0]
+        times.append(log.time + offset)
+        changes.append(log.changes + offset)
+    return AlignedLog(
+        np.concatenate(times),
+        {name: np.concatenate([log.columns[name] for log in logs]) for name in names},
+        [name for name in first.positions if name in names],
+        [name for name in first.inputs if name in names],
+        first.heading if first.heading in names else "",
+        {name: unit for name, unit in first.units.items() if name in names},
+        max(log.input_step for log in logs),
+        np.concatenate(changes),
+    )

@@ -7,12 +7,11 @@ import math
 import re
 from typing import Any
 
-from brakeline.deploy.data.schema_inference import InferredColumn, InferredSchema
+from brakeline.deploy.data.schema_inference import InferredColumn, InferredSchema, brake_periods
 
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 ERRORS = {"position": 0.01, "heading": 0.02}  # measurement errors of the template
 ERROR = 0.05
-JUMP = 0.8  # share of an input's range: an input that changes more in one period has no slew limit
 MOST_PERIODS = 64  # longest plan
 UNKNOWN = "cannot be inferred from the log"
 
@@ -24,14 +23,17 @@ def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     inputs = ["# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more."]
     inputs += [*map(_input, schema.inputs)] if schema.inputs else [f"# Inputs {UNKNOWN}: these come from the template."]
     zeros = ", ".join("0.0" for column in schema.states if column.role == "position")
-    period = f"period = {schema.period:g} # s between decisions; the median time between input changes in the log"
+    period = f"period = {schema.period:g} # s between decisions; {schema.why}"
+    plan = (
+        (r"^horizon = .*", f"horizon = {horizon}"),
+        (r"^brake = .*", f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it"),
+    )
     replacements = (
         (r"^period = .*", period),
         (r"^sight = .*", rf"\g<0>; {UNKNOWN}"),
         (r"^\[state\]\n(.+\n)+", _verbatim("[state]", *states)),
         (r"^\[input\]\n" + ("(.+\n)+" if schema.inputs else ""), _verbatim("[input]", *inputs)),
-        (r"^horizon = .*", f"horizon = {horizon}"),
-        (r"^brake = .*", f"brake = {brake} # from the strongest braking and the fastest inputs in the log; check it"),
+        *(plan if schema.inputs else ()),  # without inputs, the plan of the template fits the inputs of the template
         (r"^\[\[body\]\]", rf"# The body {UNKNOWN}: measure it.\n\g<0>"),
         (r"^at = \[0.0, 0.0\]", f"at = [{zeros}]"),
     )
@@ -48,16 +50,13 @@ def _verbatim(*lines: str) -> str:
 
 def periods(schema: InferredSchema) -> tuple[int, int]:
     """Return (horizon, brake) in periods from the braking and the delays in the log: an estimate, not a bound."""
-    inputs = [(max(-_low(one), _high(one)), most) for one in schema.inputs if (most := slew(one)) is not None]
-    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in schema.states if c.follows and c.change > 0.0]
-    brake = max((math.ceil(round(most / change, 6)) for most, change in (*inputs, *falls)), default=1)
-    late = math.ceil(max((c.delay or 0.0 for c in schema.states), default=0.0) / schema.period)
+    brake, late = brake_periods(schema.period, schema.states, schema.inputs)
     return min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
 
 
 def slew(one: InferredColumn) -> float | None:
     """Return the slew limit of an input per period, or None if the input jumps."""
-    return _outwards(one.change) if 0.0 < one.change < JUMP * (one.most - one.least) else None
+    return None if one.jumps else _outwards(one.change)
 
 
 def _low(one: InferredColumn) -> float:

@@ -14,9 +14,12 @@ from itertools import pairwise
 import numpy as np
 
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
+from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.input_delay import estimate_delay, followed_inputs
-from brakeline.deploy.data.sources.quantity_names import column_names, resolve
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.log_options import LogOptions
+from brakeline.deploy.data.motion_check import refuse_contradictions
+from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
+from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.errors import NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
@@ -52,14 +55,14 @@ class ImportedData:
 
 
 def resample(
-    tables: Sequence[Table], robot: Robot, chosen: dict[str, str], delay: float = 0.0, hold: float = HOLD
+    tables: Sequence[Table], robot: Robot, options: LogOptions, delay: float = 0.0, hold: float = HOLD
 ) -> ImportedData:
     """Resample the tables of a source to a data set.
 
     Args:
         tables: the tables of the source.
         robot: its description gives period, columns and bounds.
-        chosen: the field of each column that `--map` names.
+        options: where the columns are in the source, and in which units.
         delay: time in s by which the stamps of the inputs are too early.
         hold: time in s for which an input is valid after its last message.
 
@@ -67,7 +70,15 @@ def resample(
         NoSource: a column is missing, the source has too few samples, or no trajectory is left; the message gives the
             reason.
     """
-    recordings, notes = gap_free_recordings(resolve(tables, robot, chosen), robot, delay, hold)
+    states, inputs = column_names(robot)
+    positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
+    places = resolve(tables, robot, options)
+    chosen = choice_notes(tables, places)
+    places, glitches = without_glitches(places, positions, inputs, heading)
+    if robot.position_dim:
+        refuse_contradictions(places, positions, inputs, heading, column_units(robot))
+    recordings, cuts = gap_free_recordings(places, robot, delay, hold)
+    notes = [*notes_of(tables), *chosen, *glitches, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     step = float(np.median(np.concatenate([np.diff(r.states[0][0]) for r in recordings])))

@@ -6,34 +6,60 @@ name. The role and the unit of any other column follow from its correlation with
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.data.aligned_log import AlignedLog, align
+from brakeline.deploy.data.aligned_log import AlignedLog, align, joined
+from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.input_delay import estimate_delay
-from brakeline.deploy.data.sources.quantity_names import AXES, COMMAND
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.log_options import PLAIN, LogOptions
+from brakeline.deploy.data.motion_check import (
+    FEWEST_SPANS,
+    MAX_LAG,
+    SAME_CORRELATION,
+    SPAN,
+    correlation,
+    heading_contradiction,
+    heading_unit,
+    same_gain,
+    speed_contradiction,
+    speed_fit,
+    speeds_of_motion,
+)
+from brakeline.deploy.data.sources.quantity_names import (
+    AXES,
+    COMMAND,
+    Place,
+    Places,
+    choice_notes,
+    fields_named,
+    first_ranked,
+)
+from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
+from brakeline.deploy.data.stamps import TIME
+from brakeline.deploy.data.unit_table import in_si, si_of
 from brakeline.errors import NoSource
 
-POSITION = re.compile(r"(?:pos(?:ition)?[ _.]?|p)?([xyz])(?:[ _.]?pos(?:ition)?)?", re.IGNORECASE)
-HEADING = re.compile(r"heading|yaw|theta|psi", re.IGNORECASE)
+POSITION = re.compile(r"(?:pos(?:ition)?[ _.]?|p)?([xyz])(?:[ _.]?pos(?:ition)?)?(?:[ _.]?m)?", re.IGNORECASE)
+HEADING = re.compile(r"(?:heading|yaw|theta|psi)(?:[ _.](?:rad|deg))?", re.IGNORECASE)
 INPUT = re.compile(rf"(?:{COMMAND}|cmd|input|set(?:point)?|target)(?![a-z])", re.IGNORECASE)
 # For each quantity of a message: its name in a description, and its unit.
 STATES = {"body.x": ("speed", "m/s"), "body.y": ("speed aside", "m/s"), "yaw rate": ("turn rate", "rad/s")}
 FLYING = {f"velocity.{axis}": (f"v{axis}", "m/s") for axis in AXES}
 SPACE = FLYING | {f"acceleration.{axis}": (f"a{axis}", "m/s2") for axis in AXES}
 INPUTS = STATES | {"steering": ("steering", "rad"), "acceleration": ("acceleration", "m/s2")}
+JUMP = 0.8  # share of an input's range: an input that changes more in one period has no slew limit
 HELD = 0.5  # share of rows that repeat the row before: only inputs, which are held, repeat this often
-SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
-SAME_CORRELATION = 0.9  # of two columns of the same quantity
-SAME_GAIN = (0.75, 1.33)  # ratio of their standard deviations
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
-MAX_LAG = 1.0  # s
-FEWEST_SPANS = 20  # fewer spans give no result
+MOST_UNKNOWN = 3  # columns of a file that nothing is known of; more are left out
+CHOSEN_PERIOD = 0.1  # s, where the log shows no beat
+LONGEST_PLAN = 40  # periods: if a stop takes more, a period is several beats
+NAMED = 12  # columns that a note names
 
 
 @dataclass(frozen=True)
@@ -50,26 +76,37 @@ class InferredColumn:
     delay: float | None = None  # s; a coordinate: delay from the input
     moves: bool | None = None  # an input: whether it moves the position; None: unknown
 
+    @property
+    def jumps(self) -> bool:
+        """Return whether an input changes so much in one period that it has no slew limit."""
+        return not 0.0 < self.change < JUMP * (self.most - self.least)
+
 
 @dataclass(frozen=True)
 class InferredSchema:
     """The parts of a robot description that a log shows. `notes` says what it does not show, and why."""
 
-    period: float  # s: median time between two changes of an input, or between two rows if there is no input
+    period: float  # s
+    why: str  # how the period was found
     states: tuple[InferredColumn, ...]  # in the order of a description
     inputs: tuple[InferredColumn, ...]
     notes: tuple[str, ...]
 
 
-def infer_schema(tables: Sequence[Table]) -> InferredSchema:
-    """Infer the schema of a log.
+def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> InferredSchema:
+    """Infer the schema of one or more logs of a robot.
+
+    Args:
+        sources: the tables of each log.
+        options: where columns are, and in which units.
 
     Raises:
-        NoSource: the log has fewer than two position columns; the message gives the expected names.
+        NoSource: a log has fewer than two position columns, or units that the motion contradicts; the message says what
+            to do.
     """
-    log = _from_messages(tables) if tables[0].name else _from_columns(tables[0])
+    log, notes = _read(sources, options)
     constant = [name for name, values in log.columns.items() if np.ptp(values) == 0.0]
-    notes = [f"{name} never changes, so that it is left out" for name in constant]
+    notes += [f"{name} never changes, so that it is left out" for name in constant]
     for name in constant:
         del log.columns[name]
     log.positions, log.inputs = ([n for n in names if n not in constant] for names in (log.positions, log.inputs))
@@ -77,26 +114,86 @@ def infer_schema(tables: Sequence[Table]) -> InferredSchema:
         raise NoSource(
             f"the log needs two position columns ({', '.join(AXES)}) that change: {'; '.join(notes) or 'none'}"
         )
-    if not tables[0].name:
+    if not sources[0][0].name:
         notes += _find_heading(log)
-        _find_speeds(log)
+        _find_speeds(log, options)
     others = [n for n in log.columns if n not in (*log.positions, log.heading, *log.inputs)]
     pairs = _followers(log, others)
     for name, follower in pairs.items():
         log.units.setdefault(name, log.units.get(follower, ""))
+    unknown = [n for n in others if not log.units.get(n) and n not in pairs.values() and n not in options.fields]
+    if len(unknown) > MOST_UNKNOWN:
+        notes.append(f"left out, as the motion shows no role of them: {_listed(unknown)}. --map NAME=COLUMN takes one")
+        others = [name for name in others if name not in unknown]
+    if not log.inputs:
+        still = [name.removeprefix(f"{COMMAND} ") for name in constant if name.startswith(f"{COMMAND} ")]
+        hint = f"record a drive with changing {' and '.join(still)}" if still else "or log them as held values"
+        notes.append(f"no column is clearly an input: name inputs `{COMMAND} NAME`, {hint}")
+    beat, why = _period(log)
+    for count in (1, 2, 3, 4, 5, 8, 10, 15, 20):
+        log.period = count * beat
+        states, inputs = _states(log, others, pairs), _inputs(log)
+        if stop_periods(log.period, states, inputs) <= LONGEST_PLAN:
+            break
+    why += f"; {count} of them, so that a stop takes at most {LONGEST_PLAN}" if count > 1 else ""
+    return InferredSchema(float(f"{log.period:.3g}"), why, tuple(states), tuple(inputs), tuple(dict.fromkeys(notes)))
+
+
+def _read(sources: Sequence[Sequence[Table]], options: LogOptions) -> tuple[AlignedLog, list[str]]:
+    """Return the columns of all logs on one time, and notes on what was chosen and left out."""
+    logs, notes = list[AlignedLog](), list[str]()
+    for tables in sources:
+        fields = _from_messages(tables, options) if tables[0].name else _from_columns(tables[0], options)
+        places, more = without_glitches(fields.places, fields.positions, heading=fields.heading)
+        notes += [*notes_of(tables), *choice_notes(tables, places), *more]
+        logs.append(align(places, fields.positions, fields.inputs, fields.units, fields.heading))
+    log = joined(logs)
+    if lost := sorted({name for one in logs for name in one.columns} - set(log.columns)):
+        notes.append(f"left out, as not every log has them: {', '.join(lost)}")
+    return log, notes
+
+
+def _period(log: AlignedLog) -> tuple[float, str]:
+    """Return the period in s, and how it was found."""
+    beat = log.beat()
+    if beat is not None:
+        return beat.seconds, (
+            f"the beat of the inputs: {beat.share:.0%} of {beat.changes} times between two changes are multiples of it"
+        )
+    if log.inputs and log.input_step >= log.step:
+        return log.input_step, "the time between two messages of the inputs, which hardly change"
+    period = log.step * max(math.ceil(CHOSEN_PERIOD / log.step - 1e-6), 1)
+    return period, "a guess: the inputs of the log show no beat; take the period of your controller"
+
+
+def stop_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> int:
+    """Return how many periods the strongest braking and the delays take: an estimate, not a bound."""
+    brake, late = brake_periods(period, states, inputs)
+    return brake + late
+
+
+def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> tuple[int, int]:
+    """Return the periods of the braking, and those of the longest delay."""
+    ramps = [(max(-c.least, c.most), c.change) for c in inputs if c.jumps is False and c.change > 0.0]
+    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in states if c.follows and c.change > 0.0]
+    brake = max((math.ceil(round(most / change, 6)) for most, change in (*ramps, *falls)), default=1)
+    return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
+
+
+def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> list[InferredColumn]:
     leader = {follower: name for name, follower in pairs.items()}
     states = [_column(log, name, role="position", unit="m") for name in log.positions]
     states += [_column(log, log.heading, role="heading", unit="rad")] if log.heading in log.columns else []
-    states += [
+    return states + [
         _column(log, n, follows=_plain(leader[n], log), change=_braking(log, n), delay=_delay(log, leader[n], n))
         if n in leader
         else _column(log, n, change=_braking(log, n))
         for n in others
     ]
-    inputs = [_column(log, n, name=_plain(n, log), change=_slew(log, n), moves=_moves(log, n)) for n in log.inputs]
-    if not inputs:
-        notes.append(f"no column is clearly an input: name inputs `{COMMAND} NAME`, or log them as held values")
-    return InferredSchema(float(f"{log.period:.3g}"), tuple(states), tuple(inputs), tuple(notes))
+
+
+def _inputs(log: AlignedLog) -> list[InferredColumn]:
+    return [_column(log, n, name=_plain(n, log), change=_slew(log, n), moves=_moves(log, n)) for n in log.inputs]
 
 
 def _column(log: AlignedLog, column: str, name: str = "", unit: str = "", **more: Any) -> InferredColumn:
@@ -114,55 +211,109 @@ def _plain(name: str, log: AlignedLog) -> str:
 # --- columns and their roles by name ------------------------------------------------------------------------------
 
 
-def _from_messages(tables: Sequence[Table]) -> AlignedLog:
-    def field_of(quantity: str) -> tuple[Table, str] | None:
-        candidates = [t for t in tables if quantity in t.columns]
-        return (min(candidates, key=lambda t: t.rank), quantity) if candidates else None
+@dataclass(frozen=True)
+class _Fields:
+    """The columns of a log with their roles."""
 
-    up = field_of("position.z")
+    places: Places
+    positions: list[str]
+    inputs: list[str]
+    units: dict[str, str]
+    heading: str = ""
+
+
+def _from_messages(tables: Sequence[Table], options: LogOptions) -> _Fields:
+    def field_of(quantity: str, name: str) -> Place | None:
+        if name in options.fields:
+            candidates = fields_named(tables, options.fields[name])
+            if not candidates:
+                raise NoSource(f"--map {name}={options.fields[name]}: there is no such field; {_content(tables)}")
+        else:
+            candidates = first_ranked([(t, quantity) for t in tables if quantity in t.columns])
+        if len(candidates) > 1:
+            many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
+            raise NoSource(
+                f"{name}: several fields match; choose a topic with --topics {candidates[0][0].name}: {many}"
+            )
+        return candidates[0] if candidates else None
+
+    up = field_of("position.z", "z")
     flat = up is None or float(np.nanstd(up[0].columns[up[1]])) < 1e-3
-    fields: dict[str, tuple[Table, str]] = {}
-    units: dict[str, str] = {}
     wanted = [(axis, "m", f"position.{axis}") for axis in (AXES[:2] if flat else AXES)]
     wanted += [("heading", "rad", "yaw")] if flat else []
     wanted += [(name, unit, quantity) for quantity, (name, unit) in (STATES if flat else SPACE).items()]
     commands = INPUTS if flat else FLYING
     wanted += [(f"{COMMAND} {name}", unit, f"{COMMAND}.{quantity}") for quantity, (name, unit) in commands.items()]
-    for name, unit, quantity in wanted:
-        if (place := field_of(quantity)) is not None:
-            fields[name], units[name] = place, unit
-    positions = [axis for axis in AXES if axis in fields]
+    wanted += [(name, "", "") for name in options.fields if name not in (TIME, *(name for name, _, _ in wanted))]
+    found = {name: (place, unit) for name, unit, quantity in wanted if (place := field_of(quantity, name)) is not None}
+    positions = [axis for axis in AXES if axis in found]
     if len(positions) < 2:
-        available = "; ".join(f"{t.name}: {', '.join(t.columns)}" for t in tables)
-        raise NoSource(f"no message holds positions (Odometry, PoseStamped, TF). The source has: {available}")
-    inputs = [name for name in fields if name.startswith(f"{COMMAND} ")]
-    return align(fields, positions, inputs, units, "heading" if "heading" in fields else "")
+        raise NoSource(f"no message holds positions (Odometry, PoseStamped, TF). {_content(tables)}")
+    inputs = [name for name in found if name.startswith(f"{COMMAND} ")]
+    places, units = _in_si({name: place for name, (place, _) in found.items()}, options)
+    units = {name: unit for name, (_, unit) in found.items()} | units
+    return _Fields(places, positions, inputs, units, "heading" if "heading" in found else "")
 
 
-def _from_columns(table: Table) -> AlignedLog:
-    axes = {match[1].lower(): name for name in table.columns if (match := POSITION.fullmatch(name.strip()))}
+def _content(tables: Sequence[Table]) -> str:
+    return f"The source has: {'; '.join(f'{t.name}: {_listed(list(t.columns))}' for t in tables)}"
+
+
+def _from_columns(table: Table, options: LogOptions) -> _Fields:
+    chosen = {name: place for name, place in options.fields.items() if name != TIME}
+    if missing := [place for place in chosen.values() if place not in table.columns]:
+        raise NoSource(f"--map: there is no column {missing[0]}; the columns are: {', '.join(table.columns)}")
+    axes = {m[1].lower(): name for name in (*table.columns,)[::-1] if (m := POSITION.fullmatch(name.strip()))}
+    axes |= {axis: axis for axis in AXES if axis in chosen or axis in table.columns}
     if not {"x", "y"} <= axes.keys():
-        raise NoSource(f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}")
+        raise NoSource(
+            f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}. Name them "
+            "with --map x=COLUMN y=COLUMN"
+        )
     positions = [axes[axis] for axis in AXES if axis in axes]
-    known = {name: values[np.isfinite(values)] for name, values in table.columns.items()}
-    used = {name: (table, name) for name, values in known.items() if len(values)}
-    inputs = [name for name in used if INPUT.match(name)] or [
-        name for name in used if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
+    # Those who name columns name all that matter.
+    names = [*positions, *(n for n in chosen if n not in positions)] if chosen else list(table.columns)
+    places: Places = {name: (table, chosen.get(name, name)) for name in names}
+    places = {name: place for name, place in places.items() if np.isfinite(table.columns[place[1]]).any()}
+    known = {name: values[np.isfinite(values)] for name, (t, c) in places.items() for values in (t.columns[c],)}
+    inputs = [name for name in places if INPUT.match(name)] or [
+        name for name in places if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
     ]
-    return align(used, positions, inputs, {})
+    places, units = _in_si(places, options)
+    return _Fields(places, positions, inputs, units)
+
+
+def _in_si(places: Places, options: LogOptions) -> tuple[Places, dict[str, str]]:
+    """Return the places in SI units, as `--unit` says, and the SI unit of each that it names."""
+    options.check_names(list(places))
+    units = {name: si_of(unit) for name, unit in options.units.items() if name != TIME}
+    for name, si in units.items():
+        table, column = places[name]
+        values = in_si(table.columns[column], options.units[name], si) if si else None
+        if values is not None:
+            places = places | {name: (replace(table, columns=table.columns | {column: values}), column)}
+    return places, units
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
 
 
 # --- roles and units from the motion -------------------------------------------------------------------------------
 
 
 def _find_heading(log: AlignedLog) -> list[str]:
-    """Set the heading of a robot in the plane, and return notes on it."""
+    """Set the heading of a robot in the plane, and return notes on it. Raises NoSource for one in another unit."""
     if len(log.positions) != 2:
         return []
     candidates = [n for n in log.columns if n not in (*log.positions, *log.inputs)]
-    scores = {n: _heading_score(log, n) for n in candidates}
-    best = max(scores, key=lambda n: scores[n], default="")
-    if best and scores[best] > SAME_CORRELATION:
+    fits = {name: heading_unit(log, name) for name in candidates}
+    best = max(fits, key=lambda name: fits[name][1], default="")
+    if best and fits[best][1] > SAME_CORRELATION:
+        unit, score = fits[best]
+        if unit != "rad":
+            raise NoSource(heading_contradiction(best, unit, score))
         log.set_heading(best)
         return []
     if named := [n for n in candidates if HEADING.fullmatch(n.strip())]:
@@ -171,43 +322,22 @@ def _find_heading(log: AlignedLog) -> list[str]:
     return ["no column is clearly the heading: none agrees with the motion, and none is named heading or yaw"]
 
 
-def _heading_score(log: AlignedLog, name: str) -> float:
-    """Return how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|, in [0, 1]."""
-    i, j = log.spans(SPAN)
-    x, y = (log.change(p, i, j) for p in log.positions)
-    length = np.hypot(x, y)
-    far = length > 0.3 * length.max(initial=0.0)
-    cosines = np.abs(np.cos(np.arctan2(y, x) - log.columns[name][(i + j) // 2]))[far]
-    # On a straight path a constant agrees as well as the heading does: require that the angle changes.
-    turned = np.ptp(log.columns[name]) > 0.5
-    return float(cosines.mean()) if turned and len(cosines) >= FEWEST_SPANS else 0.0
-
-
-def _find_speeds(log: AlignedLog) -> None:
-    """Set the units of the columns that measure speeds: along and across the heading and around it, or along axes."""
-    i, j = log.spans(SPAN)
-    time = log.time[j] - log.time[i]
-    speeds = [("m/s", log.change(p, i, j) / time) for p in log.positions]
-    if log.heading:
-        (_, x), (_, y) = speeds
-        middle = log.columns[log.heading][(i + j) // 2]
-        cos, sin = np.cos(middle), np.sin(middle)
-        turned = log.change(log.heading, i, j) / time
-        speeds = [("m/s", cos * x + sin * y), ("m/s", cos * y - sin * x), ("rad/s", turned)]
-    for name, values in log.columns.items():
-        if name not in (*log.positions, *log.inputs, log.heading):
-            sums = np.concatenate([[0.0], np.cumsum(values)])
-            means = (sums[j + 1] - sums[i]) / (j - i + 1)
-            unit = next((unit for unit, speed in speeds if _correlation(speed, means) > SAME_CORRELATION), "")
-            log.units |= {name: unit} if unit else {}
-
-
-def _correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 for too few values, or if the gain is not near 1."""
-    if len(one) < FEWEST_SPANS or np.ptp(one) == 0.0 or np.ptp(other) == 0.0:
-        return 0.0
-    near = SAME_GAIN[0] < float(np.std(other) / np.std(one)) < SAME_GAIN[1]
-    return float(np.corrcoef(one, other)[0, 1]) if near else 0.0
+def _find_speeds(log: AlignedLog, options: LogOptions) -> None:
+    """Set the units of the columns that measure speeds. Raises NoSource for speeds in another unit."""
+    speeds = speeds_of_motion(log, log.heading)
+    problems = []
+    for name in log.columns:
+        if name in (*log.positions, log.heading) or name in options.units:
+            continue
+        fit = speed_fit(log, name, speeds, name in log.inputs)
+        if fit is None:
+            continue
+        if same_gain(fit.gain):
+            log.units |= {} if name in log.inputs else {name: fit.unit}
+        elif problem := speed_contradiction(name, fit):
+            problems.append(problem)
+    if problems:
+        raise NoSource("\n".join((*problems, "If a column is no speed, give it --unit NAME=1")))
 
 
 def _followers(log: AlignedLog, others: Sequence[str]) -> dict[str, str]:
@@ -229,9 +359,15 @@ def _followers(log: AlignedLog, others: Sequence[str]) -> dict[str, str]:
 
 def _lagged_correlation(log: AlignedLog, name: str, other: str) -> float:
     """Return the best correlation of an input with a coordinate up to `MAX_LAG` later; 0 if the gain is not near 1."""
-    lags = np.arange(0.0, MAX_LAG, max(log.step, log.period / 4.0))
+    lags = np.arange(0.0, MAX_LAG, max(log.step, 0.025))
     pairs = (log.rows_apart(round(lag / log.step)) for lag in lags)
-    return max(_correlation(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
+    return max(_near_correlation(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
+
+
+def _near_correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series; 0 if the gain is not near 1."""
+    near = len(one) > 0 and np.std(one) > 0.0 and same_gain(float(np.std(other) / np.std(one)))
+    return correlation(one, other) if near else 0.0
 
 
 def _delay(log: AlignedLog, name: str, follower: str) -> float | None:

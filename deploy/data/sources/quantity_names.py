@@ -1,7 +1,8 @@
 """Map the columns of a source to the coordinates and inputs of a robot.
 
 In a file of columns, the name of a coordinate is the name of its column. In messages, the quantity decides. The option
-`--map NAME=TABLE/FIELD` overrides both. Readers of messages return these quantities, in SI units and ENU:
+`--map NAME=TABLE/FIELD` overrides both, and `--topics` prefers tables. Readers of messages return these quantities, in
+SI units and ENU:
 
     position.x position.y position.z   m        yaw             rad, from x to y
     velocity.x ... (in the world)      m/s      yaw rate        rad/s
@@ -11,14 +12,19 @@ In a file of columns, the name of a coordinate is the name of its column. In mes
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
-from brakeline.deploy.data.sources.source_table import Table
+from brakeline.deploy.data.log_options import LogOptions
+from brakeline.deploy.data.sources.source_table import Table, notes_of
+from brakeline.deploy.data.unit_table import in_si
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
 AXES = "xyz"
 COMMAND = "command"
+Place = tuple[Table, str]  # a table and the name of its field
+Places = dict[str, Place]
 
 
 def split(label: str) -> tuple[str, str]:
@@ -32,6 +38,13 @@ def column_names(robot: Robot) -> tuple[list[str], list[str]]:
     states = [split(label)[0] for label in robot.state]
     inputs = [split(label)[0] for label in robot.action]
     return states, [f"{COMMAND} {name}" if name in states else name for name in inputs]
+
+
+def column_units(robot: Robot) -> dict[str, str]:
+    """Return the unit of each column, states before inputs."""
+    states, inputs = column_names(robot)
+    labels = zip((*states, *inputs), (*robot.state, *robot.action), strict=True)
+    return {name: split(label)[1] for name, label in labels}
 
 
 def quantities(robot: Robot) -> dict[str, str]:
@@ -64,50 +77,36 @@ def quantities(robot: Robot) -> dict[str, str]:
     return found
 
 
-def mapping(words: Iterable[str], robot: Robot) -> dict[str, str]:
-    """Parse `--map` options to {column: TABLE/FIELD}.
-
-    Raises:
-        NoSource: an option is malformed, or its name is not a column of the robot.
-    """
-    states, inputs = column_names(robot)
-    found: dict[str, str] = {}
-    for word in words:
-        name, equals, place = word.partition("=")
-        if not equals or name not in (*states, *inputs):
-            raise NoSource(
-                f"--map {word!r} must be NAME=TABLE/FIELD, where NAME is one of {', '.join((*states, *inputs))}"
-            )
-        found[name] = place
-    return found
-
-
-def resolve(tables: Sequence[Table], robot: Robot, chosen: dict[str, str]) -> dict[str, tuple[Table, str]]:
-    """Find the table and the field of each column of the robot.
+def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Places:
+    """Find the table and the field of each column of the robot, in the robot's unit.
 
     Raises:
         NoSource: columns are missing or ambiguous; the message lists them all, and the content of the source.
     """
-    usual = quantities(robot)
-    found: dict[str, tuple[Table, str]] = {}
+    usual, wanted_units = quantities(robot), column_units(robot)
+    options.check_names(list(wanted_units))
+    places: Places = {}
     problems: list[str] = []
-    for name in (*column_names(robot)[0], *column_names(robot)[1]):
-        if name in chosen:
-            candidates = [(t, f) for t in tables for f in t.columns if chosen[name] in (f"{t.name}/{f}", f)]
-            wanted = f"{chosen[name]!r} (--map)"
+    for name, unit in wanted_units.items():
+        if name in options.fields:
+            candidates = fields_named(tables, options.fields[name])
+            wanted = f"{options.fields[name]!r} (--map)"
         else:
             # `x` of a message may point north: match by name only in files of columns.
-            candidates = [(t, name) for t in tables if not t.name and name in t.columns]
+            plain = [table for table in tables if not table.name]
+            candidates = [(t, name) for t in plain if name in t.columns]
+            candidates = candidates or [(t, f) for t in plain for f in t.columns if _folded(f) == _folded(name)]
             candidates = candidates or [(t, usual[name]) for t in tables if usual.get(name) in t.columns]
             wanted = f"a column {name!r}" + (f" or a message with {usual[name]}" if name in usual else "")
-        candidates = [
-            candidate for candidate in candidates if candidate[0].rank == min(table.rank for table, _ in candidates)
-        ]
+        candidates = first_ranked(candidates)
         if len(candidates) == 1:
-            found[name] = candidates[0]
+            places[name] = _in_unit(candidates[0], name, options.units.get(name, ""), unit)
         elif candidates:
             many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
-            problems.append(f"{name}: several fields match; choose one with --map {name!r}=TABLE/FIELD: {many}")
+            problems.append(
+                f"{name}: several fields match; choose one with --map {name!r}=TABLE/FIELD, or a topic with --topics: "
+                f"{many}"
+            )
         else:
             problems.append(f"{name}: there is no {wanted.removeprefix('a ')}")
     if problems:
@@ -116,5 +115,47 @@ def resolve(tables: Sequence[Table], robot: Robot, chosen: dict[str, str]) -> di
             "the source does not contain every column of the robot's description:\n  "
             + "\n  ".join(problems)
             + f"\nThe source contains: {available}. Name a field with --map NAME=TABLE/FIELD."
+            + "".join(f"\n{note}" for note in notes_of(tables))
         )
-    return found
+    return places
+
+
+def fields_named(tables: Sequence[Table], place: str) -> list[Place]:
+    """Return the fields that `TABLE/FIELD` or `FIELD` names."""
+    return [(t, f) for t in tables for f in t.columns if place in (f"{t.name}/{f}", f)]
+
+
+def first_ranked(candidates: Sequence[Place]) -> list[Place]:
+    """Return the candidates of the lowest rank."""
+    lowest = min((table.rank for table, _ in candidates), default=0)
+    return [(table, field) for table, field in candidates if table.rank == lowest]
+
+
+def choice_notes(tables: Sequence[Table], places: Places) -> list[str]:
+    """Say for each quantity that several tables hold which one is used, and how to choose another."""
+    used: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for name, (table, column) in places.items():
+        others = tuple(t.name for t in tables if column in t.columns and t.name != table.name)
+        if others:
+            used.setdefault((table.name, others), []).append(name)
+    return [
+        f"{', '.join(names)}: from {name}; {', '.join(others)} also {'holds' if len(others) == 1 else 'hold'} "
+        f"{'it' if len(names) == 1 else 'them'} (choose with --topics {others[0]})"
+        for (name, others), names in used.items()
+    ]
+
+
+def _folded(name: str) -> str:
+    """Return a name without case, spaces and signs."""
+    return "".join(character for character in name.lower() if character.isalnum())
+
+
+def _in_unit(place: Place, name: str, given: str, unit: str) -> Place:
+    """Return a place with its values in the robot's unit."""
+    table, column = place
+    if not given:
+        return place
+    values = in_si(table.columns[column], given, unit)
+    if values is None:
+        raise NoSource(f"--unit {name}={given}: {name} is in {unit or '1'}, to which {given} cannot be converted")
+    return replace(table, columns=table.columns | {column: values}), column

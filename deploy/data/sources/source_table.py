@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +18,9 @@ Series = tuple[Array, Array]  # time in s and values (T,)
 class Table:
     """One stream of a source: a file of columns (with an empty name), a topic, or a message type.
 
-    time (T,) in s; columns: (T,) each, NaN for a missing value; run (T,): index of the recording of each row.
+    time (T,) in s; columns: (T,) each, NaN for a missing value; run (T,): index of the recording of each row; notes:
+    what the reader could not read, or did not use, in sentences; lines (T,): line of each row in a file of text. A
+    reader of columns leaves `time` empty: `stamps.stamped` finds it among the columns.
     """
 
     name: str
@@ -25,6 +28,9 @@ class Table:
     columns: dict[str, Array]
     run: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     rank: int = 0  # among tables with the same quantity, the lowest is used
+    notes: tuple[str, ...] = ()
+    lines: NDArray[np.intp] | None = None
+    source: str = ""  # name of the file
 
     def series(self, column: str, run: int) -> Series:
         """Return times and values of a column in one run, without missing values.
@@ -45,3 +51,8 @@ class Table:
             )
         new = np.diff(time, prepend=-np.inf) > 0.0  # the first of several samples at the same time
         return time[new], values[new]
+
+
+def notes_of(tables: Sequence[Table]) -> tuple[str, ...]:
+    """Return the notes of all tables, each once."""
+    return tuple(dict.fromkeys(note for table in tables for note in table.notes))

@@ -16,6 +16,7 @@ from pyulog import ULog
 
 from brakeline.deploy.data.coverage import coverage
 from brakeline.deploy.data.importer import import_sources, tables_of
+from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.quantity_names import resolve
 from brakeline.deploy.data.sources.tlog_file import _frames
 from brakeline.errors import NoSource
@@ -63,7 +64,7 @@ LOGS = {"copter.bin": simulated_bin, "copter.tlog": simulated_tlog, "px4.ulg": s
 @pytest.fixture(scope="module", params=LOGS)
 def flown(request):
     """What is read of each of the quadrotor's columns, (time, values); and the simulator's own time and position."""
-    places = resolve(tables_of(FLOWN / request.param), QUADROTOR, {})
+    places = resolve(tables_of(FLOWN / request.param), QUADROTOR, LogOptions())
     time, *places_then = LOGS[request.param]()
     read = {name: table.series(column, 0) for name, (table, column) in places.items()}
     since = read["x"][0][0]  # both logs begin together, within a tenth of a second

@@ -8,6 +8,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import import_sources, tables_of
+from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
@@ -82,7 +83,7 @@ def lengths(imported) -> list[int]:
 
 def test_a_recording_at_the_robots_period_is_taken_as_it_is():
     time, values = steady()
-    made = resample([table(time, values)], porter(), {})
+    made = resample([table(time, values)], porter(), LogOptions())
     states = np.vstack([t.states[:-1] for t in made.data.trajectories] + [made.data.trajectories[-1].states[-1:]])
     assert np.allclose(states, values[1:, :5]) and made.report.samples == 1
     assert lengths(made) == [99], "the first period tells the input in force"
@@ -91,22 +92,23 @@ def test_a_recording_at_the_robots_period_is_taken_as_it_is():
 def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     time, values = steady()
     kept = np.r_[0:30, 31:101]
-    assert lengths(resample([table(time[kept], values[kept])], porter(), {})) == [28, 68]
+    assert lengths(resample([table(time[kept], values[kept])], porter(), LogOptions())) == [28, 68]
     jumped = values + np.where(np.arange(101)[:, None] >= 40, [2.0, 0, 0, 0, 0, 0, 0], 0.0)
-    made = resample([table(time, jumped)], porter(), {})
+    made = resample([table(time, jumped)], porter(), LogOptions())
     assert lengths(made) == [38, 59] and "1 jumps of the pose" in made.report.notes
-    runs = resample([table(np.r_[time, time], np.vstack([values, values]), run=np.repeat([0, 1], 101))], porter(), {})
+    twice = np.r_[time, time], np.vstack([values, values])
+    runs = resample([table(*twice, run=np.repeat([0, 1], 101))], porter(), LogOptions())
     assert lengths(runs) == [99, 99]
     with pytest.raises(NoSource, match="time goes back from 20 to 0 s"):
-        resample([table(np.r_[time, time], np.vstack([values, values]))], porter(), {})
+        resample([table(*twice)], porter(), LogOptions())
     values[50, 5] = 0.7
-    made = resample([table(time, values)], porter(), {})
+    made = resample([table(time, values)], porter(), LogOptions())
     assert lengths(made) == [49, 48] and "1 periods left out: an input was outside" in made.report.notes[0]
 
 
 def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
     time, values = steady(step=0.06, turn=1.0)
-    made = resample([table(time, values)], porter(), {})
+    made = resample([table(time, values)], porter(), LogOptions())
     turned = np.concatenate([t.turned for t in made.data.trajectories])
     assert np.allclose(turned, 0.2, atol=1e-9)
 
@@ -114,21 +116,21 @@ def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
 def test_an_input_is_held_and_forgotten_after_a_while():
     time, values = steady()
     values[20:40, 5:] = np.nan  # nobody spoke for 4 s
-    made = resample([table(time, values)], porter(), {}, hold=1.0)
+    made = resample([table(time, values)], porter(), LogOptions(), hold=1.0)
     assert lengths(made) == [23, 59], "5 periods after its last word it is forgotten"
-    assert lengths(resample([table(time, values)], porter(), {}, hold=10.0)) == [99]
+    assert lengths(resample([table(time, values)], porter(), LogOptions(), hold=10.0)) == [99]
 
 
 def test_periods_begin_where_inputs_change_and_an_input_that_changed_within_counts_by_its_mean():
     time, values = steady(step=0.02)
     beat = np.floor((time - 0.06 + 1e-9) / 0.2)
     values[:, 5] = 0.1 + 0.05 * (beat % 3)
-    made = resample([table(time, values)], porter(), {})
+    made = resample([table(time, values)], porter(), LogOptions())
     inputs = np.concatenate([t.inputs[:, 0] for t in made.data.trajectories])
     assert set(np.round(inputs, 9)) == {0.1, 0.15, 0.2} and made.report.uneven == 0.0
     values[:, 5] = np.where((time % 0.2) < 0.049, 0.2, 0.4)
     values[:, 6] = np.repeat(np.arange(len(time) // 10 + 1), 10)[: len(time)] % 2  # the beat is this one's
-    made = resample([table(time, values)], porter(), {})
+    made = resample([table(time, values)], porter(), LogOptions())
     inputs = np.concatenate([t.inputs[:, 0] for t in made.data.trajectories])
     assert np.allclose(inputs, 0.35, atol=0.03) and made.report.uneven > 0.5
 
@@ -140,10 +142,10 @@ def test_the_delay_from_input_to_motion_is_found(driven, late):
     inputs = Table("", told.time, {name: told.columns[name] for name in COLUMNS[5:]}, told.run)
     seen = table(time, values)
     states = Table("", time, {name: seen.columns[name] for name in COLUMNS[:5]}, seen.run)
-    made = resample([states, inputs], porter(), {})
+    made = resample([states, inputs], porter(), LogOptions())
     for found in made.report.delays.values():
         assert found == pytest.approx(late, abs=0.03)
-    shifted = resample([states, inputs], porter(), {}, delay=late)
+    shifted = resample([states, inputs], porter(), LogOptions(), delay=late)
     assert max(shifted.report.delays.values()) <= 0.021
 
 
@@ -156,7 +158,7 @@ def test_paths_between_samples_are_within_the_bound_that_is_said():
         rows.append([*robot.true, *u])
         before = robot.true[:2].copy()
         truth.append(robot.step(u, 0.2) - before)
-    made = resample([table(0.2 * np.arange(400), np.array(rows))], porter(), {})
+    made = resample([table(0.2 * np.arange(400), np.array(rows))], porter(), LogOptions())
     assert made.report.samples == 1 and "one position per period" in " ".join(made.report.notes)
     away = _off_chord(np.array(truth))
     assert away.max() <= made.data.chord_deviation < 0.08, (away.max(), made.data.chord_deviation)
@@ -167,15 +169,15 @@ def test_what_is_missing_is_named_with_what_there_is(tmp_path, driven):
     path.write_text(path.read_text().replace("time,x,y,heading,v,", "time,x,why,heading,v,", 1))
     with pytest.raises(NoSource, match=r"y: there is no column 'y' .*\nThe source contains: columns: x, why, heading"):
         import_sources([path], porter())
-    assert import_sources([path], porter(), ["y=why"]).report.periods > 500
+    assert import_sources([path], porter(), LogOptions.parse(["y=why"])).report.periods > 500
     with pytest.raises(NoSource, match="one of x, y, heading, v, w, speed, turn rate"):
-        import_sources([path], porter(), ["z=why"])
+        import_sources([path], porter(), LogOptions.parse(["z=why"]))
     slow = write_csv(tmp_path / "slow.csv", driven[0][::25], driven[1][::25])
     with pytest.raises(NoSource, match=r"a sample every 0.5 s: the robot's period of 0.2 s"):
         import_sources([slow], porter())
     bad = tmp_path / "bad.csv"
-    bad.write_text("time,x\n0.0,1.0\n0.1,one\n")
-    with pytest.raises(NoSource, match=r"bad.csv, line 3: could not convert string to float: 'one'"):
+    bad.write_text("time,x\n0.0,one\n0.1,two\n")
+    with pytest.raises(NoSource, match=r"bad.csv, column x, line 2: it holds text \('one'\): the column is left out"):
         import_sources([bad], porter())
     with pytest.raises(NoSource, match=r"Brakeline reads \.csv, \.parquet"):
         tables_of(FILE)

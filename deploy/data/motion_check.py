@@ -1,0 +1,193 @@
+"""Compare the columns of a log with its motion: the differences of the positions show direction, speed and turn rate.
+
+A heading follows the direction of the motion, and a speed is the length of the way over its time. A column that does
+so only in another unit (degrees, km/h) has that unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from brakeline.deploy.data.aligned_log import AlignedLog, align
+from brakeline.deploy.data.sources.quantity_names import Places
+from brakeline.deploy.data.sources.source_table import Array
+from brakeline.deploy.data.stamps import FACTORS, TIME
+from brakeline.deploy.data.unit_table import COMPASS, UNITS, in_si
+from brakeline.errors import NoSource
+
+SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
+SAME_CORRELATION = 0.9  # of two columns of the same quantity
+SAME_GAIN = (0.75, 1.33)  # ratio of their standard deviations
+FOLLOWS_CORRELATION = 0.8  # of an input with the motion up to `MAX_LAG` later, so that its gain is its unit's
+MAX_LAG = 1.0  # s
+FEWEST_SPANS = 20  # fewer spans give no result
+LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h and ft/s differ by 10 %
+HEADING_UNITS = ("rad", "deg", COMPASS)
+WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
+
+
+class SpeedFit(NamedTuple):
+    """How well a column agrees with a speed of the motion, and how many times larger it is."""
+
+    correlation: float
+    gain: float
+    unit: str  # SI unit of the speed
+
+
+def refuse_contradictions(
+    places: Places, positions: list[str], inputs: list[str], heading: str, units: Mapping[str, str]
+) -> None:
+    """Raise NoSource with what to do if the motion contradicts the unit of a column."""
+    try:
+        log = align(places, positions, inputs, {})
+    except NoSource:
+        return  # too few rows to compare; `resample` says so
+    if problems := contradictions(log, heading, units):
+        raise NoSource("\n".join(problems))
+
+
+def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str]) -> list[str]:
+    """Return what the motion contradicts, in sentences that say what to do.
+
+    Args:
+        log: its heading is not unwrapped, and not set.
+        heading: name of the heading; empty for none.
+        units: SI unit that each column should have.
+    """
+    if heading:
+        unit, score = heading_unit(log, heading)
+        if unit != "rad":
+            return [heading_contradiction(heading, unit, score)]
+    speeds = speeds_of_motion(log, heading)
+    gains: dict[str, SpeedFit] = {}
+    for name, unit in units.items():
+        if unit in ("m/s", "rad/s") and name in log.columns:
+            fit = speed_fit(log, name, [s for s in speeds if s[0] == unit], name in log.inputs)
+            if fit is not None:
+                gains[name] = fit
+    return _explained(log, gains)
+
+
+def heading_contradiction(name: str, unit: str, score: float) -> str:
+    """Return the sentence for a heading that the motion follows in another unit only."""
+    return (
+        f"{name} looks like {WORDS[unit]}: in that unit, the motion agrees with it ({score:.0%}), in rad it does not. "
+        f"Convert it with --unit {name}={unit}"
+    )
+
+
+def heading_unit(log: AlignedLog, name: str) -> tuple[str, float]:
+    """Return the unit in which a column agrees best with the direction of motion, and its `heading_score`."""
+    scores = {unit: heading_score(log, name, unit) for unit in HEADING_UNITS}
+    best = max(scores, key=lambda unit: scores[unit])
+    clear = scores[best] > SAME_CORRELATION and scores[best] > scores["rad"] + 0.1
+    return (best, scores[best]) if clear else ("rad", scores["rad"])
+
+
+def heading_score(log: AlignedLog, name: str, unit: str = "rad") -> float:
+    """Return how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|, in [0, 1]."""
+    angles = in_si(log.columns[name], unit, "rad")
+    assert angles is not None
+    i, j = log.spans(SPAN)
+    x, y = (log.change(p, i, j) for p in log.positions[:2])
+    length = np.hypot(x, y)
+    far = length > 0.3 * np.quantile(length, 0.99) if len(length) else np.zeros(0, bool)
+    cosines = np.abs(np.cos(np.arctan2(y, x) - angles[(i + j) // 2]))[far]
+    # On a straight path a constant agrees as well as the heading does: require that the angle changes.
+    turned = np.ptp(angles) > 0.5
+    return float(cosines.mean()) if turned and len(cosines) >= FEWEST_SPANS else 0.0
+
+
+def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
+    """Return the speeds of all spans with their units: along and across the heading and around it, or along axes."""
+    i, j = log.spans(SPAN)
+    time = log.time[j] - log.time[i]
+    axes = [log.change(p, i, j) / time for p in log.positions]
+    if not heading:
+        return [("m/s", speed) for speed in axes]
+    angles = np.unwrap(log.columns[heading])
+    cos, sin = np.cos(angles[(i + j) // 2]), np.sin(angles[(i + j) // 2])
+    x, y = axes[:2]
+    return [
+        *(("m/s", cos * x + sin * y), ("m/s", cos * y - sin * x), ("m/s", np.hypot(x, y))),
+        ("rad/s", (angles[j] - angles[i]) / time),
+    ]
+
+
+def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool = False) -> SpeedFit | None:
+    """Return the speed of the motion that a column agrees with best, or None. The motion follows an input later."""
+    i, j = log.spans(SPAN)
+    sums = np.concatenate([[0.0], np.cumsum(log.columns[name])])
+    means = (sums[j + 1] - sums[i]) / (j - i + 1)
+    lags = range(0, round(MAX_LAG / log.step) + 1, max(round(0.1 / log.step), 1)) if is_input else (0,)
+    fits = [
+        SpeedFit(correlation(speed[lag:], means[:end]), _gain(speed[lag:], means[:end]), unit)
+        for unit, speed in speeds
+        for lag in lags
+        if (end := len(means) - lag) >= FEWEST_SPANS
+    ]
+    best = max(fits, default=SpeedFit(0.0, 0.0, ""))
+    return best if best.correlation > (FOLLOWS_CORRELATION if is_input else SAME_CORRELATION) else None
+
+
+def correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series; 0 for too few values, or if one is constant."""
+    if len(one) < FEWEST_SPANS or np.ptp(one) == 0.0 or np.ptp(other) == 0.0:
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _gain(one: Array, other: Array) -> float:
+    spread = float(np.std(one)) if len(one) else 0.0
+    return float(np.std(other)) / spread if spread else 0.0
+
+
+def same_gain(gain: float) -> bool:
+    """Return whether a gain is near 1."""
+    return SAME_GAIN[0] < gain < SAME_GAIN[1]
+
+
+def unit_like(gain: float, si: str) -> str:
+    """Return the unit that explains a gain, or an empty text."""
+    fits = {unit: abs(gain * scale - 1.0) for unit, scale in UNITS[si].items() if scale != 1.0}
+    best = min(fits, key=lambda unit: fits[unit])
+    return best if fits[best] < LIKE_UNIT and not same_gain(gain) else ""
+
+
+def speed_contradiction(name: str, fit: SpeedFit) -> str:
+    """Return the sentence for a speed in another unit; empty if the gain is near 1 or no unit explains it."""
+    unit = unit_like(fit.gain, fit.unit)
+    what = "speed" if fit.unit == "m/s" else "turn rate"
+    return (
+        f"{name} looks like {unit}: it is {fit.gain:.3g} times the {what} of the positions in {fit.unit}. "
+        f"Convert it with --unit {name}={unit}"
+        if unit
+        else ""
+    )
+
+
+def _explained(log: AlignedLog, gains: dict[str, SpeedFit]) -> list[str]:
+    """Explain gains by the stamps, if speeds and turn rates have the same, by the positions, or by each column."""
+    wrong = {name: fit for name, fit in gains.items() if not same_gain(fit.gain)}
+    values = [fit.gain for fit in wrong.values()]
+    alike = len(values) > 0 and max(values) < 1.1 * min(values)
+    if alike and {fit.unit for fit in wrong.values()} == {"m/s", "rad/s"} and len(wrong) == len(gains):
+        units = [unit for unit, scale in FACTORS.items() if abs(values[0] * scale - 1.0) < LIKE_UNIT]
+        hint = f"They look like {units[0]}: give" if units else "Give"
+        return [
+            f"the time stamps do not fit: {', '.join(wrong)} are {values[0]:.3g} times as fast as the positions move. "
+            f"{hint} the unit of the stamps with --unit {TIME}={units[0] if units else 'ms'}"
+        ]
+    linear = {name: fit for name, fit in gains.items() if fit.unit == "m/s"}
+    if alike and wrong.keys() == linear.keys() and values[0] < 1.0:
+        unit = next((u for u, scale in UNITS["m"].items() if abs(values[0] / scale - 1.0) < LIKE_UNIT), "")
+        if unit:
+            words = " ".join(f"{name}={unit}" for name in log.positions)
+            return [
+                f"{', '.join(log.positions)} look like {unit}: they move {1 / values[0]:.3g} times as fast as "
+                f"{', '.join(wrong)}. Convert them with --unit {words}"
+            ]
+    return [text for name, fit in wrong.items() if (text := speed_contradiction(name, fit))]

@@ -1,0 +1,320 @@
+"""Files of columns as other people write them: one drive in any dialect, unit and kind of stamps is one data set."""
+
+import json
+import math
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from brakeline.deploy.cli import main
+from brakeline.messaging.robot import robot_named
+from brakeline.safety.model.dataset import Dataset
+from tests.deploy.data.porter import COLUMNS, FILE, drive, write_csv
+from tests.deploy.data.test_importer import same
+
+EPOCH = 1_760_000_000
+STAMPS = {
+    "time": lambda t: f"{t:.2f}",
+    "timestamp": lambda t: f"{t:.2f}",
+    "t [ms]": lambda t: f"{1e3 * t:.0f}",
+    "time_us": lambda t: f"{1e6 * t:.0f}",
+    "Time": lambda t: f"{EPOCH + t:.2f}",
+    "stamp": lambda t: f"{1000 * EPOCH + round(1e3 * t)}",
+    "%time": lambda t: f"{1_000_000_000 * EPOCH + round(1e9 * t)}",
+    "datetime": lambda t: datetime.fromtimestamp(EPOCH + round(t, 2), UTC).isoformat(timespec="milliseconds"),
+}
+UNITS = {"heading": ("deg", math.radians(1.0)), "v": ("km/h", 1 / 3.6), "speed": ("mm/s", 1e-3), "x": ("cm", 0.01)}
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(seconds=60.0)
+
+
+@pytest.fixture(scope="module")
+def plain(driven, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plain")
+    return imported(write_csv(folder / "drive.csv", *driven))
+
+
+def imported(path, *words) -> Dataset:
+    out = path.with_suffix(".safetensors")
+    assert main(["import", str(path), "--robot", str(FILE), "--out", str(out), *words]) == 0
+    return Dataset.load(out)
+
+
+@st.composite
+def ways(draw):
+    """How to write the drive: (text, encoding, options of the import), as a function of the drive."""
+    separator = draw(st.sampled_from([",", ";", "\t", "|", ", ", " "]))
+    decimal = draw(st.sampled_from(".," if separator in (";", "\t", "|") else "."))
+    stamp = draw(st.sampled_from([name for name in STAMPS if separator != " " or " " not in name]))
+    end = draw(st.sampled_from(["\n", "\r\n"]))
+    encoding = draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]))
+    header = draw(st.sampled_from(["plain", "commented", "after comments", "quoted"]))
+    last = draw(st.sampled_from(["whole", "half written", "without end"]))
+    units = draw(st.sets(st.sampled_from(sorted(UNITS))))
+    named_in = draw(st.sampled_from(["header", "option"])) if separator != " " else "option"
+    order = draw(st.permutations(range(len(COLUMNS))))
+
+    def write(time, values):
+        values, names, words = values.copy(), list(COLUMNS), []
+        for name in sorted(units):
+            unit, scale = UNITS[name]
+            values[:, COLUMNS.index(name)] /= scale
+            if named_in == "header":
+                names[COLUMNS.index(name)] = f"{name} [{unit}]"
+            else:
+                words += ["--unit"] * (not words) + [f"{name}={unit}"]
+        if separator == " ":
+            names = [name.replace(" ", "_") for name in names]
+        names = [stamp, *(names[i] for i in order)]
+        names = [f'"{name}"' for name in names] if header == "quoted" else names
+        rows = [[STAMPS[stamp](t), *(repr(float(row[i])) for i in order)] for t, row in zip(time, values, strict=True)]
+        lines = [separator.join(cell.replace(".", decimal) if decimal == "," else cell for cell in row) for row in rows]
+        first = ("# " if header == "commented" else "") + separator.join(names)
+        comments = ["# logger v2", "# robot: porter, run 3"] if header == "after comments" else []
+        text = end.join([*comments, first, *lines]) + end
+        text += {"whole": "", "half written": lines[-1][: len(lines[-1]) // 2], "without end": lines[-1]}[last]
+        return text, encoding, words
+
+    return write
+
+
+@settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(way=ways())
+def test_one_drive_in_any_dialect_unit_and_stamps_is_one_data_set(way, driven, plain, tmp_path_factory):
+    text, encoding, words = way(*driven)
+    path = tmp_path_factory.mktemp("way") / "drive.csv"
+    path.write_bytes(text.encode(encoding))
+    same(plain, imported(path, *words), 1e-5)
+
+
+# --- units that the motion contradicts ----------------------------------------------------------------------------
+
+
+def refused(capsys, words):
+    assert main([str(word) for word in words]) == 1
+    return " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "said"),
+    [
+        (["heading"], 180 / math.pi, "heading looks like degrees"),
+        (["v"], 3.6, "v looks like km/h: it is 3.6"),
+        (["v", "speed"], 1000.0, "--unit v=mm/s"),
+        (["w"], 180 / math.pi, "w looks like deg/s"),
+        (["x", "y"], 1000.0, "x, y look like mm"),
+    ],
+)
+def test_units_that_the_motion_contradicts_are_refused(driven, tmp_path, capsys, columns, factor, said):
+    time, values = driven
+    values = values.copy()
+    for name in columns:
+        values[:, COLUMNS.index(name)] *= factor
+    path = write_csv(tmp_path / "drive.csv", time, values)
+    out = tmp_path / "none.safetensors"
+    text = refused(capsys, ["import", path, "--robot", FILE, "--out", out])
+    assert said in text and "--unit" in text and not out.exists()
+    if columns != ["x", "y"]:  # a description has metres; only a known speed shows that they are none
+        text = refused(capsys, ["robot", "new", tmp_path / "my.toml", "--from", path])
+        assert said in text and not (tmp_path / "my.toml").exists()
+
+
+def test_a_compass_heading_is_named_and_converted(driven, plain, tmp_path, capsys):
+    time, values = driven
+    values = values.copy()
+    values[:, 2] = (90.0 - np.degrees(values[:, 2])) % 360.0
+    path = write_csv(tmp_path / "drive.csv", time, values)
+    text = refused(capsys, ["import", path, "--robot", FILE, "--out", tmp_path / "a.safetensors"])
+    assert "heading looks like a compass heading" in text and "--unit heading=compass" in text
+    same(plain, imported(path, "--unit", "heading=compass"), 1e-5)
+
+
+def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):
+        assert said in refused(capsys, ["import", path, "--robot", FILE, "--unit", word])
+
+
+def test_stamps_in_a_given_unit_that_the_motion_contradicts_are_refused(driven, tmp_path, capsys):
+    time, values = driven
+    path = write_csv(tmp_path / "drive.csv", 8.0 * time, values)  # a row every 0.16 s: plausible by itself
+    text = refused(capsys, ["import", path, "--robot", FILE])
+    assert "the time stamps do not fit" in text
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e5])
+def test_implausible_stamps_are_refused(driven, tmp_path, capsys, scale):
+    time, values = driven
+    path = tmp_path / "drive.csv"
+    rows = [",".join(map(repr, map(float, row))) for row in np.column_stack([scale * time, values])]
+    path.write_text("\n".join([",".join(("time", *COLUMNS)), *rows]) + "\n")
+    text = refused(capsys, ["robot", "new", tmp_path / "my.toml", "--from", path, "--unit", "time=s"])
+    assert "not plausible" in text and "--unit time=ms" in text
+
+
+# --- the period, bounds and choice of a description ---------------------------------------------------------------
+
+
+def held(seconds=120.0, seed=0):
+    """A drive of somebody who holds the stick for a second at a time, commanded every 0.1 s."""
+    from tests.deploy.data.porter import STEP, Porter
+
+    rng = np.random.default_rng(seed)
+    robot, rows, u, left = Porter(rng), [], np.zeros(2), 0
+    for k in range(round(seconds / STEP)):
+        if k % 5 == 0:
+            if left == 0:
+                u, left = rng.choice([0.0, 0.3, 0.6], 2) * [1.0, rng.choice([-2.0, 2.0])], int(rng.integers(3, 21))
+            left -= 1
+        rows.append([*robot.measured(), *u])
+        robot.step(u)
+    values = np.array(rows)
+    values[:, 2] = (values[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return STEP * np.arange(len(rows)), values
+
+
+def described(path, *words, name="my"):
+    toml = path.parent / f"{name}.toml"
+    assert main(["robot", "new", str(toml), "--from", str(path), *map(str, words)]) == 0
+    assert main(["robot", "check", str(toml)]) == 0
+    return robot_named(str(toml)), toml.read_text()
+
+
+def test_the_period_is_the_beat_of_a_stick_that_is_held(tmp_path, capsys):
+    robot, text = described(write_csv(tmp_path / "held.csv", *held()))
+    assert robot.period == pytest.approx(0.1)
+    sure = re.search(r"(\d+)% of (\d+) times between two changes", text)
+    assert sure and int(sure[1]) > 95 and int(sure[2]) > 30
+
+
+def test_inputs_that_change_at_any_time_have_no_beat(tmp_path, capsys):
+    time, values = held()
+    rng = np.random.default_rng(2)
+    moments = np.cumsum(rng.exponential(0.8, 400))
+    values[:, 5:] = rng.choice([0.0, 0.3, 0.6], (401, 2))[np.searchsorted(moments, time)]
+    robot, text = described(write_csv(tmp_path / "any.csv", time, values))
+    assert robot.period == pytest.approx(0.1) and "a guess" in text
+
+
+def test_glitches_are_named_and_cut(driven, tmp_path, capsys):
+    time, values = driven
+    values = values.copy()
+    for row, column, value in ((700, 5, 51.0), (701, 5, 51.0), (1500, 5, -40.0), (2000, 3, 900.0), (2500, 0, 77.0)):
+        values[row, column] = value
+    path = write_csv(tmp_path / "glitchy.csv", time, values)
+    clean, _ = described(write_csv(tmp_path / "clean.csv", *driven), name="clean")
+    robot, text = described(path)
+    assert robot.action_high == clean.action_high and robot.brake_steps == clean.brake_steps
+    assert "glitchy.csv, line 702, column speed: 51 is a glitch" in text
+    assert "glitchy.csv, line 2002, column v: 900 is a glitch" in text and "line 2502, column x: 77" in text
+    capsys.readouterr()
+    assert main(["import", str(path), "--robot", str(FILE), "--out", str(tmp_path / "a.safetensors"), "--json"]) == 0
+    notes = json.loads(capsys.readouterr().out)["report"]["notes"]
+    assert any("line 2002, column v: 900 is a glitch" in note and "left out" in note for note in notes)
+    assert any("line 702, column speed: 51 is a glitch" in note and "cut there" in note for note in notes)
+    data = Dataset.load(tmp_path / "a.safetensors")
+    assert max(np.abs(t.states[:, 3]).max() for t in data.trajectories) < 1.0
+
+
+def test_columns_are_chosen_on_robot_new_and_import(driven, tmp_path, capsys):
+    time, values = driven
+    others = np.random.default_rng(0).normal(size=(len(time), 200))
+    names = tuple(f"q{i}" for i in range(len(COLUMNS))) + tuple(f"sensor_{i}" for i in range(200))
+    path = write_csv(tmp_path / "wide.csv", time, np.column_stack([values, others]), names)
+    assert "--map x=COLUMN y=COLUMN" in refused(capsys, ["robot", "new", tmp_path / "no.toml", "--from", path])
+    places = [f"{name}=q{i}" for i, name in enumerate(COLUMNS)]
+    places[5:] = ["command v=q5", "command w=q6"]
+    robot, _ = described(path, "--map", *places)
+    assert robot.state == ("x [m]", "y [m]", "heading [rad]", "v [m/s]", "w [rad/s]")
+    assert robot.action == ("v [m/s]", "w [rad/s]")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "brakeline import" in said and '--map x=q0 y=q1 heading=q2 v=q3 w=q4 "command v=q5"' in said
+    out = tmp_path / "a.safetensors"
+    toml = str(tmp_path / "my.toml")
+    assert main(["import", str(path), "--robot", toml, "--map", *places, "--out", str(out)]) == 0
+    narrow = write_csv(
+        tmp_path / "narrow.csv", time, np.column_stack([values, others[:, :50]]), (*COLUMNS, *names[-50:])
+    )
+    robot, text = described(narrow, name="narrow")
+    assert len(robot.state) == 5 and "left out, as the motion shows no role of them: sensor_180" in text
+
+
+def test_several_logs_describe_one_robot(tmp_path, capsys):
+    fast, slow = drive(seconds=60.0), drive(seconds=60.0, seed=3)
+    slow[1][:, 5] = np.minimum(slow[1][:, 5], 0.2)
+    paths = [write_csv(tmp_path / "slow.csv", *slow), write_csv(tmp_path / "fast.csv", *fast)]
+    toml = tmp_path / "both.toml"
+    assert main(["robot", "new", str(toml), "--from", *map(str, paths)]) == 0
+    assert robot_named(str(toml)).action_high == (0.6, 1.5) and "slow.csv, fast.csv" in toml.read_text()
+
+
+def test_a_description_without_varying_inputs_passes_and_says_what_to_drive(driven, tmp_path, capsys):
+    time, values = driven
+    values = values.copy()
+    values[:, 5:] = 0.0
+    path = write_csv(tmp_path / "still.csv", time, values, (*COLUMNS[:5], "command v", "command w"))
+    _, text = described(path)
+    assert "record a drive with changing v and w" in text
+
+
+# --- stamps that step back, damage --------------------------------------------------------------------------------
+
+
+def test_a_step_back_of_the_stamps_cuts_the_recording(driven, tmp_path, capsys):
+    time, values = driven
+    path = write_csv(tmp_path / "twice.csv", np.r_[time, time], np.vstack([values, values]))
+    out = tmp_path / "a.safetensors"
+    assert main(["import", str(path), "--robot", str(FILE), "--out", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)["report"]
+    assert any(
+        "line 3002: the time goes back from 59.98 to 0 s: the recording is cut there" in n for n in report["notes"]
+    )
+    assert report["periods"] == pytest.approx(2 * len(time) / 10, rel=0.05)
+
+
+def test_rows_out_of_order_are_sorted(driven, plain, tmp_path, capsys):
+    time, values = driven
+    order = np.arange(len(time))
+    order[1000], order[1001] = 1001, 1000
+    path = write_csv(tmp_path / "late.csv", time[order], values[order])
+    same(plain, imported(path), 1e-9)
+    assert "1 rows are out of order" in " ".join(capsys.readouterr().out.split())
+
+
+def test_damaged_lines_and_cells_are_named(driven, plain, tmp_path, capsys):
+    path = write_csv(tmp_path / "torn.csv", *driven)
+    lines = path.read_text().splitlines(keepends=True)
+    lines[500] = lines[500][:20] + "\n"
+    lines[700] = re.sub(r",[^,]*,", ",###,", lines[700], count=1)
+    path.write_text("".join(lines))
+    imported(path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "torn.csv, line 501: not 8 cells, as the header has: left out" in said
+    assert "torn.csv, column x, line 701: no number ('###'): the cell is left out" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "the file has no rows"),
+        ("time,x\n", "a header, but no whole row"),
+        ("a,b\n1,2\n2,3\n", "no column is known to hold time stamps: name it with --map time=COLUMN"),
+        ("0.0,1.0\n0.1,1.1\n0.2,1.2\n", "line 1: there is no header; the columns are column 1 to column 2"),
+        ("time,x\n" + "1,2\n" * 30, "the time stamps never increase"),
+        ("time,x,y\n" + "1,2\n" * 30, "line 2: 2 cells, but the header has 3 names"),
+        ("time,x,x,y\n" + "".join(f"{i},1,2,3\n" for i in range(30)), "x (column 2), x (column 3)"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_the_cause(tmp_path, capsys, text, said):
+    path = tmp_path / "odd.csv"
+    path.write_text(text)
+    assert said in refused(capsys, ["import", path, "--robot", FILE])
+    assert said in refused(capsys, ["robot", "new", Path(tmp_path) / "my.toml", "--from", path])
