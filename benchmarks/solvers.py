@@ -15,7 +15,7 @@ from benchmarks import situations
 from benchmarks.decide import SCANS
 from benchmarks.timing import Figures, each
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.filter import filter as filtering
+from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.qp_solver import ACCURACY, SOLVED, QuadraticProgram, Solution, solve
 from brakeline.sim.sim_conditions import Conditions
@@ -39,7 +39,7 @@ def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | No
         return solve(program)
 
     ready = Filter(situations.model(certificate, robot=robot))
-    with patch.object(filtering, "solve", note):
+    with patch.object(plan_search, "solve", note):
         for request in situations.requests(ready, situations.messages(robot=robot, conditions=conditions)):
             ready.decide(request)
     return seen

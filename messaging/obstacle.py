@@ -108,6 +108,12 @@ class Shapes:
     def __len__(self) -> int:
         return len(self.rho)
 
+    @property
+    def parts(self) -> tuple[Array, Array, Array, Array, Array]:
+        """The arrays of the surfaces, without the margins, as compiled code needs them."""
+        whole = np.ascontiguousarray
+        return whole(self.center), whole(self.axes), whole(self.half), whole(self.rho), whole(self.round)
+
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> Shapes:
         """Stack obstacles.

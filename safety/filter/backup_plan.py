@@ -33,12 +33,12 @@ class Prediction:
 
     def contains(self, robot: Robot, state: Array) -> bool:
         """Return whether the measured state (n,) lies in the set."""
-        away = state - self.center
+        away = (state - self.center).tolist()  # a few numbers: a loop is faster than NumPy
         if robot.heading is not None:
             cos, sin = math.cos(self.heading), math.sin(self.heading)
             away[0], away[1] = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
-            away[robot.heading] = (away[robot.heading] + np.pi) % (2.0 * np.pi) - np.pi
-        return bool((np.abs(away) <= self.half_width + SAME_SET).all())
+            away[robot.heading] = (away[robot.heading] + math.pi) % math.tau - math.pi
+        return all(abs(off) <= most + SAME_SET for off, most in zip(away, self.half_width.tolist(), strict=True))
 
 
 NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that predicts nothing

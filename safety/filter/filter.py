@@ -12,8 +12,7 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter_ns
 
@@ -22,14 +21,13 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes
-from brakeline.safety.filter.constraints import LocalMap, TubeConstraints, turning_extent
+from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
+from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.plan_inputs import PlanInputs
-from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows, QPBuilder
-from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
-from brakeline.safety.filter.reachable_tube import RolloutTube
+from brakeline.safety.filter.plan_search import Candidate, PlanSearch, Record
+from brakeline.safety.filter.qp import QPBuilder
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import (
     ADJUSTED,
@@ -44,62 +42,16 @@ from brakeline.safety.filter.request import (
     check_surroundings,
 )
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.model.model_set import ModelSet, extra_coordinates, scored_coordinates
+from brakeline.safety.filter.tube_extent import turning_extent
+from brakeline.safety.filter.window_score import WindowScore
+from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
-from brakeline.safety.model.windows import displacement
 from brakeline.safety.perception.scan_free_space import shows_free
 
 Array = NDArray[np.float64]
 
-NO_ROWS = np.zeros(0)
-LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
-
-
-@dataclass
-class _Record:
-    """What the filter learns during one decision, for its report."""
-
-    started: int
-    solver: str = ""
-    iterations: int = 0
-    solve_ns: int = 0
-    reason: str = ""
-    contained: bool = True
-    broken: int = 0
-    blocked_by: BlockingConstraint | None = None
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A plan that the filter may answer with.
-
-    Attributes:
-        plan (N, m), z (nz,): the inputs, and the regressors of their tube.
-        margin [m]: distance of the tube to the nearest half-space (docs/method.md §3).
-        constraints: the constraints whose tube belongs to the plan.
-        continues: the plan is the committed backup plan, and its earlier verification holds.
-        for_clearance: the proposal's tube is verified too, but comes nearer than the clearance margin.
-    """
-
-    kind: str
-    plan: Array
-    z: Array
-    margin: float
-    verified: bool
-    constraints: TubeConstraints
-    continues: bool = False
-    for_clearance: bool = False
-
-
-@dataclass(frozen=True)
-class _Linearized:
-    """Rows of a plan's surroundings, with the tube and the half-spaces that they come from."""
-
-    constraints: TubeConstraints
-    rows: ConstraintRows
-    planes: list[Planes]
 
 
 class Filter:
@@ -109,6 +61,7 @@ class Filter:
         tube: the exact tube, for the final check. The QP uses an outer tube (docs/method.md §2).
         constraints: holds the tube of any plan against a map of the surroundings.
         in_place: bounds of z (2, nz), and the constraints for plans in place within them; None without such plans.
+        standing (m,): inputs that leave the robot in place. translating (nz,): 1 for free inputs that move it, else 0.
         domain (2, r): recorded range of [x_0; input in force], with room for rounding.
         clearance_margin [m]: distance to obstacles that the QP keeps.
         reach [m]: an obstacle farther away cannot decide anything.
@@ -140,14 +93,9 @@ class Filter:
         self.ordinary = FastRequestCheck(robot)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
-        self.first_free = robot.regressor_dim + robot.committed_steps * robot.action_dim  # of regressors
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
-        steps = model.steps if model.one_step is not None else ()
-        n = robot.state_dim  # for scores: W is the same for all periods
-        self._scored = list(scored_coordinates(robot))
-        self._kappa, self._M = (np.array([getattr(step, name)[:n] for step in steps]) for name in ("kappa", "M"))
-        self._w = np.array([step.w[:n] for step in steps])
+        self._score = None if model.one_step is None else WindowScore(model, model.one_step)
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
     @classmethod
@@ -177,22 +125,21 @@ class Filter:
         """
         state = self.robot.state_at_inputs(speed)
         z = np.concatenate([state[self.regressor], speed, np.tile(speed, self.robot.free_steps)])
-        tube = self._constraints_for(z).tube
+        tube = self.constraints_for(z).tube
         if not self.robot.position_dim:
             half = np.zeros(self.robot.state_dim)
             half[list(extra_coordinates(self.robot))] = tube.more_half_widths(z)[-1]
             return float((np.abs(self.robot.limit_weights) @ half / self.robot.limit_scales).max())
         return float(tube.half_widths(z)[-1].max())
 
-    def _turns_in_place(self, z: Array) -> bool:
+    def turns_in_place(self, z: Array) -> bool:
         """Return whether the plan with regressors z belongs to those in place, which have their own tube."""
         return self.in_place is not None and tube_kernels.within(z, self.in_place[0])
 
-    def _constraints_for(self, z: Array, widening: float = 1.0) -> TubeConstraints:
+    def constraints_for(self, z: Array, widening: float = 1.0) -> TubeConstraints:
         """Return the constraints for the plan with regressors z: of plans in place, or of all plans; exact for z."""
-        if self.in_place is not None and tube_kernels.within(z, self.in_place[0]):
-            return self.in_place[1].at(z, widening)
-        return self.constraints.at(z, widening)
+        own = self.in_place[1] if self.in_place is not None and self.turns_in_place(z) else self.constraints
+        return own.at(z, widening)
 
     # --- one decision ------------------------------------------------------------------------------------------
 
@@ -202,7 +149,7 @@ class Filter:
         Raises:
             BadRequest: a value is missing, not finite or of the wrong size; the error names the field.
         """
-        record = _Record(perf_counter_ns())
+        record = Record(perf_counter_ns())
         if self.ordinary(request):
             check_surroundings(self.robot, request)
         else:
@@ -226,7 +173,7 @@ class Filter:
             record.reason = blind
         elif in_domain:
             committed = request.plan[self.robot.committed_steps : self.robot.free_steps].ravel()
-            candidate = self._search(local_map, z_0, proposal, committed, record)
+            candidate = PlanSearch(self, local_map, z_0, proposal, record).candidate(committed)
         else:
             record.reason = "the state is outside the domain that was recorded"
         if candidate is None:
@@ -235,181 +182,9 @@ class Filter:
                 candidate = self._recovered(request, local_map, z_0) or candidate
         return self._decision(request, local_map, candidate, record)
 
-    def _search(
-        self, local_map: LocalMap, z_0: Array, proposal: Array, committed: Array, record: _Record
-    ) -> _Candidate | None:
-        """Return the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal.
-
-        committed: free inputs of the committed plan.
-        """
-        z = self.inputs.regressors(z_0, proposal)
-        everywhere = local_map.empty and self.constraints.limits is None
-        if everywhere and not self.constraints.far and local_map.widening == 1.0:
-            constraints = self._constraints_for(z)
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, self.reach, True, constraints)
-        constraints = self._constraints_for(z, local_map.widening)
-        if everywhere and (margin := constraints.least(NO_ROWS, z)) >= max(self.clearance_margin, 0.0):
-            return _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-        general = self.constraints.at(z, local_map.widening) if self._turns_in_place(z) else constraints
-        planes = constraints.planes(local_map, z)
-        slack = constraints.slack(local_map, z, planes)
-        margin = constraints.least(slack, z)
-        allowed = _Candidate(ALLOWED, self.inputs.plan(z), z, margin, True, constraints)
-        # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
-        if margin >= (0.0 if self._turns_in_place(z) else max(self.clearance_margin, 0.0)):
-            return allowed
-        rows = general.rows(local_map, z, planes)
-        if constraints.least(slack - self.clearance_margin * rows.keep, z, self.clearance_margin) >= 0.0:
-            return allowed
-        proposed = _Linearized(general, rows, planes)
-        kept = self._with_clearance_margin(local_map, proposed, z_0, proposal)
-        if margin >= 0.0 and general.margin(kept, z) >= 0.0:
-            return allowed
-        edge = "m of the free space's edge" if self.robot.position_dim else "(in its own unit) of a limit"
-        record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
-        kept_off = self.clearance_margin * rows.keep if margin >= 0.0 else np.zeros(len(slack))
-        record.blocked_by = constraints.worst_of(local_map, z, slack, planes, kept_off)
-        # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
-        # meet the first rows.
-        adjusted = None
-        for with_clearance in (True, False):
-            if not with_clearance and margin >= 0.0:
-                return allowed
-            starts = self._starting_points(local_map, proposed, z_0, committed)
-            found = (self._solve(local_map, start, z_0, proposal, with_clearance, record) for start in starts)
-            adjusted = next((candidate for candidate in found if candidate is not None), None)
-            if adjusted is not None:
-                adjusted = replace(adjusted, for_clearance=margin >= 0.0)
-                break
-        adjusted = self._turned_only(local_map, z_0, proposal, adjusted) or adjusted
-        if adjusted is None:
-            record.reason += "; no verified input was found"
-        return adjusted
-
-    def _starting_points(
-        self, local_map: LocalMap, proposed: _Linearized, z_0: Array, committed: Array
-    ) -> Iterator[_Linearized]:
-        """Yield the proposal; for a rollout also the committed plan and the strongest braking, linearised.
-
-        A linear tube has the same rows everywhere.
-        """
-        yield proposed
-        if not isinstance(self.tube, RolloutTube):
-            return
-        stop = self.inputs.regressors(z_0, self.inputs.nothing)
-        for z in (np.concatenate([z_0, self.inputs.within(committed, z_0[-self.robot.action_dim :])]), stop):
-            constraints = self.constraints.at(z, local_map.widening)
-            planes = constraints.planes(local_map, z)
-            yield _Linearized(constraints, constraints.rows(local_map, z, planes), planes)
-
-    def _solve(
-        self,
-        local_map: LocalMap,
-        start: _Linearized,
-        z_0: Array,
-        proposal: Array,
-        with_clearance: bool,
-        record: _Record,
-    ) -> _Candidate | None:
-        """Return the verified plan closest to the proposal, or None (docs/method.md §4, §13).
-
-        The QP is linear in the inputs; a rollout is not. If its answer is not verified, the filter linearises the
-        rollout there and solves the QP again.
-        """
-        at = start
-        for _ in range(LINEARIZATIONS):
-            choice = self._with_clearance_margin(local_map, at, z_0, proposal) if with_clearance else at.rows
-            if not np.isfinite(choice.bound).all():
-                return None
-            z = self._closest(choice, z_0, proposal, record)
-            if z is None:
-                return None
-            exact = self.constraints.at(z, local_map.widening)
-            if exact is at.constraints:  # a linear tube: the rows hold everywhere
-                if exact.margin(choice, z) < 0.0:
-                    return None
-                return _Candidate(ADJUSTED, self.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
-            planes = exact.planes(local_map, z)
-            rows = exact.rows(local_map, z, planes)
-            at = _Linearized(exact, rows, planes)
-            margin, needed = exact.margin(rows, z), 0.0
-            if with_clearance:
-                kept = self._with_clearance_margin(local_map, at, z_0, proposal)
-                needed = exact.least(kept.bound[: len(rows.bound)] - rows.support(exact.tube, z), z)
-            if margin >= 0.0 and needed >= 0.0:
-                return _Candidate(ADJUSTED, self.inputs.plan(z), z, margin, True, exact)
-        return None
-
-    def _turned_only(
-        self, local_map: LocalMap, z_0: Array, proposal: Array, adjusted: _Candidate | None
-    ) -> _Candidate | None:
-        """Return the proposal without the inputs that move the position, if it is the better candidate.
-
-        It is better if its plan is verified and closer to the proposal than the QP's answer.
-        """
-        if self.in_place is None:
-            return None
-        (box, constraints), m = self.in_place, len(proposal)
-        turn = np.where(self.standing, np.clip(proposal, *box[:, -m:]), self.inputs.nothing)
-        z = self.inputs.regressors(z_0, self.inputs.limited(turn, z_0[-m:]))
-        if not tube_kernels.within(z, box) or (
-            adjusted is not None and self._off(adjusted.z, proposal) <= self._off(z, proposal)
-        ):
-            return None
-        constraints = constraints.at(z, local_map.widening)
-        margin, for_clearance = constraints.margin_in(local_map, z), adjusted is not None and adjusted.for_clearance
-        if margin < 0.0:
-            return None
-        return _Candidate(ADJUSTED, self.inputs.plan(z), z, margin, True, constraints, for_clearance=for_clearance)
-
-    def _off(self, z: Array, proposal: Array) -> float:
-        """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""
-        first = z[self.first_free : self.first_free + len(proposal)]
-        return float(np.linalg.norm((first - proposal) / (self.inputs.high - self.inputs.low)))
-
-    def _closest(self, rows: ConstraintRows, z_0: Array, proposal: Array, record: _Record) -> Array | None:
-        """Solve the QP; return its answer, clipped to bounds and slew, as regressors, or None without an answer."""
-        before = perf_counter_ns()
-        program = self.builder.program(rows, z_0, proposal)
-        solution = solve(program) if program is not None else INFEASIBLE
-        record.solve_ns += perf_counter_ns() - before
-        record.solver, record.iterations = solution.status, record.iterations + solution.iterations
-        if not solution.found:
-            return None
-        free = self.inputs.within(self.builder.inputs(solution.x), z_0[-self.robot.action_dim :])
-        return np.concatenate([z_0, free])
-
-    def _with_clearance_margin(
-        self, local_map: LocalMap, at: _Linearized, z_0: Array, proposal: Array
-    ) -> ConstraintRows:
-        """Tighten the rows by the clearance margin.
-
-        Where turning in place would not keep the margin, two rows take the place of one: the row for free space alone,
-        and a row that forbids inputs that move the robot nearer than the strongest braking does.
-        """
-        rows, before = at.rows, z_0[-len(proposal) :]
-        in_place = self.inputs.limited(np.where(self.standing, proposal, self.inputs.nothing), before)
-        stay = self.inputs.regressors(z_0, in_place)
-        if self._turns_in_place(stay):  # turns have their own tube: room to stand is enough
-            stay = self.inputs.regressors(z_0, self.inputs.limited(self.inputs.nothing, before))
-        kept_off = self.clearance_margin * rows.keep
-        staying = self.constraints.at(stay, local_map.widening)
-        there = rows if staying is at.constraints else staying.rows(local_map, stay, at.planes)
-        inside = there.support(self.tube, stay) > there.bound - kept_off
-        bound = np.where(inside, rows.bound, rows.bound - kept_off)
-        if not inside.any():
-            return ConstraintRows(rows.gradient, rows.spread, bound, rows.keep)
-        closer = rows.gradient[inside] * self.translating
-        return ConstraintRows(
-            np.vstack([rows.gradient, closer]),
-            np.vstack([rows.spread, np.zeros((len(closer), rows.spread.shape[1]))]),
-            np.concatenate([bound, closer @ stay + 2.0 * ROW_TIGHTENING]),
-            np.concatenate([rows.keep, np.zeros(len(closer))]),
-        )
-
     def _committed(
-        self, request: Request, local_map: LocalMap, z_0: Array, record: _Record, in_domain: bool
-    ) -> _Candidate:
+        self, request: Request, local_map: LocalMap, z_0: Array, record: Record, in_domain: bool
+    ) -> Candidate:
         """Return the committed backup plan, or braking that is verified anew, or braking that is not verified.
 
         The committed plan still counts as verified if the measured state is in the predicted set, this model set
@@ -427,19 +202,19 @@ class Filter:
         chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
         if record.contained and vouched:
-            constraints = self._constraints_for(as_committed, local_map.widening)
+            constraints = self.constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
-            return _Candidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
+            return Candidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
         for z in (as_committed, brake):
-            constraints = self._constraints_for(z, local_map.widening)
+            constraints = self.constraints_for(z, local_map.widening)
             margin = constraints.margin_in(local_map, z)
             if in_domain and margin >= 0.0:
-                return _Candidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
-        return _Candidate(FAILSAFE, self.inputs.plan(brake), brake, margin, False, constraints)
+                return Candidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
+        return Candidate(FAILSAFE, self.inputs.plan(brake), brake, margin, False, constraints)
 
-    def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> _Candidate | None:
+    def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> Candidate | None:
         """Return a slow way out for a robot that stands, or is on such a way, where standing is not verified.
 
         The violation must exceed what two measurement errors explain, plus the clearance margin for a robot that stays
@@ -461,7 +236,7 @@ class Filter:
             seeming = 2.0 * self.constraints.measurement_error + (
                 self.clearance_margin if self.constraints.stays else 0.0
             )
-        if self._constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
+        if self.constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
             return None
         constraints = self.constraints.at(stand, local_map.widening)
         planes = constraints.planes(local_map, stand, leaving=True)
@@ -497,9 +272,9 @@ class Filter:
         else:
             return None
         margin, constraints = constraints.margin(rows, z), self.constraints.at(z, local_map.widening)
-        return _Candidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
+        return Candidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
 
-    def _decision(self, request: Request, local_map: LocalMap, candidate: _Candidate, record: _Record) -> Decision:
+    def _decision(self, request: Request, local_map: LocalMap, candidate: Candidate, record: Record) -> Decision:
         z, constraints = candidate.z, candidate.constraints
         centers, half = constraints.sets(local_map.start, local_map.turn, z)
         reservation = request.reservation
@@ -538,26 +313,17 @@ class Filter:
     def score(self, request: Request) -> float | None:
         """Return the largest ratio of an error to its set in the window that ends with the request (§15).
 
-        The sets are those without widening. None if there is no window, or no predictor for driving of any kind.
+        None if there is no window, or no predictor for driving of any kind.
         """
-        model, past = self.model, request.past
-        if model.one_step is None or past is None or not request.finite:
+        if self._score is None or request.past is None or not request.finite:
             return None
-        robot = self.robot
-        z = np.concatenate([past.states[0, self.regressor], past.inputs.ravel()])
-        after = displacement(robot, past.states[0], np.vstack([past.states[1:], request.state]))
-        off = np.abs(after - model.one_step.rollouts(robot, z[None])[0, :, : robot.state_dim])
-        widths = self._kappa @ np.abs(z) + self._M @ np.abs(model.steps[0].W @ z) + self._w
-        widths *= model.one_step.stretches(robot, z[None])[0][:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(off > 0.0, off / widths, 0.0)
-        return float(max(shares[:, self._scored].max(), shares[0].max()))
+        return self._score(request.past, request.state)
 
     def standing_reservation(self, state: Array) -> Reservation:
         """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        start, constraints = state[: self.robot.position_dim], self._constraints_for(z)
+        start, constraints = state[: self.robot.position_dim], self.constraints_for(z)
         return self._reserve(constraints, start, *constraints.sets(start, constraints.turn(heading), z), z)
 
     def _reserve(

@@ -9,8 +9,6 @@ within a period, and a plane for one end alone would exclude the other end.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,20 +38,9 @@ def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, mea
         normals a (n, N, d) and offsets b (n, N), relative to `start`: `a·(p - start) <= b`. An obstacle that the
         start touches gets `b = -inf`: nothing there can be verified.
     """
-    between = np.concatenate([np.zeros((1, nominal.shape[1])), nominal - start])
-    seen_from = np.empty((2 * len(nominal) + 1, nominal.shape[1]))  # relative to the start
-    seen_from[::2] = between
-    seen_from[1::2] = 0.5 * (between[1:] + between[:-1])
-    towards = near.towards(start + seen_from)  # (n, 2N+1, d)
-    gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
-    unit = towards / np.maximum(gap, TOUCHING)[..., None]
-    level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
-    inside = ~(gap > TOUCHING)  # true for NaN, too
-    level[inside | inside[:, :1]] = -np.inf
-    choice = roomiest_planes(unit, level, between)
-    each = np.arange(len(choice))[:, None]
-    normal = unit[each, choice]
-    return normal, level[each, choice] - np.maximum(keep_off + near.margin, 0.0)[:, None] - np.abs(normal) @ measured
+    from brakeline.safety.filter.kernels import shape_kernels
+
+    return shape_kernels.planes_beside(*near.parts, near.margin, start, nominal, keep_off, measured)
 
 
 def half_spaces_leading_out(
@@ -73,30 +60,3 @@ def half_spaces_leading_out(
     kept = np.maximum(keep_off + near.margin[inside], 0.0) + np.abs(normals[inside, 0]) @ measured
     offsets[inside] = -(depth[inside] + kept)[:, None]
     return normals, offsets
-
-
-def roomiest_planes(unit: Array, level: Array, ends: Array) -> NDArray[np.intp]:
-    """Return the index (n, N) of the plane, among the 2N+1, that each period uses.
-
-    unit (n, 2N+1, d), level (n, 2N+1): the planes. ends (N+1, d): nominal positions at the ends of the periods.
-    From the first period in which no plane separates both ends from the obstacle, the plan crosses the obstacle. The
-    plane before then stays in force: a plane from beyond the obstacle would hold on the wrong side.
-    """
-    places, periods = _places(len(ends) - 1)
-    along = unit @ ends.T  # (n, 2N+1, N+1)
-    room = level[:, places] - np.maximum(along[:, places, periods], along[:, places, periods + 1])  # (n, N, 3)
-    best = room.argmax(axis=2)
-    choice: NDArray[np.intp] = 2 * periods[:, 0] + best
-    through = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
-    if not through.any():
-        return choice
-    before = (~through).sum(axis=1)  # periods until then
-    last = np.where(before > 0, choice[np.arange(len(choice)), before - 1], 0)
-    return np.asarray(np.where(through, last[:, None], choice))
-
-
-@cache
-def _places(periods: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices (N, 3) of each period's start, middle and end among the 2N+1 planes, and its number (N, 1)."""
-    number = np.arange(periods)[:, None]
-    return 2 * number + np.arange(3), number

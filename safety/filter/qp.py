@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,17 +26,18 @@ class ConstraintRows:
 
     Attributes:
         gradient (rows, nz), spread (rows, L+N+1) >= 0, bound (rows,) [m, or the unit of a limit].
-        keep (rows,): factor of the clearance margin in a row: 1 for an obstacle, 0 for a limit in other units.
     """
 
     gradient: Array
     spread: Array
     bound: Array
-    keep: Array
 
     def support(self, tube: Tube, z: Array) -> Array:
         """Return the left side of the rows (rows,) for regressors z."""
         return np.asarray(self.gradient @ z + self.spread @ tube.magnitudes(z))
+
+
+Center = tuple[Array, Array, Array]  # position (N, d, nz), offset (N, d), stretch (N,): see `halfspace_kernels`
 
 
 class ObstacleRows:
@@ -47,49 +47,31 @@ class ObstacleRows:
     with the chord deviation of the period, and one for the last end with the stopping distance.
     """
 
-    def __init__(self, position: Array, offset: Array, directions: Array) -> None:
-        """Gather the parts of a tube: position (N, d, nz), offset (N, d), directions (N, d, L) of the disc's center."""
-        N, d, _ = position.shape
-        L = directions.shape[2]
+    def __init__(self, directions: Array) -> None:
+        """Gather the generators (N, d, L) of the disc's center, without the factors of `Tube.stretch`."""
+        N, d, L = directions.shape
         at_start, at_end = np.arange(N), np.arange(1, N + 1)
-        ends = np.concatenate([at_start, at_end, [N]])
-        directions = np.concatenate([np.zeros((1, d, L)), directions])[ends]
+        end = np.concatenate([at_start, at_end, [N]])
+        directions = np.concatenate([np.zeros((1, d, L)), directions])[end]
         used = np.abs(directions).max(axis=1, initial=0.0) > 0.0  # in direct mode, each period has its own generators
         most = int(used.sum(axis=1).max(initial=0))
         period = np.concatenate([at_start, at_start, [N - 1]])
         extra = L + np.concatenate([at_start, at_start, [N]])  # the chord deviations, then the stopping distance
         columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
         end_directions = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
-        self.ends, self.period = ends, period
-        self.sets: tuple[Array, Index, Index] = end_directions, columns, extra
-        self.maps = self._maps(position, offset)
-        self.sizes = L + N + 1
+        self._ends: tuple[Index, Index, Array, Index, Index] = end, period, end_directions, columns, extra
+        self._sizes = L + N + 1
 
-    def _maps(self, position: Array, offset: Array) -> tuple[Array, Array]:
-        still = np.zeros((1, *position.shape[1:]))
-        return np.concatenate([still, position])[self.ends], np.concatenate([still[..., 0], offset])[self.ends]
-
-    def around(self, position: Array, offset: Array, stretch: Array) -> ObstacleRows:
-        """Return the same rows around other centers, with sets that are wider by a factor for each period (N,)."""
-        other = copy(self)
-        other.maps = self._maps(position, offset)
-        directions, columns, extra = self.sets
-        other.sets = directions * np.append(1.0, stretch)[self.ends, None, None], columns, extra
-        return other
-
-    def rows(self, normals: Array, offsets: Array, widening: float) -> ConstraintRows:
+    def rows(self, center: Center, normals: Array, offsets: Array, widening: float) -> ConstraintRows:
         """Return rows for half-spaces `a·p <= b` in the robot's frame, a (n, N, d), b (n, N)."""
-        parts = self.period, *self.maps, *self.sets
-        gradient, spread, bound = halfspace_kernels.rows(normals, offsets, *parts, self.sizes, widening)
-        return ConstraintRows(gradient, spread, bound, np.ones(len(bound)))
+        return ConstraintRows(*halfspace_kernels.rows(normals, offsets, *center, *self._ends, self._sizes, widening))
 
-    def slack(self, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
+    def slack(self, center: Center, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
         """Return `bound - support` of these rows for regressors z with magnitudes `sizes` (L+N+1,).
 
         This is faster than building the rows: there may be hundreds, each as wide as the tube has generators.
         """
-        parts = self.period, *self.maps, *self.sets
-        return halfspace_kernels.slack(normals, offsets, *parts, sizes, z)
+        return halfspace_kernels.slack(normals, offsets, *center, *self._ends, sizes, z)
 
 
 class QPBuilder:

@@ -56,7 +56,11 @@ class Tube:
     stretch: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, z: Array) -> Tube:
-        """Return a tube that equals this one for regressors z (nz,), with centers that are affine in z."""
+        """Return a tube that equals this one for regressors z (nz,). Its matrices are those of a linear predictor."""
+        return self
+
+    def affine(self, z: Array) -> Tube:
+        """Return the tube that `at` gave for regressors z (nz,), with centers that are affine everywhere."""
         return self
 
     @property
@@ -122,7 +126,7 @@ def stack_direct(
 def _tube(centers: Array, directions: Array, W: Array, M: Array, m_0: Array, d: int) -> Tube:
     """Return a tube with linear centers (N, d + r, nz) and directions (N, d + r, L), position first."""
     still = np.zeros(centers.shape[:2])
-    of_position = centers[:, :d], directions[:, :d]
+    of_position = np.ascontiguousarray(centers[:, :d]), np.ascontiguousarray(directions[:, :d])
     return Tube(*of_position, W, M, m_0, centers[:, d:], directions[:, d:], still[:, :d], still[:, d:])
 
 
@@ -146,29 +150,56 @@ class RolloutTube(Tube):
         return np.array(self.kept, dtype=np.int64)
 
     @cached_property
-    def _arguments(self) -> Arguments:
-        return self.one_step.arguments(self.robot)
+    def _arguments(self) -> tuple[*Arguments, Array, float]:
+        return self.one_step.stretch_arguments(self.robot)
+
+    @cached_property
+    def _sets(self) -> tuple[Array, Array]:
+        return np.ascontiguousarray(self.directions), np.ascontiguousarray(self.more_directions)
 
     def at(self, z: Array) -> Tube:
-        """Linearise the rollout at z: the centers are exact there, and affine everywhere."""
+        """Return the sets around the rollout from z."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        parts = rollout_kernels.affine(*self._arguments, z, self.inputs_of, self._kept)
-        position, offset, more, more_offset, first = parts
-        stretch = self.one_step.stretches(self.robot, (self.inputs_of @ z)[None])[0]
-        sets = self.directions, self.more_directions
-        wide, more_wide = (np.ascontiguousarray(part * stretch[:, None, None]) for part in sets)
-        return Tube(position, wide, self.W, self.M, self.m_0, more, more_wide, offset, more_offset, first, stretch)
+        parts = rollout_kernels.sets_around(*self._arguments, z, self.inputs_of, self._kept, *self._sets)
+        centers, wide, more, more_wide, first, stretch = parts
+        still, more_still = self._still
+        sets = still, wide, self.W, self.M, self.m_0, more_still, more_wide, centers, more, first, stretch
+        return TubeAround(*sets, rollout=self)
+
+    @cached_property
+    def _still(self) -> tuple[Array, Array]:
+        """Maps of no regressors, for positions and further coordinates."""
+        return np.zeros((*self.position.shape[:2], 0)), np.zeros((*self.more.shape[:2], 0))
+
+    def maps(self, z: Array) -> tuple[Array, Array, Array, Array]:
+        """Return gradient and offset of the centers, and of the other coordinates: the rollout, linearised at z."""
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        return rollout_kernels.affine(*self._arguments[:-2], z, self.inputs_of, self._kept)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""
         return np.asarray(self.outputs(z[None])[0][0])
 
     def outputs(self, z: Array) -> tuple[Array, Array]:
-        from brakeline.safety.filter.kernels import rollout_kernels
-
-        found = rollout_kernels.rollouts(*self._arguments, np.ascontiguousarray(z @ self.inputs_of.T))
+        found = self.one_step.rollouts(self.robot, z @ self.inputs_of.T)
         return found[..., : self.position.shape[1]], found[..., list(self.kept)]
+
+
+@dataclass(frozen=True)
+class TubeAround(Tube):
+    """The sets around one rollout. Its centers are constant: `position` and `more` map no regressors."""
+
+    rollout: RolloutTube = field(kw_only=True)
+
+    def centers(self, z: Array) -> Array:
+        return self.offset
+
+    def affine(self, z: Array) -> Tube:
+        position, offset, more, more_offset = self.rollout.maps(z)
+        sets = position, self.directions, self.W, self.M, self.m_0, more, self.more_directions, offset, more_offset
+        return Tube(*sets, self.first, self.stretch)
 
 
 def stack_rollout(linear: Tube, robot: Robot, one_step: OneStep, inputs_of: Array, more: Sequence[int]) -> RolloutTube:

@@ -215,7 +215,9 @@ def _check_past(robot: Robot, past: PastWindow) -> None:
     sizes = (robot.horizon, robot.state_dim), (robot.horizon + 1, robot.action_dim)
     if (past.states.shape, past.inputs.shape) != sizes:
         raise BadRequest("past", f"past has {sizes[0][0]} states and {sizes[1][0]} inputs of {robot.name}")
-    if not (np.isfinite(past.states).all() and np.isfinite(past.inputs).all()):
+    # The product is NaN or infinite if a value is, or if a value is very large.
+    finite = all(math.isfinite(np.vdot(part, part)) for part in (past.states, past.inputs))
+    if not finite and not (np.isfinite(past.states).all() and np.isfinite(past.inputs).all()):
         raise BadRequest("past", "past holds NaN or infinity")
 
 

@@ -166,4 +166,4 @@ class ReservationRows:
             ConstraintRows,  # here, since a client keeps reservations but needs no solver
         )
 
-        return ConstraintRows(gradient, widening * np.hstack([spread, extra]), bound.ravel(), np.ones(len(gradient)))
+        return ConstraintRows(gradient, widening * np.hstack([spread, extra]), bound.ravel())

@@ -63,6 +63,10 @@ class StateLimits:
         other._around(tube)
         return other
 
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.count * len(self.ends)
+
     def rows(self, start: Array, heading: float, turn: Array, widening: float) -> ConstraintRows:
         """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world.
 
@@ -76,7 +80,7 @@ class StateLimits:
         gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)
         spread = widening * np.concatenate([np.abs(both[..., self.nz : -1]), extra], axis=2)
         count = len(gradient)
-        return ConstraintRows(gradient, spread.reshape(count, -1), bound.ravel(), np.zeros(count))
+        return ConstraintRows(gradient, spread.reshape(count, -1), bound.ravel())
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:
@@ -84,5 +88,5 @@ def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:
     if len(parts) == 1:
         return parts[0]
     return ConstraintRows(
-        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("gradient", "spread", "bound", "keep"))
+        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("gradient", "spread", "bound"))
     )

@@ -133,8 +133,7 @@ class OneStep:
         """Return the factors on the sets (T, N) of windows z (T, r + N·m), at least 1: sqrt(1 + weight · leverage)."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        root, windows = np.ascontiguousarray(self.root), np.ascontiguousarray(z)
-        return np.asarray(np.sqrt(1.0 + self.weight * rollout_kernels.leverages(*self.arguments(robot), root, windows)))
+        return rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
 
     def arguments(self, robot: Robot) -> Arguments:
         """Return the arguments of the kernels that are the same for every plan."""
@@ -145,3 +144,7 @@ class OneStep:
         whole = np.ascontiguousarray
         predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(f.terms)
         return *predictor, others, heading, centers, d, robot.action_dim
+
+    def stretch_arguments(self, robot: Robot) -> tuple[*Arguments, Array, float]:
+        """Return the arguments of the kernels that know how the sets grow: also the root, and the weight."""
+        return *self.arguments(robot), np.ascontiguousarray(self.root), self.weight

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.scan import Scan
-from brakeline.safety.filter.halfspaces import TOUCHING, roomiest_planes
+from brakeline.safety.filter.halfspaces import TOUCHING
 from brakeline.safety.perception.occlusion_exits import occlusion_exits
 from brakeline.safety.perception.scan_coverage import gaps, gaps_and_motions
 
@@ -147,6 +147,8 @@ def half_spaces(
     A normal points to a cell's closest corner. Its level is the least over all corners, each minus its error, so the
     whole hull is beyond it for any normal.
     """
+    from brakeline.safety.filter.kernels import shape_kernels
+
     ends = np.concatenate([np.zeros((1, 2)), nominal - start])
     viewpoints = np.empty((2 * len(nominal) + 1, 2))  # the ends and the midpoints of all periods
     viewpoints[::2] = ends
@@ -160,7 +162,7 @@ def half_spaces(
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
     level = (unit @ corners.transpose(0, 2, 1) - near.error[:, None]).min(axis=2)
     level[~(gap > TOUCHING)] = -np.inf
-    choice = roomiest_planes(unit, level, ends)
+    choice = shape_kernels.roomiest_planes(unit, level, ends)
     cell = np.arange(len(choice))[:, None]
     normal = unit[cell, choice]
     t = near.age + period * np.arange(len(ends))

@@ -4,24 +4,29 @@ from itertools import pairwise
 
 import numpy as np
 
+from brakeline.messaging.obstacle import Shapes
+from brakeline.safety.filter.halfspaces import TOUCHING
 
-def rows(normals, offsets, period, end_maps, end_offset, end_directions, columns, extra, sizes, widening):
+
+def rows(normals, offsets, position, offset, stretch, end, period, end_directions, columns, extra, sizes, widening):
     """`halfspace_kernels.rows`."""
     n, ends = len(normals), len(period)
     a = normals[:, period]  # (n, E, d)
+    end_maps, end_offset = (np.concatenate([np.zeros((1, *m.shape[1:])), m])[end] for m in (position, offset))
+    factor = np.append(0.0, stretch if len(stretch) else np.ones(len(position)))[end]
     gradient = np.einsum("ned,edz->nez", a, end_maps)
     spread = np.zeros((n, ends, sizes))
-    along = np.abs(np.einsum("ned,edk->nek", a, end_directions))
-    for end in range(ends):
-        spread[:, end, columns[end]] = along[:, end]
-        spread[:, end, extra[end]] = 1.0
+    along = np.abs(np.einsum("ned,edk->nek", a, end_directions)) * factor[:, None]
+    for e in range(ends):
+        spread[:, e, columns[e]] = along[:, e]
+        spread[:, e, extra[e]] = 1.0
     bound = offsets[:, period] - np.einsum("ned,ed->ne", a, end_offset)
     return gradient.reshape(n * ends, -1), widening * spread.reshape(n * ends, -1), bound.ravel()
 
 
-def slack(normals, offsets, period, end_maps, end_offset, end_directions, columns, extra, magnitudes, z):
+def slack(normals, offsets, position, offset, stretch, end, period, end_directions, columns, extra, magnitudes, z):
     """`halfspace_kernels.slack`."""
-    parts = normals, offsets, period, end_maps, end_offset, end_directions, columns, extra
+    parts = normals, offsets, position, offset, stretch, end, period, end_directions, columns, extra
     gradient, spread, bound = rows(*parts, len(magnitudes), 1.0)
     return bound - gradient @ z - spread @ magnitudes
 
@@ -148,8 +153,8 @@ def rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, z):
     return np.array(found)
 
 
-def leverages(C, scale, saturations, terms, others, heading, arms, d, inputs, root, z):
-    """`rollout_kernels.leverages`."""
+def stretches(C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, z):
+    """`rollout_kernels.stretches`."""
     r, found = len(others), []
     for window in z:
         s, plan, total, rows = window[:r], window[r:].reshape(-1, inputs), 0.0, []
@@ -158,7 +163,7 @@ def leverages(C, scale, saturations, terms, others, heading, arms, d, inputs, ro
             bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
             phi = np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
             s, total = (C @ phi)[others], total + phi
-            rows.append(np.sum((np.tril(root) @ total) ** 2) / (k + 1))
+            rows.append(np.sqrt(1.0 + weight * np.sum((np.tril(root) @ total) ** 2) / (k + 1)))
         found.append(rows)
     return np.array(found)
 
@@ -175,4 +180,84 @@ def affine(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T,
     """`rollout_kernels.affine`."""
     outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
     offset = outputs - gradient @ z
-    return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept], outputs[0, : len(C)]
+    return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept]
+
+
+def sets_around(
+    C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, z, T, kept, sets, more_sets
+):
+    """`rollout_kernels.sets_around`."""
+    parts, window = (C, scale, saturations, terms, others, heading, arms, d, inputs), (T @ z)[None]
+    outputs, stretch = rollouts(*parts, window)[0], stretches(*parts, root, weight, window)[0]
+    wide, more_wide = (stretch[:, None, None] * part for part in (sets, more_sets))
+    return outputs[:, :d], wide, outputs[:, kept], more_wide, outputs[0, : len(C)], stretch
+
+
+def score(
+    C,
+    scale,
+    saturations,
+    terms,
+    others,
+    heading,
+    arms,
+    d,
+    inputs,
+    root,
+    weight,
+    states,
+    executed,
+    W,
+    M,
+    kappa,
+    w,
+    scored,
+):
+    """`rollout_kernels.score`."""
+    window = np.concatenate([states[0, others], executed.ravel()])
+    parts = C, scale, saturations, terms, others, heading, arms, d, inputs
+    after, turn = states[1:].copy(), np.eye(d)
+    cos, sin = np.cos(states[0, heading]), np.sin(states[0, heading])
+    turn[:2, :2] = [[cos, sin], [-sin, cos]]
+    after[:, :d] = (states[1:, :d] - states[0, :d]) @ turn.T
+    after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
+    widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
+    off = np.abs(after - rollouts(*parts, window[None])[0, :, : states.shape[1]])
+    shares = off / (widths * stretches(*parts, root, weight, window[None])[0][:, None])
+    return max(shares[:, scored].max(), shares[0].max())
+
+
+def distances(center, axes, half, rho, rounded, point):
+    """`shape_kernels.distances`."""
+    return Shapes(center, axes, half, rho, rounded, np.zeros(len(rho))).distance(point)
+
+
+def roomiest_planes(unit, level, ends):
+    """`shape_kernels.roomiest_planes`."""
+    number = np.arange(len(ends) - 1)[:, None]
+    places, periods = 2 * number + np.arange(3), number
+    along = unit @ ends.T  # (n, 2N+1, N+1)
+    room = level[:, places] - np.maximum(along[:, places, periods], along[:, places, periods + 1])  # (n, N, 3)
+    choice = 2 * periods[:, 0] + room.argmax(axis=2)
+    through = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    before = (~through).sum(axis=1)  # periods until then
+    last = np.where(before > 0, choice[np.arange(len(choice)), before - 1], 0)
+    return np.where(through, last[:, None], choice)
+
+
+def planes_beside(center, axes, half, rho, rounded, margin, start, nominal, keep_off, measured):
+    """`shape_kernels.planes_beside`."""
+    between = np.concatenate([np.zeros((1, nominal.shape[1])), nominal - start])
+    seen_from = np.empty((2 * len(nominal) + 1, nominal.shape[1]))  # relative to the start
+    seen_from[::2] = between
+    seen_from[1::2] = 0.5 * (between[1:] + between[:-1])
+    towards = Shapes(center, axes, half, rho, rounded, margin).towards(start + seen_from)  # (n, 2N+1, d)
+    gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
+    unit = towards / np.maximum(gap, TOUCHING)[..., None]
+    level = np.einsum("nqd,nqd->nq", unit, towards + seen_from)
+    inside = ~(gap > TOUCHING)  # true for NaN, too
+    level[inside | inside[:, :1]] = -np.inf
+    choice = roomiest_planes(unit, level, between)
+    each = np.arange(len(choice))[:, None]
+    normal = unit[each, choice]
+    return normal, level[each, choice] - np.maximum(keep_off + margin, 0.0)[:, None] - np.abs(normal) @ measured

@@ -7,9 +7,10 @@ import pytest
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.safety.filter import filter as filter_module
+from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
-from brakeline.safety.filter.filter import Filter, _Linearized
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.plan_search import Linearized, PlanSearch, Record
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
@@ -99,9 +100,10 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         scene = ready.constraints.local_map(ask, z_0, ready.builder.reachable(ask.input_in_force))
         proposal = ready.inputs.limited(ask.action, ask.input_in_force)
-        rows = ready.constraints.rows(scene, np.concatenate([z_0, proposal]))
-        at = _Linearized(ready.constraints, rows, ready.constraints.planes(scene, np.concatenate([z_0, proposal])))
-        kept = ready._with_clearance_margin(scene, at, z_0, proposal)
+        z = np.concatenate([z_0, proposal])
+        planes = ready.constraints.planes(scene, z)
+        at = Linearized(ready.constraints, scene, z, planes, ready.constraints.slack(scene, z, planes))
+        kept = PlanSearch(ready, scene, z_0, proposal, Record(0)).with_clearance_margin(at)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:
@@ -135,7 +137,7 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
     rng = np.random.default_rng(5)
     replaced = [ask for ask in (random_request(rng) for _ in range(200)) if ready.decide(ask).for_clearance]
     assert len(replaced) > 5
-    monkeypatch.setattr(filter_module, "solve", lambda program: INFEASIBLE)
+    monkeypatch.setattr(plan_search, "solve", lambda program: INFEASIBLE)
     for ask in replaced:
         decision = ready.decide(ask)
         assert (decision.kind, decision.for_clearance, decision.verified) == (ALLOWED, None, True)

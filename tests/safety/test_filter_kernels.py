@@ -3,13 +3,20 @@
 import numpy as np
 import pytest
 
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.safety.filter import plan_inputs
-from brakeline.safety.filter.kernels import active_set_kernels, halfspace_kernels, rollout_kernels, tube_kernels
+from brakeline.safety.filter.kernels import (
+    active_set_kernels,
+    halfspace_kernels,
+    rollout_kernels,
+    shape_kernels,
+    tube_kernels,
+)
 from tests.safety import kernel_twins
 
 N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors, free inputs
 MAGNITUDES = L + N + 1
-MODULES = halfspace_kernels, tube_kernels, active_set_kernels, plan_inputs, rollout_kernels
+MODULES = halfspace_kernels, tube_kernels, active_set_kernels, plan_inputs, rollout_kernels, shape_kernels
 
 
 def turned(rng, d):
@@ -24,10 +31,11 @@ def half_space_parts(rng, d):
     ends, used = 2 * N + 1, 3
     period = rng.integers(0, N, ends)
     columns = np.array([rng.choice(L, used, replace=False) for _ in range(ends)])
-    end_maps, end_directions = rng.normal(size=(ends, d, NZ)), rng.normal(size=(ends, d, used))
-    extra = L + rng.integers(0, N + 1, ends)
-    half_spaces, end_offset = (rng.normal(size=(8, N, d)), rng.normal(size=(8, N))), rng.normal(size=(ends, d))
-    return *half_spaces, period, end_maps, end_offset, end_directions, columns, extra
+    end, end_directions = rng.integers(0, N + 1, ends), rng.normal(size=(ends, d, used))
+    extra, stretch = L + rng.integers(0, N + 1, ends), rng.uniform(1.0, 2.0, N) if rng.random() < 0.5 else np.zeros(0)
+    half_spaces = rng.normal(size=(8, N, d)), rng.normal(size=(8, N))
+    center = rng.normal(size=(N, d, NZ)), rng.normal(size=(N, d)), stretch
+    return *half_spaces, *center, end, period, end_directions, columns, extra
 
 
 def tube_parts(rng, d):
@@ -56,6 +64,19 @@ def presolve_arguments(rng, room):
     return gradient, spread, bound, *known, M, *inputs, atoms, rng.uniform(0.5, 2.0, FREE + Q), 1e-6
 
 
+def shapes(rng, d):
+    """Obstacles of every kind, about a start at the origin that some of them touch."""
+    size = rng.uniform(0.1, 1.0, 3)
+    upright = (*size[:2],) if d == 3 else (size[0],)
+    found = [
+        Obstacle(BOX, tuple(rng.normal(size=d)), tuple(size[:d]), rng.uniform(-3.0, 3.0)),
+        Obstacle(CYLINDER, tuple(rng.normal(size=d)), upright, margin=rng.uniform(-0.2, 0.2)),
+        Obstacle(SPHERE, tuple(rng.normal(size=d)), (size[0],)),
+        Obstacle(WALL, tuple(rng.normal(size=d)), (), rng.uniform(-3.0, 3.0)),
+    ]
+    return Shapes.of(found, d)
+
+
 def cases(rng, d):
     """Arguments for each kernel, by its name."""
     W_t, M_t, m_0, position, offset, directions, widening = tube = tube_parts(rng, d)
@@ -66,6 +87,9 @@ def cases(rng, d):
     before, bounds = rng.uniform(low, high), np.stack([z - rng.uniform(-0.05, 1.0), z + 1.0])
     h, g, A, b = rng.uniform(0.1, 1.0, FREE), rng.normal(size=FREE), rng.normal(size=(30, FREE)), rng.normal(size=30)
     step = rng.normal(size=(9, NZ)), W_t, M_t[:, :9], rng.random((NZ, 9)), m_0[:9], rng.random((9, 9))
+    predictor, leverage = rollout_parts(rng, d), (np.tril(rng.normal(size=(12, 12))), rng.uniform(0.0, 3.0))
+    plan = 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0
+    near, path = shapes(rng, d), np.vstack([np.zeros(d), np.cumsum(0.3 * rng.normal(size=(N, d)), axis=0)])
     return {
         "rows": (*parts, MAGNITUDES, widening),
         "slack": (*parts, rng.random(MAGNITUDES), z),
@@ -82,16 +106,19 @@ def cases(rng, d):
         "sets": (*tube, z, start, turn, measured),
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), widening, start, turn),
-        "rollouts": (*rollout_parts(rng, d), 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
-        "leverages": (
-            *(*rollout_parts(rng, d), np.tril(rng.normal(size=(12, 12)))),
-            0.5 * rng.normal(size=(5, 2 + 2 + 2 * N)),
+        "rollouts": (*predictor, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "stretches": (*predictor, *leverage, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
+        "affine": (*predictor, *plan, np.array([d + 1, d])),
+        "sets_around": (*predictor, *leverage, *plan, np.array([d + 1, d]), directions, rng.normal(size=(N, 2, L))),
+        "score": (
+            *(*predictor, *leverage, rng.normal(size=(N + 1, d + 3)), 0.5 * rng.normal(size=(N + 1, 2))),
+            *(rng.normal(size=(Q, 2 + 2 + 2 * N)), rng.random((N, d + 3, Q))),
+            *(rng.random((N, d + 3, 2 + 2 + 2 * N)), rng.random((N, d + 3)), np.arange(d)),
         ),
-        "affine": (
-            *(*rollout_parts(rng, d), 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0),
-            np.array([d + 1, d]),
-        ),
-        "linearized": (*rollout_parts(rng, d), 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0),
+        "linearized": (*predictor, *plan),
+        "distances": (*near.parts, start),
+        "roomiest_planes": (rng.normal(size=(6, 2 * N + 1, d)), rng.normal(size=(6, 2 * N + 1)) + 1.0, path),
+        "planes_beside": (*near.parts, near.margin, start, start + path[1:], 0.1, measured),
         "hildreth_active_set": (h, g, A, b, 20),
         "clip_to_bounds": (rng.normal(size=2), before, low, high, slew),
         "regressors_of_braking": (z, rng.random((3, 2)), rng.normal(size=2)),

@@ -45,12 +45,12 @@ def test_rows_and_slack_agree_with_the_definition(d: int, seed: int) -> None:
     tube = a_tube(rng, d, own=bool(seed % 2))
     normals, offsets = rng.normal(size=(4, tube.horizon, d)), rng.normal(size=(4, tube.horizon))
     z = rng.normal(size=tube.W.shape[1])
-    layout = ObstacleRows(tube.position, tube.offset, tube.directions)
-    rows = layout.rows(normals, offsets, 1.0)
+    layout, center = ObstacleRows(tube.directions), (tube.position, tube.offset, tube.stretch)
+    rows = layout.rows(center, normals, offsets, 1.0)
     period = [*range(tube.horizon), *range(tube.horizon), tube.horizon - 1]
     expected = (offsets[:, period] - supports(tube, normals, z)).ravel()
     assert rows.bound - rows.support(tube, z) == pytest.approx(expected, abs=1e-9)
-    assert layout.slack(normals, offsets, tube.magnitudes(z), z) == pytest.approx(expected, abs=1e-9)
+    assert layout.slack(center, normals, offsets, tube.magnitudes(z), z) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("what", ["normals", "offsets", "z"])
@@ -63,8 +63,8 @@ def test_nan_in_any_input_leaves_no_slack(what: str) -> None:
         "z": rng.normal(size=tube.W.shape[1]),
     }
     told[what].flat[0] = np.nan
-    layout, z = ObstacleRows(tube.position, tube.offset, tube.directions), told["z"]
-    left = layout.slack(told["normals"], told["offsets"], tube.magnitudes(z), z)
+    z, center = told["z"], (tube.position, tube.offset, tube.stretch)
+    left = ObstacleRows(tube.directions).slack(center, told["normals"], told["offsets"], tube.magnitudes(z), z)
     assert np.isnan(left).any()
 
 

@@ -21,7 +21,7 @@ def programs(model: ModelSet, count, seed=0):
     """QPs as the filter builds them, of proposals near obstacles."""
     rng = np.random.default_rng(seed)
     tube, outer = model.tube(), model.outer_tube()
-    layout, builder = ObstacleRows(tube.position, tube.offset, tube.directions), QPBuilder(model.robot, outer)
+    layout, builder = ObstacleRows(tube.directions), QPBuilder(model.robot, outer)
     for _ in range(count):
         angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
         posts = [cylinder(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, distance, strict=True)]
@@ -29,7 +29,8 @@ def programs(model: ModelSet, count, seed=0):
         z_0, r = np.array([v, w, v, w]), rng.uniform([0.0, -0.5], [0.25, 0.5])
         nominal = tube.centers(np.concatenate([z_0, r]))
         normals, offsets = half_spaces(Shapes.of(posts, 2), np.zeros(2), nominal, 0.105, np.full(2, 0.004))
-        program = builder.program(layout.rows(normals, offsets, 1.0), z_0, r)
+        center = tube.position, tube.offset, tube.stretch
+        program = builder.program(layout.rows(center, normals, offsets, 1.0), z_0, r)
         if program is not None:
             yield builder, program
 

@@ -188,11 +188,11 @@ def test_the_predictors_in_place_serve_a_standing_robots_plans_in_place_and_no_o
     ready = Filter(turner)
     box, own = ready.in_place
     standing = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 1.0])  # [v, w, inputs in force, chosen inputs]
-    assert ready._constraints_for(standing) is own
+    assert ready.constraints_for(standing) is own
     for place, value in ((0, 0.05), (2, 0.01), (4, 0.01), (5, 2.0), (1, np.nan)):
         moving = standing.copy()
         moving[place] = value
-        assert ready._constraints_for(moving) is ready.constraints
+        assert ready.constraints_for(moving) is ready.constraints
     assert box.shape == (2, 6)
 
 

@@ -3,8 +3,10 @@
 A tube has E = 2N + 1 *ends* for each half-space of an obstacle: the start and the end of each period, and the end of
 the plan once more. The arguments that describe them come from `qp.ObstacleRows`:
 
+    position (N, d, nz), offset (N, d): affine maps from regressors z to the position after each period
+    stretch (N,) or none: factors on the generators after each period
+    end (E,): the number of periods after which the end is. Where it is 0, the position is the start itself
     period (E,): the period whose half-space holds at the end
-    end_maps (E, d, nz), end_offset (E, d): affine maps from regressors z to the position at the end
     end_directions (E, d, K), columns (E, K): generators that are not zero there, and their indices among all L
     extra (E,): index of the magnitude that is added in all directions: a chord deviation or the stopping distance
 
@@ -24,14 +26,17 @@ Index = NDArray[np.int64]
 
 @compiled(
     "Tuple((f8[:,::1], f8[:,::1], f8[::1]))"
-    "(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[:,::1], i8[::1], i8, f8)"
+    "(f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:], f8[::1],"
+    " i8[::1], i8[::1], f8[:,:,::1], i8[:,::1], i8[::1], i8, f8)"
 )
 def rows(
     normals: Array,
     offsets: Array,
+    position: Array,
+    offset: Array,
+    stretch: Array,
+    end: Index,
     period: Index,
-    end_maps: Array,
-    end_offset: Array,
     end_directions: Array,
     columns: Index,
     extra: Index,
@@ -43,35 +48,40 @@ def rows(
     Returns:
         Gradient (n·E, nz), spread (n·E, sizes) and bound (n·E,).
     """
-    n, ends, d, nz = len(normals), len(period), end_maps.shape[1], end_maps.shape[2]
+    n, ends, d, nz = len(normals), len(period), position.shape[1], position.shape[2]
     gradient, spread, bound = np.zeros((n * ends, nz)), np.zeros((n * ends, sizes)), np.empty(n * ends)
     for i in range(n):
         for e in range(ends):
-            row, normal = i * ends + e, normals[i, period[e]]
+            row, normal, after = i * ends + e, normals[i, period[e]], end[e] - 1
             bound[row] = offsets[i, period[e]]
-            for axis in range(d):
-                bound[row] -= normal[axis] * end_offset[e, axis]
-                for j in range(nz):
-                    gradient[row, j] += normal[axis] * end_maps[e, axis, j]
-            for k in range(columns.shape[1]):
-                along = 0.0
+            if after >= 0:
+                factor = stretch[after] if len(stretch) else 1.0
                 for axis in range(d):
-                    along += normal[axis] * end_directions[e, axis, k]
-                spread[row, columns[e, k]] = abs(along) * widening
+                    bound[row] -= normal[axis] * offset[after, axis]
+                    for j in range(nz):
+                        gradient[row, j] += normal[axis] * position[after, axis, j]
+                for k in range(columns.shape[1]):
+                    along = 0.0
+                    for axis in range(d):
+                        along += normal[axis] * (factor * end_directions[e, axis, k])
+                    spread[row, columns[e, k]] = abs(along) * widening
             spread[row, extra[e]] = widening
     return gradient, spread, bound
 
 
 @compiled(
     "f8[::1]"
-    "(f8[:,:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8[::1], f8[::1])"
+    "(f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:], f8[::1],"
+    " i8[::1], i8[::1], f8[:,:,::1], i8[:,::1], i8[::1], f8[::1], f8[::1])"
 )
 def slack(
     normals: Array,
     offsets: Array,
+    position: Array,
+    offset: Array,
+    stretch: Array,
+    end: Index,
     period: Index,
-    end_maps: Array,
-    end_offset: Array,
     end_directions: Array,
     columns: Index,
     extra: Index,
@@ -82,24 +92,30 @@ def slack(
 
     sizes (L+N+1,): the tube's magnitudes under regressors z. NaN in a half-space or in z gives NaN.
     """
-    n, ends, d = len(normals), len(period), end_maps.shape[1]
+    n, ends, d = len(normals), len(period), position.shape[1]
     remaining, a = np.empty((n, ends)), np.zeros((3, n))
     for e in range(ends):
-        reached, at = np.full(n, sizes[extra[e]]), np.zeros(3)
+        after, reached = end[e] - 1, np.full(n, sizes[extra[e]])
         for axis in range(d):
-            at[axis] = end_offset[e, axis]
-            for j in range(len(z)):
-                at[axis] += end_maps[e, axis, j] * z[j]
             for i in range(n):
                 a[axis, i] = normals[i, period[e], axis]
-                reached[i] += a[axis, i] * at[axis]
-        for k in range(columns.shape[1]):
-            span, size = np.zeros(3), sizes[columns[e, k]]
-            for axis in range(d):
-                span[axis] = end_directions[e, axis, k]
-            u, v, w = span[0], span[1], span[2]
+        at = np.zeros(3)
+        for axis in range(d):
+            if after >= 0:
+                at[axis] = offset[after, axis]
+                for j in range(position.shape[2]):
+                    at[axis] += position[after, axis, j] * z[j]
             for i in range(n):
-                reached[i] += abs(a[0, i] * u + a[1, i] * v + a[2, i] * w) * size
+                reached[i] += a[axis, i] * at[axis]
+        if after >= 0:
+            factor = stretch[after] if len(stretch) else 1.0
+            for k in range(columns.shape[1]):
+                span, size = np.zeros(3), sizes[columns[e, k]]
+                for axis in range(d):
+                    span[axis] = factor * end_directions[e, axis, k]
+                u, v, w = span[0], span[1], span[2]
+                for i in range(n):
+                    reached[i] += abs(a[0, i] * u + a[1, i] * v + a[2, i] * w) * size
         for i in range(n):
             remaining[i, e] = offsets[i, period[e]] - reached[i]
     return remaining.ravel()

@@ -9,6 +9,9 @@ Arguments that all functions share:
     others (r,)         indices in the state of the coordinates s, which are neither position nor heading
     heading             index of the heading in the state, -1 without one
     arms (D, d)         centers of the body's further discs, in the robot's frame
+    d, inputs           numbers of position coordinates and of inputs
+    root (F, F)         inverse of the lower Cholesky factor of the features' second moment
+    weight              how much the sets grow with the leverage
 
 `tests/safety/kernel_twins.py` has each function in plain NumPy.
 """
@@ -25,126 +28,26 @@ from brakeline.safety.compilation import compiled
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+SHARED = "f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8"  # types of the shared arguments
 
-@compiled("void(f8[::1], f8[:,::1], f8[::1], f8[::1])")
-def _primitives(scale: Array, saturations: Array, v: Array, p: Array) -> None:
-    """Write the primitives of the variables v into p (1 + v + E,)."""
-    p[0] = 1.0
+
+@compiled("void(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1])")
+def _predict(
+    C: Array, scale: Array, saturations: Array, terms: Index, v: Array, p: Array, total: Array, y: Array
+) -> None:
+    """Write the primitives of the variables v into p and the outputs C φ into y (n,); add φ to total (F,)."""
+    p[0], y[:] = 1.0, 0.0
     for i in range(len(v)):
         p[1 + i] = v[i] / scale[i]
     for e in range(len(saturations)):
         a, b = int(saturations[e, 0]), int(saturations[e, 1])
         away = v[a] - v[b] if b >= 0 else v[a]
         p[1 + len(v) + e] = math.tanh(away / saturations[e, 2])
-
-
-@compiled("void(f8[:,::1], f8[:,::1], i8[:,::1], f8[::1], f8[::1])")
-def _outputs(C: Array, saturations: Array, terms: Index, p: Array, y: Array) -> None:
-    """Write the outputs C φ into y (n,)."""
-    y[:] = 0.0
     for f in range(len(terms)):
         feature = p[terms[f, 0]] * p[terms[f, 1]] * p[terms[f, 2]]
+        total[f] += feature
         for i in range(len(y)):
             y[i] += C[i, f] * feature
-
-
-@compiled("f8[:,:,::1](f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[:,::1])")
-def rollouts(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    z: Array,
-) -> Array:
-    """Return the outputs (T, N, n + D·d) after each period, in the frame of the start, for windows z (T, r + m + N·m).
-
-    The outputs are the displacement, the change of heading and the other coordinates, as in `Windows.y`, then the
-    displacements of the discs at `arms`.
-    """
-    n, r, D = len(C), len(others), len(arms)
-    N = (z.shape[1] - r) // inputs - 1
-    found, v, y = np.zeros((len(z), N, n + D * d)), np.empty(r + 2 * inputs), np.empty(n)
-    p = np.empty(1 + len(v) + len(saturations))
-    for t in range(len(z)):
-        cos, sin, angle = 1.0, 0.0, 0.0
-        at = np.zeros(d)
-        for i in range(r):
-            v[i] = z[t, i]
-        for k in range(N):
-            for i in range(inputs):
-                v[r + i] = z[t, r + (k + 1) * inputs + i]
-                v[r + inputs + i] = z[t, r + k * inputs + i]
-            _primitives(scale, saturations, v, p)
-            _outputs(C, saturations, terms, p, y)
-            row = found[t, k]
-            for axis in range(d):
-                at[axis] += y[axis]
-            if heading >= 0:
-                at[0] += (cos - 1.0) * y[0] - sin * y[1]
-                at[1] += (cos - 1.0) * y[1] + sin * y[0]
-                angle += y[heading]
-                cos, sin = math.cos(angle), math.sin(angle)
-                row[heading] = angle
-            for axis in range(d):
-                row[axis] = at[axis]
-            for i in range(r):
-                v[i] = row[others[i]] = y[others[i]]
-            for j in range(D):
-                for axis in range(d):
-                    row[n + j * d + axis] = at[axis]
-                row[n + j * d] += (cos - 1.0) * arms[j, 0] - sin * arms[j, 1]
-                row[n + j * d + 1] += (cos - 1.0) * arms[j, 1] + sin * arms[j, 0]
-    return found
-
-
-@compiled("f8[:,::1](f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[:,::1], f8[:,::1])")
-def leverages(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    root: Array,
-    z: Array,
-) -> Array:
-    """Return the leverages h_k (T, N) of the first k periods of windows z (T, r + m + N·m): |root Σ_{j<k} φ_j|² / k.
-
-    root (F, F): inverse of the lower Cholesky factor of the features' second moment.
-    """
-    r, F = len(others), len(terms)
-    N = (z.shape[1] - r) // inputs - 1
-    found, v, y = np.zeros((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
-    p, total = np.empty(1 + len(v) + len(saturations)), np.empty(F)
-    for t in range(len(z)):
-        total[:] = 0.0
-        v[:r] = z[t, :r]
-        for k in range(N):
-            for i in range(inputs):
-                v[r + i] = z[t, r + (k + 1) * inputs + i]
-                v[r + inputs + i] = z[t, r + k * inputs + i]
-            _primitives(scale, saturations, v, p)
-            _outputs(C, saturations, terms, p, y)
-            for f in range(F):
-                total[f] += p[terms[f, 0]] * p[terms[f, 1]] * p[terms[f, 2]]
-            square = 0.0
-            for i in range(F):
-                along = 0.0
-                for j in range(i + 1):
-                    along += root[i, j] * total[j]
-                square += along * along
-            found[t, k] = square / (k + 1)
-            for i in range(r):
-                v[i] = y[others[i]]
-    return found
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], f8[::1], f8[:,::1])")
@@ -201,10 +104,117 @@ def _move(y: Array, dy: Array, pose: Array, dpose: Array, heading: int) -> None:
             dpose[1 + axis, c] += dy[axis, c]
 
 
-@compiled(
-    "Tuple((f8[:,::1], f8[:,:,::1]))"
-    "(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[::1], f8[:,::1])"
-)
+@compiled("void(f8[::1], f8[:,::1], f8[::1], f8[:,::1], i8[::1], i8, f8[:,::1], f8[::1], f8[:,::1])")
+def _write(
+    y: Array,
+    dy: Array,
+    pose: Array,
+    dpose: Array,
+    others: Index,
+    heading: int,
+    arms: Array,
+    row: Array,
+    slope: Array,
+) -> None:
+    """Write the outputs after a period into `row` (n + D·d,) and their gradient into `slope` (n + D·d, nz)."""
+    d, nz = len(pose) - 1, dy.shape[1]
+    for i in range(len(others)):
+        row[others[i]], slope[others[i]] = y[others[i]], dy[others[i]]
+    for axis in range(d):
+        row[axis], slope[axis] = pose[1 + axis], dpose[1 + axis]
+    if heading >= 0:
+        row[heading], slope[heading] = pose[0], dpose[0]
+        cos, sin = math.cos(pose[0]), math.sin(pose[0])
+        for j in range(len(arms)):
+            at = len(y) + j * d
+            for axis in range(d):
+                row[at + axis], slope[at + axis] = pose[1 + axis], dpose[1 + axis]
+            east, north = cos * arms[j, 0] - sin * arms[j, 1], sin * arms[j, 0] + cos * arms[j, 1]
+            row[at] += east - arms[j, 0]
+            row[at + 1] += north - arms[j, 1]
+            for c in range(nz):
+                slope[at, c] -= north * dpose[0, c]
+                slope[at + 1, c] += east * dpose[0, c]
+
+
+@compiled(f"f8[:,:,::1]({SHARED}, f8[:,::1])")
+def rollouts(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    z: Array,
+) -> Array:
+    """Return the outputs (T, N, n + D·d) after each period, in the frame of the start, for windows z (T, r + m + N·m).
+
+    The outputs are the displacement, the change of heading and the other coordinates, as in `Windows.y`, then the
+    displacements of the discs at `arms`.
+    """
+    n, r = len(C), len(others)
+    N = (z.shape[1] - r) // inputs - 1
+    found, v, y = np.zeros((len(z), N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
+    p, total = np.empty(1 + len(v) + len(saturations)), np.zeros(len(terms))
+    pose, flat = np.empty(1 + d), np.empty((found.shape[2], 0))  # no gradient
+    for t in range(len(z)):
+        pose[:], v[:r] = 0.0, z[t, :r]
+        for k in range(N):
+            now = r + (k + 1) * inputs
+            v[r : r + inputs], v[r + inputs :] = z[t, now : now + inputs], z[t, now - inputs : now]
+            _predict(C, scale, saturations, terms, v, p, total, y)
+            _move(y, flat[:n], pose, flat[: 1 + d], heading)
+            _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, found[t, k], flat)
+            for i in range(r):
+                v[i] = y[others[i]]
+    return found
+
+
+@compiled(f"f8[:,::1]({SHARED}, f8[:,::1], f8, f8[:,::1])")
+def stretches(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    root: Array,
+    weight: float,
+    z: Array,
+) -> Array:
+    """Return the factors sqrt(1 + weight h_k) (T, N) on the sets of windows z (T, r + m + N·m).
+
+    h_k = |root Σ_{j<k} φ_j|² / k is the leverage of the first k periods (docs/method.md §14).
+    """
+    r, F = len(others), len(terms)
+    N = (z.shape[1] - r) // inputs - 1
+    found, v, y = np.empty((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
+    p, total = np.empty(1 + len(v) + len(saturations)), np.empty(F)
+    for t in range(len(z)):
+        total[:], v[:r] = 0.0, z[t, :r]
+        for k in range(N):
+            now = r + (k + 1) * inputs
+            v[r : r + inputs], v[r + inputs :] = z[t, now : now + inputs], z[t, now - inputs : now]
+            _predict(C, scale, saturations, terms, v, p, total, y)
+            square = 0.0
+            for i in range(F):
+                along = 0.0
+                for j in range(i + 1):
+                    along += root[i, j] * total[j]
+                square += along * along
+            found[t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
+            for i in range(r):
+                v[i] = y[others[i]]
+    return found
+
+
+@compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({SHARED}, f8[::1], f8[:,::1])")
 def linearized(
     C: Array,
     scale: Array,
@@ -225,7 +235,7 @@ def linearized(
     n, r, nz = len(C), len(others), len(z)
     N, V = (len(T) - r) // inputs - 1, r + 2 * inputs
     outputs, gradient = np.zeros((N, n + len(arms) * d)), np.zeros((N, n + len(arms) * d, nz))
-    v, y, p = np.empty(V), np.empty(n), np.empty(1 + V + len(saturations))
+    v, y, p, total = np.empty(V), np.empty(n), np.empty(1 + V + len(saturations)), np.zeros(len(terms))
     known, partial = np.zeros(len(T)), np.empty((n, V))
     dv, dy, pose, dpose = np.zeros((V, nz)), np.empty((n, nz)), np.zeros(1 + d), np.zeros((1 + d, nz))
     for i in range(len(T)):
@@ -233,41 +243,20 @@ def linearized(
             known[i] += T[i, j] * z[j]
     v[:r], dv[:r] = known[:r], T[:r]
     for k in range(N):
-        for i in range(inputs):
-            now, before = r + (k + 1) * inputs + i, r + k * inputs + i
-            v[r + i], v[r + inputs + i] = known[now], known[before]
-            dv[r + i], dv[r + inputs + i] = T[now], T[before]
-        _primitives(scale, saturations, v, p)
-        _outputs(C, saturations, terms, p, y)
+        now = r + (k + 1) * inputs
+        v[r : r + inputs], v[r + inputs :] = known[now : now + inputs], known[now - inputs : now]
+        dv[r : r + inputs], dv[r + inputs :] = T[now : now + inputs], T[now - inputs : now]
+        _predict(C, scale, saturations, terms, v, p, total, y)
         _partials(C, scale, saturations, terms, p, partial)
         _product(partial, dv, dy)
         _move(y, dy, pose, dpose, heading)
-        row, slope = outputs[k], gradient[k]
+        _write(y, dy, pose, dpose, others, heading, arms, outputs[k], gradient[k])
         for i in range(r):
-            v[i] = row[others[i]] = y[others[i]]
-            dv[i] = slope[others[i]] = dy[others[i]]
-        for axis in range(d):
-            row[axis], slope[axis] = pose[1 + axis], dpose[1 + axis]
-        if heading >= 0:
-            row[heading], slope[heading] = pose[0], dpose[0]
-        cos, sin = math.cos(pose[0]), math.sin(pose[0])
-        for j in range(len(arms)):
-            at = n + j * d
-            for axis in range(d):
-                row[at + axis], slope[at + axis] = pose[1 + axis], dpose[1 + axis]
-            east, north = cos * arms[j, 0] - sin * arms[j, 1], sin * arms[j, 0] + cos * arms[j, 1]
-            row[at] += east - arms[j, 0]
-            row[at + 1] += north - arms[j, 1]
-            for c in range(nz):
-                slope[at, c] -= north * dpose[0, c]
-                slope[at + 1, c] += east * dpose[0, c]
+            v[i], dv[i] = y[others[i]], dy[others[i]]
     return outputs, gradient
 
 
-@compiled(
-    "Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1]))"
-    "(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8, f8[::1], f8[:,::1], i8[::1])"
-)
+@compiled(f"Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]))({SHARED}, f8[::1], f8[:,::1], i8[::1])")
 def affine(
     C: Array,
     scale: Array,
@@ -281,12 +270,11 @@ def affine(
     z: Array,
     T: Array,
     kept: Index,
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `kept` (k,).
 
     Returns:
-        Gradient (N, d, nz) and offset (N, d) of the positions, the same of the kept coordinates, and all coordinates
-        after one period (n,).
+        Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the kept coordinates.
     """
     outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
     N, nz, k = len(outputs), len(z), len(kept)
@@ -302,4 +290,120 @@ def affine(
                 position[i, axis], offset[i, axis] = gradient[i, at], rest
             else:
                 more[i, axis - d], more_offset[i, axis - d] = gradient[i, at], rest
-    return position, offset, more, more_offset, outputs[0, : len(C)].copy()
+    return position, offset, more, more_offset
+
+
+@compiled(
+    "Tuple((f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[::1], f8[::1]))"
+    f"({SHARED}, f8[:,::1], f8,"
+    " f8[::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1])"
+)
+def sets_around(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    root: Array,
+    weight: float,
+    z: Array,
+    T: Array,
+    kept: Index,
+    directions: Array,
+    more_directions: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Return the rollout from z, and the generators of the sets around it.
+
+    directions (N, d, L), more_directions (N, k, L): without the factors, for the positions and the coordinates `kept`.
+
+    Returns:
+        Positions (N, d) and their generators (N, d, L), the same of the kept coordinates, all coordinates after one
+        period (n,), and the factors (N,) that the generators hold.
+    """
+    window = np.zeros((1, len(T)))
+    for i in range(len(T)):
+        for j in range(len(z)):
+            window[0, i] += T[i, j] * z[j]
+    outputs = rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, window)[0]
+    stretch = stretches(C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, window)[0].copy()
+    N, k = len(outputs), len(kept)
+    centers, wide, more, more_wide = (
+        np.empty((N, d)),
+        np.empty_like(directions),
+        np.empty((N, k)),
+        more_directions.copy(),
+    )
+    for i in range(N):
+        for axis in range(d):
+            centers[i, axis], wide[i, axis] = outputs[i, axis], stretch[i] * directions[i, axis]
+        for axis in range(k):
+            more[i, axis] = outputs[i, kept[axis]]
+        more_wide[i] *= stretch[i]
+    return centers, wide, more, more_wide, outputs[0, : len(C)].copy(), stretch
+
+
+@compiled(f"f8({SHARED}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1])")
+def score(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    root: Array,
+    weight: float,
+    states: Array,
+    executed: Array,
+    W: Array,
+    M: Array,
+    kappa: Array,
+    w: Array,
+    scored: Index,
+) -> float:
+    """Return the largest ratio of an error to its set in a window that has ended, or NaN if one is NaN.
+
+    Args:
+        states (N + 1, n): measured states. executed (N + 1, m): the input in force before, and the inputs.
+        W (q, nz), M (N, n, q), kappa (N, n, nz), w (N, n): the sets' half-widths, M |W z| + kappa |z| + w.
+        scored: indices of the coordinates that count after every period. After the first, all count.
+    """
+    shared, r = (C, scale, saturations, terms, others, heading, arms, d, inputs), len(others)
+    z = np.empty((1, r + executed.size))
+    window = z[0]
+    for i in range(r):
+        window[i] = states[0, others[i]]
+    window[r:] = executed.ravel()
+    predicted, stretch = rollouts(*shared, z)[0], stretches(*shared, root, weight, z)[0]
+    atoms, first, largest = np.zeros(len(W)), states[0], 0.0
+    for i in range(len(W)):
+        for j in range(len(window)):
+            atoms[i] += W[i, j] * window[j]
+    atoms = np.abs(atoms)
+    cos, sin = (math.cos(first[heading]), math.sin(first[heading])) if heading >= 0 else (1.0, 0.0)
+    for k in range(len(w)):
+        after = states[k + 1].copy()
+        for axis in range(d):
+            after[axis] -= first[axis]
+        if heading >= 0:
+            east, north = after[0], after[1]
+            after[0], after[1] = cos * east + sin * north, cos * north - sin * east
+            after[heading] = (after[heading] - first[heading] + math.pi) % math.tau - math.pi
+        for at in range(len(after) if k == 0 else len(scored)):
+            i = at if k == 0 else scored[at]
+            off, width = abs(after[i] - predicted[k, i]), w[k, i]
+            for j in range(len(window)):
+                width += kappa[k, i, j] * abs(window[j])
+            for j in range(len(atoms)):
+                width += M[k, i, j] * atoms[j]
+            share = off / (width * stretch[k]) if off != 0.0 else 0.0
+            if share != share:
+                return share
+            largest = max(largest, share)
+    return largest

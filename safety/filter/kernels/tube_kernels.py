@@ -115,7 +115,7 @@ def extent(
         square = 0.0
         for axis in range(d):
             moved, width = offset[k, axis], 0.0
-            for j in range(len(z)):
+            for j in range(position.shape[2]):
                 moved += position[k, axis, j] * z[j]
             for i in range(L):
                 width += abs(directions[k, axis, i]) * sizes[i]

@@ -1,0 +1,109 @@
+"""The space within reach of a robot, from what a request says about it (docs/method.md §3, §8-§10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.moving_obstacles import MovingObstacles
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.scan import Scan
+from brakeline.safety.filter.kernels import shape_kernels
+from brakeline.safety.filter.recovery import escape_direction
+from brakeline.safety.filter.request import Request
+from brakeline.safety.filter.reservation import OtherReservations
+from brakeline.safety.perception.occluded_regions import OccludedRegions
+from brakeline.safety.perception.scan_free_space import OccupiedCells, occupied_cells
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LocalMap:
+    """What a request says about the space within reach of a robot, in the world.
+
+    Attributes:
+        start (d,), heading [rad]: measured pose. turn (d, d): rotation from the robot's frame to the world.
+        near: obstacles within reach. moving: moving obstacles that may come within reach.
+        beyond [m]: the distance below which the request names no further obstacle, at most the sensor's range.
+        unseen: space that a scan does not show to be free. other_reservations: those of other robots.
+        widening: factor that the request puts on every set (docs/method.md §15).
+    """
+
+    start: Array
+    heading: float
+    turn: Array
+    near: Shapes
+    beyond: float
+    moving: MovingObstacles | None = None
+    unseen: OccupiedCells | OccludedRegions | None = None
+    other_reservations: OtherReservations | None = None
+    widening: float = 1.0
+
+    @property
+    def parked(self) -> LocalMap:
+        """Return the map without what moves: a standing robot need not avoid it (passive safety, §8)."""
+        unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
+        return replace(self, moving=None, unseen=unseen)
+
+    @property
+    def away(self) -> Array | None:
+        """The direction (d,), world, away from what is nearest to the start; None if nothing near has a direction."""
+        ways = [escape_direction(self.near, self.start)[None]] if len(self.near) else []
+        if isinstance(self.unseen, OccupiedCells):
+            ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
+        each = np.concatenate(ways or [np.zeros((0, len(self.start)))])
+        return each[np.argmin(np.einsum("nd,nd->n", each, each))] if len(each) else None
+
+    @property
+    def empty(self) -> bool:
+        return not len(self.near) and self.moving is None and self.unseen is None and self.other_reservations is None
+
+
+def local_map(robot: Robot, request: Request, reach: float, turn: Array, occluded: OccludedRegions | None) -> LocalMap:
+    """Return the map of a request.
+
+    Args:
+        robot: the robot. request: what it asks.
+        reach [m]: radius of the map. turn (d, d): rotation from the robot's frame to the world.
+        occluded: the shadows of the request's range image, if it has one.
+    """
+    d, near, beyond = robot.position_dim, request.obstacles, robot.sight
+    start, whole_plan = np.ascontiguousarray(request.state[:d]), robot.horizon * robot.period
+    heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
+    if len(near):
+        away = shape_kernels.distances(*near.parts, start) - near.margin
+        beyond, counts = _parted(away, beyond, reach)
+        near = near if counts.all() else near.take(counts)
+    moving = request.movers
+    if moving is not None:
+        beyond, counts = _parted(moving.least_distance(start, whole_plan), beyond, reach)
+        moving = moving.take(counts) if counts.any() else None
+    other_reservations = request.other_reservations
+    if other_reservations is not None:
+        beyond, counts = _parted(other_reservations.nearest(start), beyond, reach)
+        other_reservations = other_reservations.take(counts) if counts.any() else None
+    unseen: OccupiedCells | OccludedRegions | None = occluded
+    if isinstance(request.scan, Scan):
+        unseen = _unseen(request.scan, start, reach, whole_plan)
+    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, request.widening)
+
+
+def _parted(away: Array, beyond: float, reach: float) -> tuple[float, NDArray[np.bool_]]:
+    """Return the distance [m] of the nearest obstacle beyond reach, at most `beyond`, and which (n,) are within.
+
+    An obstacle whose distance is NaN counts as within reach.
+    """
+    counts = ~(away > reach)
+    return float(away[~counts].min(initial=beyond)), counts
+
+
+def _unseen(scan: Scan, start: Array, reach: float, whole_plan: float) -> OccupiedCells | None:
+    """Return the cells that a scan does not show to be free, within reach or able to come there during a plan [s]."""
+    within = reach + scan.speed * (scan.age + whole_plan)
+    within += float(np.linalg.norm(scan.sensor()[0] - start)) + scan.sensor_error
+    cells = occupied_cells(scan, within + scan.heading_error * within)
+    return cells if len(cells) else None

@@ -1,0 +1,269 @@
+"""Search for a verified plan near a proposal (paper, algorithm 2; docs/method.md §4, §13).
+
+The search stops at the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from time import perf_counter_ns
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes
+from brakeline.safety.filter.constraints import TubeConstraints
+from brakeline.safety.filter.kernels import tube_kernels
+from brakeline.safety.filter.local_map import LocalMap
+from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows
+from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
+from brakeline.safety.filter.reachable_tube import RolloutTube
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
+
+Array = NDArray[np.float64]
+
+NO_ROWS = np.zeros(0)
+LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
+
+
+@dataclass
+class Record:
+    """What the filter learns during one decision, for its report."""
+
+    started: int
+    solver: str = ""
+    iterations: int = 0
+    solve_ns: int = 0
+    reason: str = ""
+    contained: bool = True
+    broken: int = 0
+    blocked_by: BlockingConstraint | None = None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A plan that the filter may answer with.
+
+    Attributes:
+        plan (N, m), z (nz,): the inputs, and the regressors of their tube.
+        margin [m]: distance of the tube to the nearest half-space (docs/method.md §3).
+        constraints: the constraints whose tube belongs to the plan.
+        continues: the plan is the committed backup plan, and its earlier verification holds.
+        for_clearance: the proposal's tube is verified too, but comes nearer than the clearance margin.
+    """
+
+    kind: str
+    plan: Array
+    z: Array
+    margin: float
+    verified: bool
+    constraints: TubeConstraints
+    continues: bool = False
+    for_clearance: bool = False
+
+
+class Linearized:
+    """A tube and the half-spaces around one plan, as rows that are affine in the regressors.
+
+    Attributes:
+        constraints: the tube. planes: the half-spaces.
+        slack (rows,): what the rows leave for the plan.
+        kept_off (rows,) [m]: how far each row keeps off by the clearance margin.
+        kept: the rows with the clearance margin, once they are known.
+    """
+
+    def __init__(
+        self, constraints: TubeConstraints, local_map: LocalMap, z: Array, planes: list[Planes], slack: Array
+    ) -> None:
+        self.constraints, self.planes, self.slack, self._local_map, self._z = constraints, planes, slack, local_map, z
+        self.kept_off = constraints.kept_off(len(slack))
+        self.kept: ConstraintRows | None = None
+
+    @cached_property
+    def rows(self) -> ConstraintRows:
+        return self.constraints.rows(self._local_map, self._z, self.planes)
+
+
+class PlanSearch:
+    """The search for one decision.
+
+    Attributes:
+        safety: the filter. record: what the search learns.
+        local_map: the surroundings. z_0 (known,): regressors that are known. proposal (m,): the proposed input.
+    """
+
+    def __init__(self, safety: Filter, local_map: LocalMap, z_0: Array, proposal: Array, record: Record) -> None:
+        self.safety, self.local_map, self.z_0, self.proposal, self.record = safety, local_map, z_0, proposal, record
+        self._before = z_0[-len(proposal) :]
+
+    def candidate(self, committed: Array) -> Candidate | None:
+        """Return the first verified plan. committed: free inputs of the committed plan."""
+        safety, local_map, record = self.safety, self.local_map, self.record
+        z = safety.inputs.regressors(self.z_0, self.proposal)
+        everywhere = local_map.empty and safety.constraints.limits is None
+        constraints = safety.constraints_for(z, local_map.widening)
+        if everywhere and not safety.constraints.far and local_map.widening == 1.0:
+            return Candidate(ALLOWED, safety.inputs.plan(z), z, safety.reach, True, constraints)
+        enough = max(safety.clearance_margin, 0.0)
+        if everywhere and (margin := constraints.least(NO_ROWS, z)) >= enough:
+            return Candidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
+        planes, in_place = constraints.planes(local_map, z), safety.turns_in_place(z)
+        slack = constraints.slack(local_map, z, planes)
+        margin = constraints.least(slack, z)
+        allowed = Candidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
+        # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
+        if margin >= (0.0 if in_place else enough):
+            return allowed
+        kept_off = constraints.kept_off(len(slack))
+        if constraints.least(slack - kept_off, z, safety.clearance_margin) >= 0.0:
+            return allowed
+        general = safety.constraints.at(z, local_map.widening) if in_place else constraints
+        proposed = Linearized(general, local_map, z, planes, slack)
+        if margin >= 0.0 and general.margin(self.with_clearance_margin(proposed), z) >= 0.0:
+            return allowed
+        edge = "m of the free space's edge" if safety.robot.position_dim else "(in its own unit) of a limit"
+        record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
+        blocking = kept_off if margin >= 0.0 else np.zeros(len(slack))
+        record.blocked_by = constraints.worst_of(local_map, z, slack, planes, blocking)
+        # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
+        # meet the first rows.
+        adjusted = None
+        for with_clearance in (True, False):
+            if not with_clearance and margin >= 0.0:
+                return allowed
+            found = (self._solve(start, with_clearance) for start in self._starting_points(proposed, committed))
+            adjusted = next((candidate for candidate in found if candidate is not None), None)
+            if adjusted is not None:
+                adjusted = replace(adjusted, for_clearance=margin >= 0.0)
+                break
+        adjusted = self._turned_only(adjusted) or adjusted
+        if adjusted is None:
+            record.reason += "; no verified input was found"
+        return adjusted
+
+    def _starting_points(self, proposed: Linearized, committed: Array) -> Iterator[Linearized]:
+        """Yield the proposal; for a rollout also the committed plan and the strongest braking, linearised.
+
+        A linear tube has the same rows everywhere.
+        """
+        yield proposed
+        if not isinstance(self.safety.tube, RolloutTube):
+            return
+        inputs = self.safety.inputs
+        yield self._around(np.concatenate([self.z_0, inputs.within(committed, self._before)]))
+        yield self._around(inputs.regressors(self.z_0, inputs.nothing))
+
+    def _around(self, z: Array) -> Linearized:
+        """Linearise around the plan with regressors z."""
+        constraints = self.safety.constraints.at(z, self.local_map.widening)
+        planes = constraints.planes(self.local_map, z)
+        return Linearized(constraints, self.local_map, z, planes, constraints.slack(self.local_map, z, planes))
+
+    def _solve(self, start: Linearized, with_clearance: bool) -> Candidate | None:
+        """Return the verified plan closest to the proposal, or None (docs/method.md §4, §13).
+
+        The QP is linear in the inputs; a rollout is not. If its answer is not verified, the filter linearises the
+        rollout there and solves the QP again.
+        """
+        at, safety = start, self.safety
+        for _ in range(LINEARIZATIONS):
+            choice = self.with_clearance_margin(at) if with_clearance else at.rows
+            if not np.isfinite(choice.bound).all():
+                return None
+            z = self._closest(choice)
+            if z is None:
+                return None
+            exact = at.constraints
+            if not isinstance(safety.tube, RolloutTube):  # the rows hold everywhere
+                if exact.margin(choice, z) < 0.0:
+                    return None
+                return Candidate(ADJUSTED, safety.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
+            at = self._around(z)
+            exact, needed = at.constraints, 0.0
+            margin = exact.least(at.slack, z)
+            if margin >= 0.0 and with_clearance:
+                needed = exact.least(at.slack - np.where(self._too_near_to_turn(at), 0.0, at.kept_off), z)
+            if margin >= 0.0 and needed >= 0.0:
+                return Candidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
+        return None
+
+    def _turned_only(self, adjusted: Candidate | None) -> Candidate | None:
+        """Return the proposal without the inputs that move the position, if it is the better candidate.
+
+        It is better if its plan is verified and closer to the proposal than the QP's answer.
+        """
+        safety, local_map = self.safety, self.local_map
+        if safety.in_place is None:
+            return None
+        (box, constraints), m = safety.in_place, len(self.proposal)
+        turn = np.where(safety.standing, np.clip(self.proposal, *box[:, -m:]), safety.inputs.nothing)
+        z = safety.inputs.regressors(self.z_0, safety.inputs.limited(turn, self._before))
+        if not tube_kernels.within(z, box) or (adjusted is not None and self._off(adjusted.z) <= self._off(z)):
+            return None
+        constraints = constraints.at(z, local_map.widening)
+        margin, for_clearance = constraints.margin_in(local_map, z), adjusted is not None and adjusted.for_clearance
+        if margin < 0.0:
+            return None
+        plan = safety.inputs.plan(z)
+        return Candidate(ADJUSTED, plan, z, margin, True, constraints, for_clearance=for_clearance)
+
+    def _off(self, z: Array) -> float:
+        """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""
+        inputs, m = self.safety.inputs, len(self.proposal)
+        first = z[len(self.z_0) : len(self.z_0) + m]
+        return float(np.linalg.norm((first - self.proposal) / (inputs.high - inputs.low)))
+
+    def _closest(self, rows: ConstraintRows) -> Array | None:
+        """Solve the QP; return its answer, clipped to bounds and slew, as regressors, or None without an answer."""
+        before, builder, record = perf_counter_ns(), self.safety.builder, self.record
+        program = builder.program(rows, self.z_0, self.proposal)
+        solution = solve(program) if program is not None else INFEASIBLE
+        record.solve_ns += perf_counter_ns() - before
+        record.solver, record.iterations = solution.status, record.iterations + solution.iterations
+        if not solution.found:
+            return None
+        free = self.safety.inputs.within(builder.inputs(solution.x), self._before)
+        return np.concatenate([self.z_0, free])
+
+    @cached_property
+    def _staying(self) -> tuple[Array, TubeConstraints]:
+        """The regressors of turning in place, or of standing where turns have their own tube; and the constraints."""
+        safety = self.safety
+        in_place = np.where(safety.standing, self.proposal, safety.inputs.nothing)
+        stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(in_place, self._before))
+        if safety.turns_in_place(stay):  # turns have their own tube: room to stand is enough
+            stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(safety.inputs.nothing, self._before))
+        return stay, safety.constraints.at(stay, self.local_map.widening)
+
+    def _too_near_to_turn(self, at: Linearized) -> NDArray[np.bool_]:
+        """Return the rows (rows,) for which turning in place would not keep the clearance margin."""
+        stay, staying = self._staying
+        return np.asarray(staying.slack(self.local_map, stay, at.planes) < at.kept_off)
+
+    def with_clearance_margin(self, at: Linearized) -> ConstraintRows:
+        """Return the rows, tightened by the clearance margin.
+
+        Where turning in place would not keep the margin, two rows take the place of one: the row for free space alone,
+        and a row that forbids inputs that move the robot nearer than the strongest braking does.
+        """
+        if at.kept is None:
+            at.kept = self._tightened(at)
+        return at.kept
+
+    def _tightened(self, at: Linearized) -> ConstraintRows:
+        rows, inside = at.rows, self._too_near_to_turn(at)
+        bound = np.where(inside, rows.bound, rows.bound - at.kept_off)
+        if not inside.any():
+            return ConstraintRows(rows.gradient, rows.spread, bound)
+        closer = rows.gradient[inside] * self.safety.translating
+        return ConstraintRows(
+            np.vstack([rows.gradient, closer]),
+            np.vstack([rows.spread, np.zeros((len(closer), rows.spread.shape[1]))]),
+            np.concatenate([bound, closer @ self._staying[0] + 2.0 * ROW_TIGHTENING]),
+        )

@@ -1,0 +1,74 @@
+"""How far tubes reach: the clearance margin, the reach of local maps, and whether a standing robot drifts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
+
+Array = NDArray[np.float64]
+
+ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
+EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
+
+
+def turning_extent(robot: Robot, tube: Tube) -> float:
+    """Return the default clearance margin [m]: the extent of the tube of turning in place at the highest turn rate.
+
+    Without this margin a robot may stop so close to an obstacle that no motion can be verified from there.
+    """
+    if not robot.position_dim:
+        return 0.0
+    in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
+    state = robot.state_at_inputs(in_place)
+    z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+    tube = tube.at(z)
+    sizes = tube.magnitudes(z)
+    L, d = tube.generators, robot.position_dim
+    directions = np.random.default_rng(0).normal(size=(64, d))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    width = np.abs(directions[:, None, None, :] @ tube.directions)[:, :, 0] @ sizes[:L]
+    drift = np.abs(directions @ tube.centers(z).T)
+    return float((width + drift).max() + sizes[L:].max())
+
+
+def stays(robot: Robot, tube: Tube) -> bool:
+    """Return whether a standing robot stays in place.
+
+    A robot that hovers by an estimate may drift: its tube of standing then grows over a plan by more than the
+    measurement error, and by more than a tenth of the body's radius.
+    """
+    nothing = robot.zero_input()
+    state = robot.state_at_inputs(nothing)[list(robot.regressor)]
+    z = np.concatenate([state, np.tile(nothing, 1 + robot.free_steps)])
+    half = np.abs(tube.directions) @ tube.magnitudes(z)[: tube.generators]
+    size = np.linalg.norm(half, axis=1)
+    measured = np.linalg.norm(robot.measurement_bound[: robot.position_dim])
+    return bool(size[-1] - size[0] <= max(measured, 0.1 * robot.footprint))
+
+
+def widest_extent(robot: Robot, tube: Tube, outer: Tube, domain: Array, body: float) -> float:
+    """Return a distance [m] from the measured position that no tube, with a body of radius `body` [m], exceeds.
+
+    It comes from interval arithmetic over the range of all regressors, so it is loose for error bounds with many
+    rows W. For a rollout it is an estimate from extreme regressors; the filter checks the extent of each plan.
+
+    Args:
+        robot: the robot. tube: the exact tube. outer: an outer tube with fewer rows in W.
+        domain (2, r): range of the recorded [x_0; input in force].
+        body: radius of the body with the measurement error.
+    """
+    F = robot.free_steps
+    low = np.concatenate([domain[0], np.tile(robot.low(), F)])
+    high = np.concatenate([domain[1], np.tile(robot.high(), F)])
+    z = np.maximum(np.abs(low), np.abs(high))
+    sizes = outer.M @ (np.abs(outer.W) @ z) + outer.m_0
+    way = np.abs(outer.position) @ z + np.abs(outer.directions) @ sizes[: outer.generators]
+    if isinstance(tube, RolloutTube):
+        extremes = np.random.default_rng(0).integers(0, 2, (EXTREMES, len(low)))
+        with np.errstate(over="ignore", invalid="ignore"):  # far from the data a rollout may diverge
+            way += np.nan_to_num(np.abs(tube.outputs(np.where(extremes, high, low))[0]), nan=np.inf).max(0)
+        way = np.minimum(ROOM_FOR_STRETCH * way, robot.sight)
+    return float(np.linalg.norm(way, axis=1).max() + body + sizes[outer.generators :].max())

@@ -1,0 +1,30 @@
+"""The score of a window that has ended: how much of its sets the errors used (docs/method.md §15)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.safety.filter.widening import PastWindow
+from brakeline.safety.model.model_set import ModelSet, scored_coordinates
+from brakeline.safety.model.one_step import OneStep
+
+Array = NDArray[np.float64]
+
+
+class WindowScore:
+    """Scores windows by the sets that a model set of mode one-step states for them, without widening."""
+
+    def __init__(self, model: ModelSet, one_step: OneStep) -> None:
+        n, robot = model.robot.state_dim, model.robot
+        kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
+        scored = np.array(scored_coordinates(robot), dtype=np.int64)
+        W = np.ascontiguousarray(model.first.W)  # the same for all periods
+        self._predictor, self._sets = one_step.stretch_arguments(robot), (W, M, kappa, w, scored)
+
+    def __call__(self, past: PastWindow, state: Array) -> float:
+        """Return the largest ratio of an error to its set in the window that ends in a measured state (n,)."""
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        states = np.concatenate([past.states, state[None]])
+        return rollout_kernels.score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)
