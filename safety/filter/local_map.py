@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,29 +77,27 @@ def local_map(robot: Robot, request: Request, reach: float, turn: Array, occlude
     heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
     if len(near):
         away = shape_kernels.distances(*near.parts, start) - near.margin
-        beyond, counts = _parted(away, beyond, reach)
-        near = near if counts.all() else near.take(counts)
+        beyond, counts, number = shape_kernels.parted(away, beyond, reach)
+        if number < len(near):
+            near = near.take(counts) if number else _nothing(d)
     moving = request.movers
     if moving is not None:
-        beyond, counts = _parted(moving.least_distance(start, whole_plan), beyond, reach)
-        moving = moving.take(counts) if counts.any() else None
+        beyond, counts, number = shape_kernels.parted(moving.least_distance(start, whole_plan), beyond, reach)
+        moving = moving.take(counts) if number else None
     other_reservations = request.other_reservations
     if other_reservations is not None:
-        beyond, counts = _parted(other_reservations.nearest(start), beyond, reach)
-        other_reservations = other_reservations.take(counts) if counts.any() else None
+        beyond, counts, number = shape_kernels.parted(other_reservations.nearest(start), beyond, reach)
+        other_reservations = other_reservations.take(counts) if number else None
     unseen: OccupiedCells | OccludedRegions | None = occluded
     if isinstance(request.scan, Scan):
         unseen = _unseen(request.scan, start, reach, whole_plan)
     return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, request.widening)
 
 
-def _parted(away: Array, beyond: float, reach: float) -> tuple[float, NDArray[np.bool_]]:
-    """Return the distance [m] of the nearest obstacle beyond reach, at most `beyond`, and which (n,) are within.
-
-    An obstacle whose distance is NaN counts as within reach.
-    """
-    counts = ~(away > reach)
-    return float(away[~counts].min(initial=beyond)), counts
+@cache
+def _nothing(dim: int) -> Shapes:
+    """Return no obstacles."""
+    return Shapes.of((), dim)
 
 
 def _unseen(scan: Scan, start: Array, reach: float, whole_plan: float) -> OccupiedCells | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,8 @@ def _by_few(program: QuadraticProgram) -> Solution | None:
     inside, iterations = hildreth_active_set(program.h, program.g, program.A, program.b, STEPS), 0
     inside[len(program.b) - program.always :] = True
     for _ in range(ROUNDS):
-        part = _solved(replace(program, A=program.A[inside], b=program.b[inside]), few=True)
+        rows = QuadraticProgram(program.h, program.g, program.A[inside], program.b[inside])
+        part = _solved(rows, few=True)
         iterations += part.iterations
         if part.status != SOLVED:
             return None

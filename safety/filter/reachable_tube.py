@@ -6,9 +6,9 @@ periods, `stack_recursive` is the recursion of Lemma 2, and `stack_rollout` roll
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -150,19 +150,20 @@ class RolloutTube(Tube):
         return np.array(self.kept, dtype=np.int64)
 
     @cached_property
-    def _arguments(self) -> tuple[*Arguments, Array, float]:
-        return self.one_step.stretch_arguments(self.robot)
+    def _sets_around(self) -> Callable[[Array], tuple[Array, Array, Array, Array, Array, Array]]:
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        sets = np.ascontiguousarray(self.directions), np.ascontiguousarray(self.more_directions)
+        predictor = self.one_step.stretch_arguments(self.robot)
+        return partial(rollout_kernels.sets_around, *predictor, self.inputs_of, self._kept, *sets)
 
     @cached_property
-    def _sets(self) -> tuple[Array, Array]:
-        return np.ascontiguousarray(self.directions), np.ascontiguousarray(self.more_directions)
+    def _arguments(self) -> Arguments:
+        return self.one_step.arguments(self.robot)
 
     def at(self, z: Array) -> Tube:
         """Return the sets around the rollout from z."""
-        from brakeline.safety.filter.kernels import rollout_kernels
-
-        parts = rollout_kernels.sets_around(*self._arguments, z, self.inputs_of, self._kept, *self._sets)
-        centers, wide, more, more_wide, first, stretch = parts
+        centers, wide, more, more_wide, first, stretch = self._sets_around(z)
         still, more_still = self._still
         sets = still, wide, self.W, self.M, self.m_0, more_still, more_wide, centers, more, first, stretch
         return TubeAround(*sets, rollout=self)
@@ -176,7 +177,7 @@ class RolloutTube(Tube):
         """Return gradient and offset of the centers, and of the other coordinates: the rollout, linearised at z."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        return rollout_kernels.affine(*self._arguments[:-2], z, self.inputs_of, self._kept)
+        return rollout_kernels.affine(*self._arguments, z, self.inputs_of, self._kept)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""

@@ -230,10 +230,17 @@ class FastRequestCheck:
         low, high = (np.tile(bound, (robot.horizon, 1)) for bound in robot.bounds)
         low[-1, robot.zero_at_rest], high[-1, robot.zero_at_rest] = -STOPPED, STOPPED
         fixed = [np.full(n, FARTHEST), np.full(m, most)]
-        self.low = np.concatenate([*(-part for part in fixed), robot.bounds[0], low.ravel()])
-        self.high = np.concatenate([*fixed, robot.bounds[1], high.ravel()])
-        self.predicted_low = np.concatenate([self.low, [-most], np.full(n, -most), np.zeros(n)])
-        self.predicted_high = np.concatenate([self.high, np.full(2 * n + 1, most)])
+        self.bounds = np.stack(
+            [
+                np.concatenate([*(-part for part in fixed), robot.bounds[0], low.ravel()]),
+                np.concatenate([*fixed, robot.bounds[1], high.ravel()]),
+            ]
+        )
+        predicted = np.stack([np.concatenate([np.full(n + 1, -most), np.zeros(n)]), np.full(2 * n + 1, most)])
+        self.with_predicted = np.hstack([self.bounds, predicted])
+        from brakeline.safety.filter.kernels import tube_kernels  # here, since clients need no compiled code
+
+        self.within = tube_kernels.within
 
     def __call__(self, request: Request) -> bool:
         """Return False if `check_for_filter` must look at the request."""
@@ -249,14 +256,11 @@ class FastRequestCheck:
                 return False
         predicted = request.predicted
         if predicted is None:
-            values, low, high = np.concatenate((request.state, *inputs)), self.low, self.high
-        else:
-            if not predicted.center.shape == predicted.half_width.shape == (n,):
-                return False
-            sets = (predicted.heading,), predicted.center, predicted.half_width
-            values = np.concatenate((request.state, *inputs, *sets))
-            low, high = self.predicted_low, self.predicted_high
-        return bool(((values >= low) & (values <= high)).all())
+            return self.within(np.concatenate((request.state, *inputs)), self.bounds)
+        if not predicted.center.shape == predicted.half_width.shape == (n,):
+            return False
+        sets = (predicted.heading,), predicted.center, predicted.half_width
+        return self.within(np.concatenate((request.state, *inputs, *sets)), self.with_predicted)
 
 
 def check_for_rival(robot: Robot, request: Request, observed: int) -> None:

@@ -20,11 +20,12 @@ class WindowScore:
         kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
         scored = np.array(scored_coordinates(robot), dtype=np.int64)
         W = np.ascontiguousarray(model.first.W)  # the same for all periods
-        self._predictor, self._sets = one_step.stretch_arguments(robot), (W, M, kappa, w, scored)
+        from brakeline.safety.filter.kernels import rollout_kernels
+
+        self._score, self._predictor = rollout_kernels.score, one_step.stretch_arguments(robot)
+        self._sets = W, M, kappa, w, scored
 
     def __call__(self, past: PastWindow, state: Array) -> float:
         """Return the largest ratio of an error to its set in the window that ends in a measured state (n,)."""
-        from brakeline.safety.filter.kernels import rollout_kernels
-
         states = np.concatenate([past.states, state[None]])
-        return rollout_kernels.score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)
+        return self._score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)

@@ -184,7 +184,7 @@ def affine(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T,
 
 
 def sets_around(
-    C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, z, T, kept, sets, more_sets
+    C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, T, kept, sets, more_sets, z
 ):
     """`rollout_kernels.sets_around`."""
     parts, window = (C, scale, saturations, terms, others, heading, arms, d, inputs), (T @ z)[None]
@@ -230,6 +230,12 @@ def score(
 def distances(center, axes, half, rho, rounded, point):
     """`shape_kernels.distances`."""
     return Shapes(center, axes, half, rho, rounded, np.zeros(len(rho))).distance(point)
+
+
+def parted(away, beyond, reach):
+    """`shape_kernels.parted`."""
+    counts = ~(away > reach)
+    return float(away[~counts].min(initial=beyond)), counts, int(counts.sum())
 
 
 def roomiest_planes(unit, level, ends):

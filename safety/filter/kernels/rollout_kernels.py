@@ -296,7 +296,7 @@ def affine(
 @compiled(
     "Tuple((f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[::1], f8[::1]))"
     f"({SHARED}, f8[:,::1], f8,"
-    " f8[::1], f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1])"
+    " f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1])"
 )
 def sets_around(
     C: Array,
@@ -310,11 +310,11 @@ def sets_around(
     inputs: int,
     root: Array,
     weight: float,
-    z: Array,
     T: Array,
     kept: Index,
     directions: Array,
     more_directions: Array,
+    z: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return the rollout from z, and the generators of the sets around it.
 

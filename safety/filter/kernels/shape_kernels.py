@@ -57,6 +57,21 @@ def distances(center: Array, axes: Array, half: Array, rho: Array, rounded: Arra
     return away
 
 
+@compiled("Tuple((f8, b1[::1], i8))(f8[::1], f8, f8)")
+def parted(away: Array, beyond: float, reach: float) -> tuple[float, NDArray[np.bool_], int]:
+    """Return the distance [m] of the nearest obstacle beyond reach, at most `beyond`, and which (n,) are within.
+
+    An obstacle whose distance is NaN counts as within reach. The last value is the number of obstacles within.
+    """
+    counts, number = np.empty(len(away), np.bool_), 0
+    for i in range(len(away)):
+        counts[i] = not away[i] > reach
+        number += counts[i]
+        if not counts[i]:
+            beyond = min(beyond, away[i])
+    return beyond, counts, number
+
+
 @compiled("i8[:,::1](f8[:,:,::1], f8[:,::1], f8[:,::1])")
 def roomiest_planes(unit: Array, level: Array, ends: Array) -> Index:
     """Return the index (n, N) of the plane, among the 2N+1, that each period uses.
