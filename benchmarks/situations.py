@@ -17,27 +17,27 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
-from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.model_set import DIRECT, ModelConfig, ModelSet
 from brakeline.safety.service.wire import request_of
 from brakeline.sim.sim_conditions import Conditions
 
 STEPS = 1500
 
 
-def model(certificate: str = "residual", mode: str = "direct", robot: RobotWithTask | None = None) -> ModelSet:
+def model(certificate: str = "residual", mode: str = DIRECT, robot: RobotWithTask | None = None) -> ModelSet:
     """Return a model set of a robot; by default of the ground robot."""
     return model_for(robot or robot_with_task("ground"), ModelConfig(certificate, mode))
 
 
 def driven(
-    policy: str, seed: int, robot: RobotWithTask, conditions: Conditions | None = None
+    policy: str, seed: int, robot: RobotWithTask, conditions: Conditions | None = None, mode: str = DIRECT
 ) -> Iterator[tuple[pb.Episode | None, DecisionOutcome, pb.Step]]:
-    """Drive a policy behind the default filter, without end.
+    """Drive a policy behind the default filter, or one of another mode, without end.
 
     Yields:
         At each step: the message of the episode at its first step, else None; the outcome of the request; the step.
     """
-    ask = in_process(model(robot=robot))
+    ask = in_process(model(mode=mode, robot=robot))
     driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), ActorIdentity("actor-0", 0, seed))
     choose = policy_named(policy, robot, seed)
     for number in count():
@@ -51,10 +51,14 @@ def driven(
 
 
 def messages(
-    policy: str = "random", seed: int = 5, robot: RobotWithTask | None = None, conditions: Conditions | None = None
+    policy: str = "random",
+    seed: int = 5,
+    robot: RobotWithTask | None = None,
+    conditions: Conditions | None = None,
+    mode: str = DIRECT,
 ) -> list[pb.Request]:
-    """Return the requests of some episodes of a policy behind the default filter."""
-    steps = driven(policy, seed, robot or robot_with_task("ground"), conditions)
+    """Return the requests of some episodes of a policy behind the default filter, or one of another mode."""
+    steps = driven(policy, seed, robot or robot_with_task("ground"), conditions, mode)
     return [outcome.request for _, outcome, _ in islice(steps, STEPS)]
 
 

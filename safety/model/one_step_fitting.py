@@ -47,14 +47,12 @@ class Samples:
 
     Attributes:
         v (P, v), y (P, n), period_fold (P,): all periods: variables [s; u; input of the period before] and outputs.
-        leading (P, v): the same variables in the order of regressors: [s; input of the period before; u].
         z (T, nz), after (T, N, n + d·discs), chords (T, N), stops (T,), fold (T,), start (T, 2): all windows of N
             periods that lie in one fold: regressors, outputs after each period, chord deviations [m], the way after the
             window [m] if it ends in a stop, otherwise NaN, trajectory and first period.
     """
 
     v: Array
-    leading: Array
     y: Array
     period_fold: Index
     z: Array
@@ -80,7 +78,7 @@ def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
         periods = len(t.inputs)
         block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
         parts.append((*_periods(robot, t), block, *_windows(data, t, number, block)))
-    names = ("v", "leading", "y", "period_fold", "z", "after", "chords", "stops", "fold", "start")
+    names = ("v", "y", "period_fold", "z", "after", "chords", "stops", "fold", "start")
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples = Samples(**dict(zip(names, columns, strict=True)))
     if len(np.unique(samples.fold)) < folds:
@@ -95,10 +93,9 @@ def _before(robot: Robot, t: Trajectory) -> Array:
     return np.vstack([first, t.inputs[:-1]])
 
 
-def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array, Array]:
-    measured, before = t.states[:-1, list(robot.regressor)], _before(robot, t)
-    v, leading = np.hstack([measured, t.inputs, before]), np.hstack([measured, before, t.inputs])
-    return v, leading, displacement(robot, t.states[:-1], t.states[1:])
+def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
+    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, _before(robot, t)])
+    return v, displacement(robot, t.states[:-1], t.states[1:])
 
 
 def _windows(
@@ -331,7 +328,8 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     first_scale = np.where(np.arange(n) < d, factor, first)
     steps = tuple(shape.bound(robot, k, slice(n), scale if k > 1 else first_scale) for k in range(1, N + 1))
     chords = [shape.bound(robot, k, slice(n, n + 1), scale[:1]) for k in range(1, N + 1)]
-    known = s.leading[:, : robot.regressor_dim]
+    measured = len(robot.regressor)
+    known = np.hstack([s.v[:, :measured], s.v[:, measured + robot.action_dim :]])  # without the period's own input
     model = ModelSet(
         robot,
         replace(model_config, mode=ONE_STEP, windows=FREE, certificate=RESIDUAL),
