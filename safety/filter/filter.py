@@ -26,7 +26,7 @@ from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.plan_inputs import PlanInputs
-from brakeline.safety.filter.plan_search import Candidate, PlanSearch, Record
+from brakeline.safety.filter.plan_search import DecisionRecord, PlanCandidate, PlanSearch
 from brakeline.safety.filter.qp import QPBuilder
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import (
@@ -149,7 +149,7 @@ class Filter:
         Raises:
             BadRequest: a value is missing, not finite or of the wrong size; the error names the field.
         """
-        record = Record(perf_counter_ns())
+        record = DecisionRecord(perf_counter_ns())
         if self.ordinary(request):
             check_surroundings(self.robot, request)
         else:
@@ -183,8 +183,8 @@ class Filter:
         return self._decision(request, local_map, candidate, record)
 
     def _committed(
-        self, request: Request, local_map: LocalMap, z_0: Array, record: Record, in_domain: bool
-    ) -> Candidate:
+        self, request: Request, local_map: LocalMap, z_0: Array, record: DecisionRecord, in_domain: bool
+    ) -> PlanCandidate:
         """Return the committed backup plan, or braking that is verified anew, or braking that is not verified.
 
         The committed plan still counts as verified if the measured state is in the predicted set, this model set
@@ -204,17 +204,17 @@ class Filter:
         if record.contained and vouched:
             constraints = self.constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
-            return Candidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
+            return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
         for z in (as_committed, brake):
             constraints = self.constraints_for(z, local_map.widening)
             margin = constraints.margin_in(local_map, z)
             if in_domain and margin >= 0.0:
-                return Candidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
-        return Candidate(FAILSAFE, self.inputs.plan(brake), brake, margin, False, constraints)
+                return PlanCandidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
+        return PlanCandidate(FAILSAFE, self.inputs.plan(brake), brake, margin, False, constraints)
 
-    def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> Candidate | None:
+    def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> PlanCandidate | None:
         """Return a slow way out for a robot that stands, or is on such a way, where standing is not verified.
 
         The violation must exceed what two measurement errors explain, plus the clearance margin for a robot that stays
@@ -272,9 +272,11 @@ class Filter:
         else:
             return None
         margin, constraints = constraints.margin(rows, z), self.constraints.at(z, local_map.widening)
-        return Candidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
+        return PlanCandidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
 
-    def _decision(self, request: Request, local_map: LocalMap, candidate: Candidate, record: Record) -> Decision:
+    def _decision(
+        self, request: Request, local_map: LocalMap, candidate: PlanCandidate, record: DecisionRecord
+    ) -> Decision:
         z, constraints = candidate.z, candidate.constraints
         centers, half = constraints.sets(local_map.start, local_map.turn, z)
         reservation = request.reservation

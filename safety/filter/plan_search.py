@@ -33,7 +33,7 @@ LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 
 
 @dataclass
-class Record:
+class DecisionRecord:
     """What the filter learns during one decision, for its report."""
 
     started: int
@@ -47,7 +47,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class PlanCandidate:
     """A plan that the filter may answer with.
 
     Attributes:
@@ -98,25 +98,27 @@ class PlanSearch:
         local_map: the surroundings. z_0 (known,): regressors that are known. proposal (m,): the proposed input.
     """
 
-    def __init__(self, safety: Filter, local_map: LocalMap, z_0: Array, proposal: Array, record: Record) -> None:
+    def __init__(
+        self, safety: Filter, local_map: LocalMap, z_0: Array, proposal: Array, record: DecisionRecord
+    ) -> None:
         self.safety, self.local_map, self.z_0, self.proposal, self.record = safety, local_map, z_0, proposal, record
         self._before = z_0[-len(proposal) :]
 
-    def candidate(self, committed: Array) -> Candidate | None:
+    def candidate(self, committed: Array) -> PlanCandidate | None:
         """Return the first verified plan. committed: free inputs of the committed plan."""
         safety, local_map, record = self.safety, self.local_map, self.record
         z = safety.inputs.regressors(self.z_0, self.proposal)
         everywhere = local_map.empty and safety.constraints.limits is None
         constraints = safety.constraints_for(z, local_map.widening)
         if everywhere and not safety.constraints.far and local_map.widening == 1.0:
-            return Candidate(ALLOWED, safety.inputs.plan(z), z, safety.reach, True, constraints)
+            return PlanCandidate(ALLOWED, safety.inputs.plan(z), z, safety.reach, True, constraints)
         enough = max(safety.clearance_margin, 0.0)
         if everywhere and (margin := constraints.least(NO_ROWS, z)) >= enough:
-            return Candidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
+            return PlanCandidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
         planes, in_place = constraints.planes(local_map, z), safety.turns_in_place(z)
         slack = constraints.slack(local_map, z, planes)
         margin = constraints.least(slack, z)
-        allowed = Candidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
+        allowed = PlanCandidate(ALLOWED, safety.inputs.plan(z), z, margin, True, constraints)
         # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
         if margin >= (0.0 if in_place else enough):
             return allowed
@@ -165,7 +167,7 @@ class PlanSearch:
         planes = constraints.planes(self.local_map, z)
         return Linearized(constraints, self.local_map, z, planes, constraints.slack(self.local_map, z, planes))
 
-    def _solve(self, start: Linearized, with_clearance: bool) -> Candidate | None:
+    def _solve(self, start: Linearized, with_clearance: bool) -> PlanCandidate | None:
         """Return the verified plan closest to the proposal, or None (docs/method.md §4, §13).
 
         The QP is linear in the inputs; a rollout is not. If its answer is not verified, the filter linearises the
@@ -183,17 +185,17 @@ class PlanSearch:
             if not isinstance(safety.tube, RolloutTube):  # the rows hold everywhere
                 if exact.margin(choice, z) < 0.0:
                     return None
-                return Candidate(ADJUSTED, safety.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
+                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
             at = self._around(z)
             exact, needed = at.constraints, 0.0
             margin = exact.least(at.slack, z)
             if margin >= 0.0 and with_clearance:
                 needed = exact.least(at.slack - np.where(self._too_near_to_turn(at), 0.0, at.kept_off), z)
             if margin >= 0.0 and needed >= 0.0:
-                return Candidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
+                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
         return None
 
-    def _turned_only(self, adjusted: Candidate | None) -> Candidate | None:
+    def _turned_only(self, adjusted: PlanCandidate | None) -> PlanCandidate | None:
         """Return the proposal without the inputs that move the position, if it is the better candidate.
 
         It is better if its plan is verified and closer to the proposal than the QP's answer.
@@ -211,7 +213,7 @@ class PlanSearch:
         if margin < 0.0:
             return None
         plan = safety.inputs.plan(z)
-        return Candidate(ADJUSTED, plan, z, margin, True, constraints, for_clearance=for_clearance)
+        return PlanCandidate(ADJUSTED, plan, z, margin, True, constraints, for_clearance=for_clearance)
 
     def _off(self, z: Array) -> float:
         """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""

@@ -18,12 +18,13 @@ from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import driving_kinds
-from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound, envelope
+from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import Features, OneStep, features_for
-from brakeline.safety.model.windows import displacement, plan_regressor_map, predicted_outputs, way_after_rest, ways
+from brakeline.safety.model.set_shape import MOST_FOR_SHAPE, Shape, plans_from, shape_with_chords, spread_features
+from brakeline.safety.model.windows import displacement, predicted_outputs, way_after_rest, ways
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,9 +33,6 @@ FOLDS = 5
 DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
 FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
 SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
-MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameters
-CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
-LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
@@ -208,75 +206,6 @@ def _distances(robot: Robot, errors: Array) -> Array:
         return np.asarray(np.linalg.norm(errors[..., : robot.position_dim], axis=-1))
 
 
-def spread_features(robot: Robot, z: Array, k: int) -> Array:
-    """Return what the half-widths after k periods grow with (T, q), for regressors z (T, r + m + N·m).
-
-    These are the speeds, the input in force, and the means of the k inputs and of their changes, each without its sign:
-    with a slope for each input, minutes of driving would not determine a half-width.
-    """
-    known, m = robot.regressor_dim, robot.action_dim
-    inputs = z[:, known - m :].reshape(len(z), -1, m)[:, : k + 1]  # from the input in force on
-    changes = np.abs(np.diff(inputs, axis=1)).mean(1)
-    return np.hstack([np.abs(z[:, :known]), np.abs(inputs[:, 1:]).mean(1), changes])
-
-
-def _plans_from(robot: Robot, z: Array) -> Array:
-    """Return the regressors of plans from recorded starts: with the recorded first input, and braking at once."""
-    known, m = robot.regressor_dim, robot.action_dim
-    firsts = z[:, known : known + m], np.broadcast_to(robot.zero_input(), (len(z), m))
-    plans = [np.hstack([z[:, :known], np.tile(first, robot.free_steps)]) for first in firsts]
-    return np.asarray(np.vstack(plans) @ plan_regressor_map(robot).T)
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Half-widths of the predicted coordinates after each period, up to a factor: slopes · `spread_features` + w.
-
-    Attributes:
-        slopes (N, n', q), w (N, n'): n' coordinates.
-    """
-
-    slopes: Array
-    w: Array
-
-    def widths(self, robot: Robot, z: Array, last: bool = False) -> Array:
-        """Return half-widths (T, N, n') for regressors z (T, nz). last: of a shape of the last period alone."""
-        first = robot.horizon if last else 1
-        parts = [spread_features(robot, z, first + k) @ slopes.T for k, slopes in enumerate(self.slopes)]
-        return np.asarray(np.stack(parts, axis=1) + self.w)
-
-    @staticmethod
-    def around(robot: Robot, z: Array, errors: Array, inflation: float = 1.0, last: bool = False) -> Shape:
-        """Return the shape that holds all errors (T, N, n') and is tightest, on average, for plans as the filter has.
-
-        Driving that was recorded holds large inputs to the end of a window; plans brake. last: the errors (T, 1, n')
-        are those after the last period.
-        """
-        _, N, n = errors.shape
-        found, plans = [], _plans_from(robot, z)
-        for k in range(N):
-            period = robot.horizon if last else k + 1
-            used, typical = spread_features(robot, z, period), spread_features(robot, plans, period)
-            found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical) for i in range(n)]
-        slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
-        return Shape(slopes.reshape(N, n, -1), w.reshape(N, n))
-
-    def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
-        """Return the error bound of some coordinates after k periods, each times its factor; without a predictor.
-
-        The rows of W are the changes of the inputs.
-        """
-        known, m, N = robot.regressor_dim, robot.action_dim, robot.horizon
-        nz = known + N * m
-        changes = np.eye(N * m, nz, known) - np.eye(N * m, nz, known - m)
-        slopes, w = factor[:, None] * self.slopes[k - 1, coordinates], factor * self.w[k - 1, coordinates]
-        kappa, M = np.zeros((len(w), nz)), np.zeros((len(w), N * m))
-        kappa[:, :known] = slopes[:, :known]
-        kappa[:, known : known + k * m] = np.tile(slopes[:, known : known + m] / k, k)
-        M[:, : k * m] = np.tile(slopes[:, known + m :] / k, k)
-        return ErrorBound(np.zeros_like(kappa), changes, M, kappa, w, np.eye(len(w)))
-
-
 @dataclass(frozen=True)
 class Calibration:
     """How the predictor of one period was chosen, and how far its sets had to be widened.
@@ -322,7 +251,7 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
         first = max(factor, first)
     one_step = regression.fit(chosen.ridge, weight=weight)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = _shape(robot, s.z, errors, s.chords)
+    shape = shape_with_chords(robot, s.z, errors, s.chords)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factor)
     first_scale = np.where(np.arange(n) < d, factor, first)
@@ -381,19 +310,6 @@ def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> 
     return shape.bound(data.robot, data.robot.horizon, slice(1), np.ones(1))
 
 
-def _shape(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
-    """Return the shape of the errors, and of the chord deviations as a further coordinate."""
-    some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
-    shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2))
-    shape.slopes[:, -1] *= CHORD_INFLATION
-    if robot.position_dim:
-        least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
-    else:
-        least = LEAST_CHORD * float((np.abs(robot.limit_weights) @ shape.w[-1, :-1] / robot.limit_scales).mean())
-    shape.w[:, -1] = np.maximum(CHORD_INFLATION * shape.w[:, -1], least)
-    return shape
-
-
 def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float, outside: float) -> float:
     """Return the largest weight of the leverage with which the last sets of plans are nearly as narrow as with any.
 
@@ -403,7 +319,7 @@ def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float, out
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, found = _plans_from(robot, z), dict.fromkeys(WEIGHTS, 0.0)
+    plans, found = plans_from(robot, z), dict.fromkeys(WEIGHTS, 0.0)
     for weight in WEIGHTS:
         scores, width = np.zeros(len(z)), 0.0
         for i in range(len(regression.gram)):
@@ -433,7 +349,7 @@ def _scores(
         held = s.fold == i
         one_step = regression.fit(ridge, i, weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = _shape(robot, s.z[~held], errors[~held], s.chords[~held])
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held])
         widths = shape.widths(robot, s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = shares[..., used].max((1, 2))

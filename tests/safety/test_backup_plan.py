@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, Prediction
-from brakeline.safety.filter.plan_search import Record
+from brakeline.safety.filter.plan_search import DecisionRecord
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
@@ -48,7 +48,11 @@ def test_an_older_models_tail_is_verified_anew(ready, version):
         ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         found = ready._committed(
-            ask, ready.constraints.local_map(ask, z_0, ready.builder.reachable(z_0[-2:])), z_0, Record(0), in_domain
+            ask,
+            ready.constraints.local_map(ask, z_0, ready.builder.reachable(z_0[-2:])),
+            z_0,
+            DecisionRecord(0),
+            in_domain,
         )
         assert found.verified == verified
         assert np.array_equal(found.plan, ask.plan if verified else STILL)

@@ -10,7 +10,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.plan_search import Linearized, PlanSearch, Record
+from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
 from brakeline.safety.model.error_bounds import KINDS, ErrorBound
@@ -103,7 +103,7 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         z = np.concatenate([z_0, proposal])
         planes = ready.constraints.planes(scene, z)
         at = Linearized(ready.constraints, scene, z, planes, ready.constraints.slack(scene, z, planes))
-        kept = PlanSearch(ready, scene, z_0, proposal, Record(0)).with_clearance_margin(at)
+        kept = PlanSearch(ready, scene, z_0, proposal, DecisionRecord(0)).with_clearance_margin(at)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
         best = np.inf
         for u in grid:
