@@ -64,14 +64,16 @@ class ObstacleRows:
 
     def rows(self, center: Center, normals: Array, offsets: Array, widening: float) -> ConstraintRows:
         """Return rows for half-spaces `a·p <= b` in the robot's frame, a (n, N, d), b (n, N)."""
-        return ConstraintRows(*halfspace_kernels.rows(normals, offsets, *center, *self._ends, self._sizes, widening))
+        parts = *center, *self._ends
+        return ConstraintRows(*halfspace_kernels.rows(normals, offsets, *parts, self._sizes, widening))
 
     def slack(self, center: Center, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
         """Return `bound - support` of these rows for regressors z with magnitudes `sizes` (L+N+1,).
 
         This is faster than building the rows: there may be hundreds, each as wide as the tube has generators.
         """
-        return halfspace_kernels.slack(normals, offsets, *center, *self._ends, sizes, z)
+        parts = *center, *self._ends
+        return halfspace_kernels.slack(normals, offsets, *parts, sizes, z)
 
 
 class QPBuilder:
