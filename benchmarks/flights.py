@@ -1,4 +1,4 @@
-"""Fly real autopilots among obstacles: a first flight, flights behind the filter that it gives, and then policies.
+"""Fly real autopilots among obstacles: a first flight, more flights behind the filter if wanted, and then policies.
 
 Needs `$BRAKELINE_ARDUPILOT` and `$BRAKELINE_PX4`: folders whose `sitl FOLDER INSTANCE` runs one. The benchmark leaves
 out what is missing. In real time: twenty minutes or thirty, and `--minutes` for each policy in each arena. It does not
@@ -32,6 +32,7 @@ PRACTICE = "0.15"  # share of steps at which it practises the planned stop: a mo
 BEYOND = 240.0  # s that a command may take besides its flight: estimator, landing, model set
 # A few minutes of flight give a loose bound. The benchmark measures flights behind it all the same.
 ACCEPTING = ("--accept-bound", "1")
+ONE_FLIGHT = ("--accept-bound", "0.03")  # of mode one-step
 TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
 
@@ -45,6 +46,8 @@ class Setup:
         words: options of `collect` and `fly`.
         cameras: it flies under motion capture.
         further: its last model set is of a third flight, long enough without `--few`.
+        outside: `--outside` of the only model set, of mode one-step and from the first flight. 0 for linear model sets
+            of a second or third flight.
     """
 
     kind: str
@@ -52,12 +55,19 @@ class Setup:
     words: tuple[str, ...] = ()
     cameras: bool = False
     further: bool = False
+    outside: float = 0.0
+
+    @property
+    def accepting(self) -> tuple[str, str]:
+        """The options that accept the bound of the setup's model sets."""
+        return ONE_FLIGHT if self.outside else ACCEPTING
 
 
 # ArduCopter 4.0 moves a target position along with the requested velocity, and flies faster than requested to catch up
 # with it. With lower gains it creeps after a stop, with higher ones it overshoots. With position targets (`--lead`) it
 # has nothing to catch up with, so the gains can be high.
 CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 1.0, "PSC_VELZ_P": 8.0}
+STEADY = {**CALM, "PSC_VELXY_P": 3.0, "PSC_VELXY_D": 1.0}
 STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
 # The sensors of PX4's SIH have other noise than its estimator assumes, and its GPS has no delay.
 HEARD = {
@@ -75,11 +85,14 @@ OUTDOORS, HEARING = "ardupilot", "px4"
 PATIENT = {**ALERT, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
 LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
 INDOORS_LED = "px4 with motion capture, led to places"
+OUTDOORS_ONCE, INDOORS_ONCE = "ardupilot, one flight", "px4 with motion capture, one flight"
 SETUPS = {
     OUTDOORS: Setup("ardupilot", CALM, further=True),
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True),
+    OUTDOORS_ONCE: Setup("ardupilot", STEADY, outside=0.02),
+    INDOORS_ONCE: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True, outside=0.01),
     INDOORS_LED: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **PATIENT}, ("--lead",), cameras=True),
 }
 
@@ -106,8 +119,11 @@ def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, flo
     yield "first flight", _learned(first)
     if "model" not in first:
         return
-    yield "second flight", flown(flights.second)
-    yield "certified by it", _certified(flights, "second", "--few")
+    if flights.once:
+        yield "certified by it", certified(flights.certify_first())
+    else:
+        yield "second flight", flown(flights.second)
+        yield "certified by it", _certified(flights, "second", "--few")
     if flights.further:
         yield "third flight", flown(flights.third)
         yield "certified by that", _certified(flights, "third")
@@ -145,6 +161,7 @@ class Flights:
     def __init__(self, setup: str, start: Path, folder: Path) -> None:
         self._name, self._setup, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
         self.data, self.further = self._folder / "data", self._setup.further
+        self.once = self._setup.outside > 0.0  # the first flight is the only one before the policies
 
     @classmethod
     def beside(cls, other: Flights, name: str) -> Flights:
@@ -167,10 +184,21 @@ class Flights:
         """Put the model set of a flight's log to use in a data folder. Returns its validation, or {"refused": …}."""
         path = self._folder / f"{name}-certified.json"
         if not path.exists():
-            command = ["certify", str(self.run(name)), "--robot", "quadrotor-late", *words, "--use", *ACCEPTING]
-            path.write_text(told([*command, "--certificates", "residual", "--mode", "direct", "--json"], data, BEYOND))
+            linear = "--certificates", "residual", "--mode", "direct"
+            path.write_text(self._certify(self.run(name), data, *words, *linear))
         figures: dict[str, Any] = json.loads(path.read_text())["residual"]["direct"]
         return figures
+
+    def certify_first(self) -> dict[str, Any]:
+        """Put a model set of mode one-step to use, from the first flight. Returns its validation."""
+        flown = self.data / "quadrotor" / "flown.safetensors"
+        printed = self._certify(flown, self.data, "--outside", str(self._setup.outside))
+        figures: dict[str, Any] = json.loads(printed)["residual"]["one-step"]
+        return figures
+
+    def _certify(self, source: Path, data: Path, *words: str) -> str:
+        command = ["certify", str(source), "--robot", "quadrotor-late", *words, "--use", *self._setup.accepting]
+        return told([*command, "--json"], data, BEYOND)
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
         """Fly a policy in an arena."""
@@ -210,7 +238,7 @@ class Flights:
             stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0]))
             option = "--system" if vehicles == 1 else "--systems"
             where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
-            command = [*words, *ACCEPTING, *self._setup.words, *where]
+            command = [*words, *self._setup.accepting, *self._setup.words, *where]
             return told(command, self.data, 60.0 * minutes + BEYOND)
 
     def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
@@ -255,7 +283,6 @@ def switched_on(
 
 def told(words: list[str], data: Path, seconds: float) -> str:
     """Return the last line that a command of ours prints; data: its folder of data sets. Raises Failed."""
-    environment = os.environ | {"BRAKELINE_DATA": str(data)}
     command, environment = [*PYTHON, "-m", "brakeline.deploy.cli", *words], os.environ | {"BRAKELINE_DATA": str(data)}
     done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment, timeout=seconds)
     if not (lines := done.stdout.splitlines()):

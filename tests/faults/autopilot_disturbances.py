@@ -1,7 +1,8 @@
 """Real autopilots under changed conditions: wind, weak motors, a load, noise, a GPS that jumps, cameras that fail.
 
 Run it after `flights`, in the same folder. A* flies among obstacles behind the model set from there; `certify` makes a
-new model set from that flight's log; A* flies behind the new one. In real time: eight minutes for each condition.
+new model set from that flight's log; A* flies behind the new one. With the model set of a single flight (one-step), a
+certifier makes new ones during the flight instead. In real time: eight minutes for each condition.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def run(folder: Path) -> Words:
         except sitl.NoAutopilot as none:
             print(none, file=sys.stderr)
             continue
-        rows |= _upsets(flights, name, LASTING[setup.kind], PASSING[name])
+        rows |= _upsets(flights, name, LASTING[setup.kind], PASSING.get(name, {}))
     return rows
 
 
@@ -52,9 +53,10 @@ def _upsets(flights: Flights, setup: str, lasting: dict[str, Upset], passing: di
     rows: Words = {}
     for what, upset in (lasting | passing).items():
         name = what.replace(" ", "-").replace("/", "").replace("%", "").replace(",", "")
-        row = flown(partial(flights.upset, name, BEFORE, upset, "--practice", PRACTICE))
+        minutes, words = (BEFORE + AFTER, ("--adapt",)) if flights.once else (BEFORE, ("--practice", PRACTICE))
+        row = flown(partial(flights.upset, name, minutes, upset, *words))
         rows[f"{setup}: {what}"] = row
-        if what in lasting and "failed" not in row:
+        if what in lasting and not flights.once and "failed" not in row:
             rows |= _again(flights, setup, what, name, upset)
     return rows
 

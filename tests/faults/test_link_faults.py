@@ -94,3 +94,25 @@ def test_the_last_model_set_is_of_the_longest_flight(
     assert made == certified
     assert rows["certified by it"] == {"failed": "no windows"} and ("third flight" in rows) == (len(certified) > 1)
     assert rows["astar, dense"] == {"failed": "no room to hover"}
+
+
+def test_one_flight_gives_the_only_model_set_if_its_bound_is_small(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said: list[list[str]] = []
+
+    def told(words: list[str], data: Path, seconds: float) -> str:
+        said.append(words)
+        if words[0] == "certify":
+            return json.dumps({"residual": {"one-step": {"bound_plan": 0.02}}})
+        if words[0] == "collect":
+            return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
+        raise Failed("no room to hover")
+
+    monkeypatch.setattr(flights, "told", told)
+    monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
+    rows = dict(flights._rows(Flights(flights.OUTDOORS_ONCE, Path("sitl"), tmp_path), 1.0))
+    assert rows["certified by it"] == {"bound_plan": 0.02} and "second flight" not in rows
+    assert all(" ".join(words).count("--accept-bound 0.03") == 1 for words in said)
+    (certify,) = (words for words in said if words[0] == "certify")
+    assert certify[1].endswith("flown.safetensors") and certify[certify.index("--outside") + 1] == "0.02"
