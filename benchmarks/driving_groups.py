@@ -17,7 +17,7 @@ from benchmarks.timing import Figures
 from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import Evaluation, in_process, prepare_evaluation
-from brakeline.deploy.progress import under_way
+from brakeline.deploy.progress import console, under_way
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -134,5 +134,7 @@ def run(plans: int = PLANS) -> Figures:
         model = model_for(robot, ModelConfig(mode=ONE_STEP))
         for group in GROUPS:
             with under_way(f"{name}: {group}"):
-                rows[f"{name}: {group}"] = contained(robot, model, group, plans).figures(model)
+                counts = contained(robot, model, group, plans)
+            rows[f"{name}: {group}"] = counts.figures(model)
+            console.print(f"{name}: {group}: {counts.plans_outside} of {counts.plans} plans outside", markup=False)
     return rows
