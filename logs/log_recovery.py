@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import mcap.writer
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Header, Metadata
 
 from brakeline.errors import LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, records
@@ -82,7 +82,10 @@ def recover(path: Path, out: Path | None = None) -> Recovery:
                 path.rename(damaged)
         beside.replace(target)
     except NotMcap as error:
-        raise LogError(f"{path} is not an MCAP file: {error}") from error
+        raise LogError(
+            f"{path} is not an MCAP file: {error}. `brakeline import` reads damaged logs of other formats as far as "
+            "they go, without a repair"
+        ) from error
     finally:
         beside.unlink(missing_ok=True)
     result.kept = damaged
@@ -91,10 +94,10 @@ def recover(path: Path, out: Path | None = None) -> Recovery:
 
 def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> None:
     writer: Any = mcap.writer.Writer(sink, chunk_size=CHUNK)
-    writer.start(profile="", library="brakeline recover")
     numbers: dict[LogChannel, int] = {}
     schemas: dict[tuple[str, bytes], int] = {}
-    for item in records(source, size, lambda key, schema: LogChannel(key, key, None)):
+    writer.start(profile=_profile(source, size), library="brakeline recover")
+    for item in records(source, size, _channel):
         if type(item) is tuple:
             series, log_time, publish_time, payload = item
             if series not in numbers:
@@ -110,6 +113,17 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> No
         elif isinstance(item, Attachment):
             writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.data)
     writer.finish()
+
+
+def _channel(key: str, schema: str) -> LogChannel:
+    return LogChannel(key, key, None)
+
+
+def _profile(source: IO[bytes], size: int) -> str:
+    """Return the profile in the file's header, such as `ros2`: it says whose messages the file holds."""
+    first = next(records(source, size, _channel), None)
+    source.seek(0)
+    return first.profile if isinstance(first, Header) else ""
 
 
 def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:

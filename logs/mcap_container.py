@@ -21,7 +21,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
 from brakeline.errors import NotMcap
 
@@ -33,6 +33,7 @@ SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.M
 
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time; then the payload
+_CHUNK = struct.Struct("<QQQII")  # first and last time, uncompressed size, checksum, length of the compression's name
 _TO_PAYLOAD = _HEAD.size + _MESSAGE.size
 
 
@@ -78,7 +79,7 @@ class LogChannel:
 
 
 Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload
-Item = Row | Metadata | Attachment | DamagedBytes
+Item = Row | Header | Metadata | Attachment | DamagedBytes
 
 
 class _Tables:
@@ -102,7 +103,7 @@ class _Tables:
 
 
 def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) -> Iterator[Item]:
-    """Yield the messages, metadata, attachments and damage of a file, in order.
+    """Yield the header, messages, metadata, attachments and damage of a file, in order.
 
     Args:
         size: of the file, bytes.
@@ -122,6 +123,12 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
         end = good + _HEAD.size + length
         if not opcode or end > size:
             reason = "a record is incomplete" if good < size else "the recorder was killed or is still running"
+            if opcode == Opcode.CHUNK:
+                count = 0
+                for row in _begun(file.read(), tables):
+                    yield row
+                    count += 1
+                reason = f"a chunk is incomplete, of which {count} messages were read"
             yield DamagedBytes(good, size - good, reason, at_end=True)
             return
         content = file.read(length)
@@ -145,6 +152,8 @@ def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
         tables.add(opcode, content)
     elif opcode == MESSAGE:
         yield from _unpacked(_HEAD.pack(opcode, len(content)) + content, tables)
+    elif opcode == Opcode.HEADER:
+        yield Header.read(ReadDataStream(BytesIO(content)))
     elif opcode == Opcode.METADATA:
         yield Metadata.read(ReadDataStream(BytesIO(content)))
     elif opcode == Opcode.ATTACHMENT:
@@ -176,6 +185,21 @@ def _uncompressed(content: bytes) -> bytes:
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("the checksum of a chunk is wrong")
     return data
+
+
+def _begun(content: bytes, tables: _Tables) -> Iterator[Row]:
+    """Yield the messages at the beginning of an incomplete chunk."""
+    try:
+        _, _, size, _, length = _CHUNK.unpack_from(content)
+        size, compression = min(size, MOST_CHUNK_BYTES), content[_CHUNK.size : _CHUNK.size + length]
+        data = content[_CHUNK.size + length + 8 :]  # behind their length
+        if compression == b"zstd":
+            data = zstandard.ZstdDecompressor().stream_reader(data).read(size)
+        elif compression == b"lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, size)
+        yield from _unpacked(data[:size], tables)
+    except BROKEN:
+        return
 
 
 def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:

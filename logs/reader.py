@@ -18,6 +18,7 @@ from mcap.records import Attachment, Metadata
 
 from brakeline.errors import Implausible, LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, Row, records
+from brakeline.logs.mcap_contents import is_ros
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import being_written, name_of, number_of
 from brakeline.messaging.message_checks import check
@@ -117,7 +118,13 @@ class Log:
             yield from self._rows_of(path)
 
     def _rows_of(self, path: Path) -> Iterator[Row]:
-        """Yield the messages of one file from front to back, which needs no summary."""
+        """Yield the messages of one file from front to back, which needs no summary.
+
+        Raises:
+            LogError: the file is not an MCAP file, or it is a ROS bag.
+        """
+        if is_ros(path):
+            raise LogError(f"{path} is a ROS bag, not the log of a run: read it with `brakeline import {path}`")
         segment = LogSegment(path, path.stat().st_size, recording=being_written(path))
         self.segments.append(segment)
         try:

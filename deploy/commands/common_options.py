@@ -34,6 +34,13 @@ Robot = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or path of a robot description (.toml).")
 ]
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Log files (.mcap) or run folders.")]
+ReadSeconds = Annotated[
+    float,
+    tyro.conf.arg(
+        help="Limit on the computing time for reading a foreign log [s]. 0 means 3 s, and 1 s more for each 200 kB."
+    ),
+]
+ReadGib = Annotated[float, tyro.conf.arg(help="Limit on the memory for reading a foreign log [GiB].")]
 Seed = Annotated[int, tyro.conf.arg(help="Seed of all random draws. The same seed gives the same result.")]
 ArenaName = Annotated[
     str,

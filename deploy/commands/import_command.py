@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from brakeline.deploy.commands.command_output import errors, print_result
-from brakeline.deploy.commands.common_options import Json
+from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
 from brakeline.deploy.data import importer
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.coverage import Coverage, coverage
@@ -19,6 +19,7 @@ from brakeline.deploy.data.coverage_plot import draw_coverage
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import HOLD
+from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import robot_named
 
@@ -28,7 +29,7 @@ class ImportCommand:
     """The options of `brakeline import`."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Logs to import: CSV, Parquet, ROS 2 bags, .bin and .tlog of ArduPilot, .ulg of PX4, own runs (docs/data.md)."""
+    """Logs to import: CSV, Parquet, ROS bags, logs of ArduPilot, PX4 and of own runs (docs/data.md)."""
     robot: str = "ground"
     """Robot that was logged: a name, or the path of a description (.toml)."""
     out: Path | None = None
@@ -45,6 +46,8 @@ class ImportCommand:
     moves."""
     hold: float = HOLD
     """Time after its last message for which an input counts [s]."""
+    read_seconds: ReadSeconds = 0.0
+    read_gib: ReadGib = 4.0
     picture: Path | None = None
     """Draw what was driven into this image (.png)."""
     json: Json = False
@@ -52,7 +55,8 @@ class ImportCommand:
     def run(self) -> int:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         robot = robot_named(self.robot)
-        options = LogOptions.parse(self.map, self.unit, self.topics)
+        limits = ReadLimits(self.read_seconds, self.read_gib)
+        options = LogOptions.parse(self.map, self.unit, self.topics, limits)
         imported = importer.import_sources(self.sources, robot, options, self.delay, self.hold)
         covered = coverage(imported.data)
         path = self.out or record_path(robot)

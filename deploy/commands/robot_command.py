@@ -11,9 +11,10 @@ import tyro
 from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
-from brakeline.deploy.commands.common_options import Json
+from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
 from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.deploy.data.log_options import LogOptions
+from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.errors import BadDescription, NoSource
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
@@ -30,7 +31,7 @@ class RobotCommand:
     file: Annotated[str, tyro.conf.Positional]
     """The description (.toml). With check and show also the name of a robot that comes with the program."""
     from_: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
-    """With new: infer values from these logs of one robot (CSV, Parquet, ROS 2 bags, logs of autopilots). The log of a
+    """With new: infer values from these logs of one robot (CSV, Parquet, ROS bags, logs of autopilots). The log of a
     run contains the whole description."""
     map: tuple[str, ...] = ()
     """With --from: names of coordinates, inputs and the time, and where they are in the log, each as NAME=TABLE/FIELD
@@ -39,6 +40,8 @@ class RobotCommand:
     """With --from: units of the log, each as NAME=UNIT, where they are not SI: heading=deg, speed=km/h, time=ms."""
     topics: tuple[str, ...] = ()
     """With --from: topics or message types to take, where several hold the same quantity."""
+    read_seconds: ReadSeconds = 0.0
+    read_gib: ReadGib = 4.0
     picture: Path | None = None
     """With show: draw the body and the stop into this image."""
     json: Json = False
@@ -55,7 +58,8 @@ class RobotCommand:
             raise ValueError(f"{path} exists: check it with `brakeline robot check {path}`, or choose another name")
         text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
-        options = LogOptions.parse(self.map, self.unit, self.topics)
+        limits = ReadLimits(self.read_seconds, self.read_gib)
+        options = LogOptions.parse(self.map, self.unit, self.topics, limits)
         if self.from_:
             text, notes = _from_logs(self.from_, text, path.stem, options)
         path.write_text(text)

@@ -29,7 +29,11 @@ def read_embedded_description(path: Path, name: str) -> str:
             break
     descriptions = log.metadata.get(ROBOTS, {})
     if not descriptions:
-        raise NoSource(f"{path} contains no robot description: the log is from a version without descriptions")
+        damage = "".join(f"; {cut}" for cut in log.cuts)
+        raise NoSource(
+            f"{path} contains no robot description{damage}. It is not the log of a run, or it is an old one: "
+            "write one with `brakeline robot new` without --from"
+        )
     if len(descriptions) > 1 and name not in descriptions:
         raise NoSource(f"{path} holds the robots {', '.join(descriptions)}: name the file after the one that you want")
     chosen = name if name in descriptions else next(iter(descriptions))

@@ -5,74 +5,85 @@ Brakeline's own logs are sampled at the period already, so that no resampling is
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
 from brakeline.deploy.data.resample import HOLD, ImportedData, ImportReport, resample
 from brakeline.deploy.data.run_dataset import from_log
+from brakeline.deploy.data.sources.isolated_reader import read_isolated
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.deploy.data.stamps import TIME, in_header_units, stamped
 from brakeline.errors import NoSource
+from brakeline.logs.mcap_contents import is_ros
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
 
-ROS2 = "ros2_bag:read"
+BAG_ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap.zstd")  # besides .mcap, which logs of runs share
+BAG, OWN = "ros_bag:read", "a log of a run"
 READERS = {
     ".csv": "csv_file:read",
     ".parquet": "column_files:read_parquet",
-    ".db3": ROS2,
+    ".bag": BAG,
+    ".db3": BAG,
     ".bin": "ardupilot_log:read",
+    ".log": "ardupilot_log:read",
     ".tlog": "tlog_file:read",
     ".ulg": "px4_log:read",
 }
-KINDS = f"{', '.join(READERS)}, the folder of a ROS 2 bag, .mcap (a ROS 2 bag, or a log of a run)"
+KINDS = f"{', '.join(READERS)}, .mcap (a ROS 1 or ROS 2 bag, or a log of a run), and folders of bags and of runs"
 ALL_STEPS = 1_000_000  # of a Brakeline log
 
 
 def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
-    """Read the tables of a source with the reader for its file name's ending.
+    """Read the tables of a foreign log, in a process of its own.
 
     Args:
         path: the source.
-        options: gives the column and the unit of the stamps, and the topics to prefer.
+        options: gives the column and the unit of the stamps, the topics to prefer, and the limits.
 
     Raises:
         NoSource: the file does not exist, its kind is not supported, or it is damaged.
     """
-    if not path.exists():
-        raise NoSource(f"{path}: this file or folder does not exist")
-    place = ROS2 if is_bag(path) else READERS.get(path.suffix.lower())
-    if place is None:
-        raise NoSource(f"{path}: this kind of file is not supported. Brakeline reads {KINDS}.")
-    module, _, name = place.partition(":")
-    tables: list[Table] = getattr(importlib.import_module(f"brakeline.deploy.data.sources.{module}"), name)(path)
+    reader = reader_of(path)
+    if reader == OWN:
+        raise NoSource(f"{path} is a log of a run: it has no tables")
+    tables = read_isolated(reader, path, options.limits)
     column, unit = options.fields.get(TIME, ""), options.units.get(TIME, "")
     tables = [replace(t if t.name else stamped(in_header_units(t), column, unit), source=path.name) for t in tables]
     return options.ranked(tables)
 
 
-def is_bag(path: Path) -> bool:
-    """Return True for a ROS 2 bag: a folder with `metadata.yaml`, or an MCAP file with the profile `ros2`."""
+def reader_of(path: Path) -> str:
+    """Return the reader of a source, MODULE:FUNCTION in `sources`, or `OWN` for a log of a Brakeline run.
+
+    Raises:
+        NoSource: the file does not exist, or its kind is not supported.
+    """
+    if not path.exists():
+        raise NoSource(f"{path}: this file or folder does not exist")
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    if path.suffix != ".mcap":
-        return False
-    try:
-        with path.open("rb") as file:
-            return make_reader(file).get_header().profile == "ros2"
-    except McapError:
-        return False  # damaged: only Brakeline's own reader can recover a log
+        names = [file.name.lower() for file in path.iterdir()]
+        if any(name == "metadata.yaml" or name.endswith(BAG_ENDINGS) for name in names):
+            return BAG
+        return OWN if not (logs := list(path.glob("*.mcap"))) or not is_ros(logs[0]) else BAG
+    if not path.is_file():
+        raise NoSource(f"{path} is neither a file nor a folder")
+    name = path.name.lower()
+    if name.endswith(".mcap"):
+        return BAG if is_ros(path) else OWN
+    if name.endswith(BAG_ENDINGS):
+        return BAG
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise NoSource(f"{path}: this kind of file is not supported. Brakeline reads {KINDS}.")
+    return reader
 
 
 def own_log(path: Path) -> bool:
     """Return True for a log of a Brakeline run, a file or a folder."""
-    return (path.suffix == ".mcap" or path.is_dir()) and path.exists() and not is_bag(path)
+    return path.exists() and reader_of(path) == OWN
 
 
 def import_sources(

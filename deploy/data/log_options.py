@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
+from brakeline.deploy.data.sources.isolated_reader import USUAL_LIMITS, ReadLimits
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.deploy.data.stamps import TIME
 from brakeline.deploy.data.unit_table import chosen_units
@@ -15,14 +16,24 @@ CHOSEN_RANK = -1000  # of a table that the user names: before all others
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Where quantities are in a log, and in which units. `fields`: {name: TABLE/FIELD}; `units`: {name: unit}."""
+    """Where quantities are in a log, and in which units. `fields`: {name: TABLE/FIELD}; `units`: {name: unit}.
+
+    `limits` are those of reading a foreign log.
+    """
 
     fields: dict[str, str] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     topics: tuple[str, ...] = ()
+    limits: ReadLimits = USUAL_LIMITS
 
     @classmethod
-    def parse(cls, places: Iterable[str] = (), units: Iterable[str] = (), topics: Iterable[str] = ()) -> LogOptions:
+    def parse(
+        cls,
+        places: Iterable[str] = (),
+        units: Iterable[str] = (),
+        topics: Iterable[str] = (),
+        limits: ReadLimits = USUAL_LIMITS,
+    ) -> LogOptions:
         """Parse the words of `--map` and `--unit`. Raises NoSource if one is malformed."""
         fields: dict[str, str] = {}
         for word in places:
@@ -30,7 +41,7 @@ class LogOptions:
             if not (name and place):
                 raise NoSource(f"--map {word!r} must be NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns")
             fields[name] = place
-        return cls(fields, chosen_units(units), tuple(topics))
+        return cls(fields, chosen_units(units), tuple(topics), limits)
 
     def check_names(self, names: Sequence[str]) -> None:
         """Raise NoSource if an option names something else than `names` or the time."""

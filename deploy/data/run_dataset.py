@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from brakeline.errors import BadData
-from brakeline.logs.reader import read
+from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 
 FEWEST_STEPS = 5  # shorter trajectories are dropped
+MOST_NAMED = 5  # keys of other messages that an error names
 
 
 def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
@@ -28,15 +29,23 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
         LogError: the file does not exist, or is not a log.
     """
     steps: deque[pb.Step] = deque(maxlen=last)
-    for record in read(path):
+    log, others = open_log(path), Counter[str]()
+    for record in log:
         if isinstance(record.message, pb.Step) and record.message.robot == robot.name:
             steps.append(record.message)
+        else:
+            others[record.key] += 1
+    damage = "".join(f"; {cut}" for cut in log.cuts)
     trajectories = tuple(trajectories_of(steps, robot))
     if not trajectories:
-        raise BadData(f"{path}: no trajectory of {robot.name}; was anything recorded?")
+        content = ", ".join(f"{count} of {key}" for key, count in others.most_common(MOST_NAMED)) or "none"
+        raise BadData(
+            f"{path}: no trajectory of {robot.name}, of which it has {len(steps)} steps{damage}. Other messages: "
+            f"{content}. See what the log holds with `brakeline analyse {path}`, or name its robot with --robot"
+        )
     data = Dataset(robot, trajectories, {"origin": "log"})
     data.check()
-    return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}"
+    return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{damage}"
 
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from brakeline.deploy.data.sources.message_tables import Columns
 from brakeline.deploy.data.sources.quantity_names import AXES
@@ -51,12 +50,19 @@ def add_accelerations(tables: Sequence[Table]) -> list[Table]:
 
 def _accelerations(felt: Table, attitudes: Table) -> Columns:
     time, known_at = felt.time, attitudes.time
-    angles = [np.interp(time, known_at, np.unwrap(attitudes.columns[name])) for name in ATTITUDE]
-    forces = np.column_stack([felt.columns[name] for name in FORCE])
-    north, east, down = Rotation.from_euler("ZYX", np.column_stack(angles)).apply(forces).T
+    yaw, pitch, roll = (np.interp(time, known_at, np.unwrap(attitudes.columns[name])) for name in ATTITUDE)
+    north, east, down = _into_ned([felt.columns[name] for name in FORCE], yaw, pitch, roll)
     after = np.searchsorted(known_at, time)
     inside = (after > 0) & (after < len(known_at))
     after = np.clip(after, 1, len(known_at) - 1)
     known = inside & (known_at[after] - known_at[after - 1] < MAX_GAP)
     values = (east, north, -down - GRAVITY)
     return {f"acceleration.{axis}": np.where(known, value, np.nan) for axis, value in zip(AXES, values, strict=True)}
+
+
+def _into_ned(forces: Sequence[Array], yaw: Array, pitch: Array, roll: Array) -> tuple[Array, Array, Array]:
+    """Rotate vectors (forward, right, down) of the body into north, east, down: by roll, then pitch, then yaw."""
+    forward, right, down = forces
+    right, down = np.cos(roll) * right - np.sin(roll) * down, np.sin(roll) * right + np.cos(roll) * down
+    forward, down = np.cos(pitch) * forward + np.sin(pitch) * down, np.cos(pitch) * down - np.sin(pitch) * forward
+    return np.cos(yaw) * forward - np.sin(yaw) * right, np.sin(yaw) * forward + np.cos(yaw) * right, down

@@ -44,10 +44,10 @@ def read(path: Path) -> list[Table]:
     if not messages:
         raise NoSource(f"{path}: the log contains none of the messages {', '.join(KINDS)}")
     since = min(int(one.data["timestamp"][0]) for one in messages)
-    return [_table(one.name, one.data, since) for one in messages]
+    return [_table(path, one.name, one.data, since) for one in messages]
 
 
-def _table(name: str, data: dict[str, np.ndarray], since: int) -> Table:
+def _table(path: Path, name: str, data: dict[str, np.ndarray], since: int) -> Table:
     stamp = data["timestamp_sample"] if data.get("timestamp_sample", np.zeros(1)).all() else data["timestamp"]
     columns = {key: np.asarray(values, float) for key, values in data.items() if not key.startswith("timestamp")}
-    return Table(name, (stamp.astype(np.int64) - since) / 1e6, with_quantities(columns, KINDS[name]))
+    return with_quantities(Table(name, (stamp.astype(np.int64) - since) / 1e6, columns), KINDS[name], path)

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,19 +62,32 @@ def read(path: Path) -> list[Table]:
     Raises:
         NoSource: the recording has none of the messages, or it has those of several vehicles.
     """
-    messages, vehicles = MessageTables(), set[int]()
-    parser = dialect.MAVLink(None)
-    parser.robust_parsing = True
-    for micros, frame in _frames(path.read_bytes()):
-        for message in parser.parse_buffer(frame) or ():
+    messages, vehicles, data = MessageTables(path), set[int](), path.read_bytes()
+    parser, used, damaged = _parser(), 0, 0
+    for micros, frame in _frames(data):
+        used += TIME.size + len(frame)
+        try:
+            decoded = parser.parse_buffer(frame) or ()
+        except Exception:  # pymavlink raises many types on damaged frames, and keeps their bytes
+            parser, damaged = _parser(), damaged + 1
+            continue
+        for message in decoded:
             name = message.get_type()
             if name in KINDS:
                 messages.add(name, KINDS[name], message.to_dict().items(), 1000 * micros)
                 vehicles |= set() if name == SENT else {message.get_srcSystem()}
+    if damaged or used < len(data):
+        messages.damage.append(f"{damaged} damaged frames and {len(data) - used} bytes between frames are left out")
     if len(vehicles) > 1:
         raise NoSource(f"{path} contains several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
-    tables = messages.tables(f"{path}: the log contains none of the messages {', '.join(KINDS)}")
+    tables = messages.tables(f"the log contains none of the messages {', '.join(KINDS)}")
     return add_accelerations([t if t.name == SENT else _on_recorder_clock(t) for t in tables])
+
+
+def _parser() -> Any:
+    parser = dialect.MAVLink(None)
+    parser.robust_parsing = True
+    return parser
 
 
 def _on_recorder_clock(table: Table) -> Table:

@@ -6,6 +6,8 @@ import struct
 import numpy as np
 import pyarrow
 import pyarrow.parquet
+from pymavlink import DFReader
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -21,8 +23,26 @@ def write_parquet(path, time, values):
 
 
 def write_bag(path, time, values, storage=StoragePlugin.SQLITE3):
-    """/odom with a header, /cmd_vel without; positions in the world, velocities of the body."""
+    """A ROS 2 bag."""
     types = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=9, storage_plugin=storage) as bag:
+        write_messages(bag, types, types.serialize_cdr, time, values)
+    return path
+
+
+def write_ros1_bag(path, time, values, compression=None):
+    types = get_typestore(Stores.ROS1_NOETIC)
+    bag = Writer1(path)
+    bag.chunk_threshold = 2**16  # bytes: several chunks, as in long bags
+    if compression is not None:
+        bag.set_compression(compression)
+    with bag:
+        write_messages(bag, types, types.serialize_ros1, time, values)
+    return path
+
+
+def write_messages(bag, types, serialize, time, values):
+    """/odom with a header, /cmd_vel without; positions in the world, velocities of the body."""
 
     def kind(name):
         return types.types[name.replace("/", "/msg/")]
@@ -33,25 +53,37 @@ def write_bag(path, time, values, storage=StoragePlugin.SQLITE3):
     posed, twisted = (kind(f"geometry_msgs/{name}WithCovariance") for name in ("Pose", "Twist"))
     odometry, text = kind("nav_msgs/Odometry"), kind("std_msgs/String")
     header, stamp, none = kind("std_msgs/Header"), kind("builtin_interfaces/Time"), np.zeros(36)
-    with Writer(path, version=9, storage_plugin=storage) as bag:
-        kinds = {"/odom": odometry, "/cmd_vel": twist, "/chatter": text}
-        topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=types) for name, kind in kinds.items()}
+    first = {"seq": 7} if "seq" in header.__dataclass_fields__ else {}  # of ROS 1
+    kinds = {"/odom": odometry, "/cmd_vel": twist, "/chatter": text}
+    topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=types) for name, kind in kinds.items()}
 
-        def write(topic, message, at):
-            bag.write(topics[topic], at, types.serialize_cdr(message, message.__msgtype__))
+    def write(topic, message, at):
+        bag.write(topics[topic], at, serialize(message, message.__msgtype__))
 
-        write("/chatter", text("hello"), EPOCH)
-        last = None
-        for t, (x, y, heading, v, w, speed, turn) in zip(time, values, strict=True):
-            now = EPOCH + round(1e9 * t)
-            q = quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
-            moved = twisted(twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w)), none)
-            stamped = header(stamp(*divmod(now, 1_000_000_000)), "odom")
-            message = odometry(stamped, "base_link", posed(pose(point(x, y, 0.0), q), none), moved)
-            write("/odom", message, now + 3_000_000)  # received a little later
-            if (speed, turn) != last or round(t / 0.02) % 5 == 0:
-                write("/cmd_vel", twist(vector(speed, 0.0, 0.0), vector(0.0, 0.0, turn)), now)
-                last = speed, turn
+    write("/chatter", text("hello"), EPOCH)
+    last = None
+    for t, (x, y, heading, v, w, speed, turn) in zip(time, values, strict=True):
+        now = EPOCH + round(1e9 * t)
+        q = quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+        moved = twisted(twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w)), none)
+        stamped = header(**first, stamp=stamp(*divmod(now, 1_000_000_000)), frame_id="odom")
+        message = odometry(stamped, "base_link", posed(pose(point(x, y, 0.0), q), none), moved)
+        write("/odom", message, now + 3_000_000)  # received a little later
+        if (speed, turn) != last or round(t / 0.02) % 5 == 0:
+            write("/cmd_vel", twist(vector(speed, 0.0, 0.0), vector(0.0, 0.0, turn)), now)
+            last = speed, turn
+
+
+def write_text_log(path, time, values):
+    """A rover's log as text, as ground stations write it from a .bin: the scaled values of each message."""
+    log = DFReader.DFReader_binary(str(write_bin(path.with_suffix(".bin"), time, values)))
+    lines = [
+        f"FMT, {one.type}, {one.len}, {one.name}, {one.format}, {','.join(one.columns)}" for one in log.formats.values()
+    ]
+    while (message := log.recv_match(type=["XKF1", "IMU", "THR", "STER"])) is not None:
+        lines.append(", ".join([message.get_type(), *(repr(value) for value in list(message.to_dict().values())[1:])]))
+    log.close()
+    path.write_text("\n".join(lines) + "\n")
     return path
 
 

@@ -1,0 +1,233 @@
+"""Other people's logs: tools take over from each other, damaged logs are read, parsers are confined."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+
+from brakeline.deploy.cli import main
+from brakeline.deploy.data.importer import OWN, reader_of, tables_of
+from brakeline.deploy.data.sources import isolated_reader
+from brakeline.deploy.data.sources.isolated_reader import ReadLimits, read_here, read_isolated
+from brakeline.deploy.data.sources.source_table import notes_of
+from brakeline.errors import LogError, NoSource
+from brakeline.logs.log_recovery import recover
+from brakeline.logs.reader import open_log
+from tests.deploy.data.bags import write_bag, write_bin, write_ros1_bag, write_text_log
+from tests.deploy.data.porter import FILE, drive
+from tests.logs.sample_log import Writer
+
+BAG = "ros_bag:read"
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(seconds=20.0)
+
+
+@pytest.fixture(scope="module")
+def bags(driven, tmp_path_factory):
+    """The same drive as bags of every kind."""
+    folder = tmp_path_factory.mktemp("bags")
+    write_bag(folder / "mcap", *driven, storage=StoragePlugin.MCAP)
+    write_bag(folder / "sqlite", *driven)
+    write_ros1_bag(folder / "ros1.bag", *driven)
+    for compression in Writer1.CompressionFormat:
+        write_ros1_bag(folder / f"{compression.name}.bag", *driven, compression)
+    return folder
+
+
+def seconds(tables) -> float:
+    return max(float(table.time[-1]) for table in tables)
+
+
+def odometry(tables):
+    return next(table for table in tables if table.name == "/odom")
+
+
+# --- tools take over from each other -----------------------------------------------------------------------------
+
+
+def test_a_recovered_bag_is_still_a_bag(bags, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    data = (bags / "mcap" / "mcap.mcap").read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+    recover(cut)
+    with cut.open("rb") as file:
+        assert make_reader(file).get_header().profile == "ros2"
+    assert reader_of(cut) == BAG and 5.0 < seconds(tables_of(cut)) < 19.0
+
+
+def test_a_bag_is_recognised_by_its_messages_and_a_run_by_its_own(bags, tmp_path):
+    nameless = tmp_path / "nameless.mcap"
+    nameless.write_bytes(
+        (bags / "mcap" / "mcap.mcap").read_bytes().replace(b"\x04\x00\x00\x00ros2", b"\x04\x00\x00\x00    ")
+    )
+    assert reader_of(nameless) == BAG
+    writer = Writer(losses=0.0)
+    writer.episode("actor-0", 0)
+    assert reader_of(writer.write(tmp_path / "run.mcap")) == OWN
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+def test_a_bag_without_its_metadata_is_read(bags, tmp_path, kind):
+    folder = shutil.copytree(bags / kind, tmp_path / kind)
+    whole = odometry(tables_of(folder))
+    (folder / "metadata.yaml").unlink()
+    table = odometry(read_here(reader_of(folder), folder))
+    assert np.array_equal(table.time, whole.time) and notes_of([table]) == ()
+
+
+def test_commands_for_logs_of_runs_name_the_one_for_bags(bags, capsys):
+    path = bags / "mcap" / "mcap.mcap"
+    with pytest.raises(LogError, match=r"is a ROS bag.* `brakeline import"):
+        list(open_log(path))
+    for command in (["analyse", str(path)], ["export", str(path), "--csv", "/dev/null"]):
+        assert main(command) == 1
+        assert "read it with `brakeline import" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(LogError, match=r"brakeline import. reads damaged logs of other formats"):
+        recover(bags / "ros1.bag")
+
+
+def test_a_log_of_a_run_without_the_robot_says_what_it_holds_and_what_is_lost(tmp_path, capsys):
+    writer = Writer(losses=0.0)
+    writer.episode("actor-0", 0)
+    path = writer.write(tmp_path / "run.mcap")
+    path.write_bytes(path.read_bytes()[:-60])
+    assert main(["import", str(path), "--robot", str(FILE)]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no trajectory of porter" in said and "of step/ground/actor-0" in said and "brakeline analyse" in said
+    assert "summary" in said or "cannot be read" in said
+    assert main(["robot", "new", str(tmp_path / "a.toml"), "--from", str(bags_like(tmp_path))]) == 1
+    assert "brakeline robot new" in " ".join(capsys.readouterr().err.split())
+
+
+def bags_like(folder: Path) -> Path:
+    """An MCAP file with nothing in it."""
+    path = folder / "empty.mcap"
+    path.write_bytes(b"")
+    return path
+
+
+# --- damaged logs, as far as they go ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["mcap/mcap.mcap", "sqlite/sqlite.db3", "ros1.bag", "BZ2.bag", "LZ4.bag"])
+def test_a_cut_bag_is_read_up_to_the_cut_and_says_so(bags, tmp_path, name):
+    whole = odometry(read_here(BAG, bags / name))
+    assert not whole.notes and len(whole.time) == 1000
+    data = (bags / name).read_bytes()
+    cut = tmp_path / Path(name).name
+    cut.write_bytes(data[: int(0.6 * len(data))])
+    tables = read_here(BAG, cut)
+    table = odometry(tables)
+    assert 100 < len(table.time) < 900
+    assert np.array_equal(table.columns["position.x"], whole.columns["position.x"][: len(table.time)])
+    notes = notes_of(tables)
+    assert notes and all(str(cut) in note for note in notes)
+    assert any("lost" in note or "cannot be read" in note for note in notes), notes
+
+
+@pytest.mark.parametrize("write", [write_bin, write_text_log])
+def test_a_cut_log_of_an_autopilot_is_read(driven, tmp_path, write):
+    path = write(tmp_path / ("a.bin" if write is write_bin else "a.log"), *driven)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 - 5])
+    assert 8.0 < seconds(read_here("ardupilot_log:read", path)) < 12.0
+
+
+def test_damaged_bytes_cost_the_messages_around_them(bags, tmp_path, driven):
+    data = bytearray((bags / "ros1.bag").read_bytes())
+    at = data.index(b"nav_msgs/Odometry")
+    place = data.index(b"odom", at + 20_000)
+    data[place - 4 : place] = b"\xff\xff\xff\x7f"  # the length of a frame's name
+    path = tmp_path / "a.bag"
+    path.write_bytes(data)
+    tables = read_here(BAG, path)
+    assert (
+        len(odometry(tables).time) == 999 and "1 messages are left out: /odom cannot be decoded" in tables[0].notes[0]
+    )
+
+
+def test_impossible_stamps_are_left_out(driven, tmp_path):
+    path = write_bin(tmp_path / "a.bin", *driven)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\xa3\x95\x0a", 3 * len(data) // 4)
+    data[at + 3 : at + 11] = b"\xff" * 8
+    path.write_bytes(data)
+    tables = read_here("ardupilot_log:read", path)
+    assert seconds(tables) < 21.0 and "1 messages with impossible time stamps are left out" in tables[0].notes[0]
+
+
+# --- parsers are confined -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def parser(tmp_path, monkeypatch):
+    """Plant a parser for the process that reads: its source is run in the place of a real reader."""
+
+    def plant(source: str) -> str:
+        (tmp_path / "sitecustomize.py").write_text(
+            "import sys, types\n"
+            f"module = types.ModuleType('{isolated_reader.__package__}.planted')\n"
+            f"exec({source!r}, module.__dict__)\n"
+            f"sys.modules[module.__name__] = module\n"
+        )
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+        return "planted:read"
+
+    return plant
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("def read(path):\n while True: pass", "takes more than .* s.*--read-seconds"),
+        ("import time\ndef read(path): time.sleep(60)", "takes more than .* s.*--read-seconds"),
+        ("def read(path): return [bytearray(2**30)]", r"takes more than 0.5 GiB of memory.*--read-gib"),
+        ("def read(path): return {}[path.name]", "its reader stopped with KeyError: 'a.log'"),
+        ("def read(path): return read(path)", "its reader stopped with RecursionError"),
+        ("import os, signal\ndef read(path): os.kill(os.getpid(), signal.SIGSEGV)", r"crashed \(SIGSEGV\)"),
+        ("import os\ndef read(path): os._exit(3)", r"crashed \(status 3\)"),
+    ],
+)
+def test_a_parser_that_hangs_fills_the_memory_or_crashes_ends_with_one_error(
+    tmp_path, parser, source, said, monkeypatch
+):
+    monkeypatch.setattr(isolated_reader, "WAITING", 0.0 if "sleep" in source else 600.0)
+    path = tmp_path / "a.log"
+    path.write_bytes(b"")
+    limits = ReadLimits(0.4 if "seconds" in said else 2.0, 0.5)
+    with pytest.raises(NoSource, match=f"a.log: .*{said}"):
+        read_isolated(parser(source), path, limits)
+
+
+def test_a_missing_package_stays_a_missing_package(tmp_path, parser):
+    path = tmp_path / "a.log"
+    path.write_bytes(b"")
+    with pytest.raises(ModuleNotFoundError) as caught:
+        read_isolated(parser("def read(path): import pyulog.none"), path, ReadLimits(1.0, 0.5))
+    assert caught.value.name == "pyulog.none"
+
+
+def test_tables_come_back_as_they_were_read(bags):
+    here, back = (
+        read(BAG, bags / "ros1.bag", *more) for read, more in ((read_here, ()), (read_isolated, (ReadLimits(),)))
+    )
+    for one, other in zip(here, back, strict=True):
+        assert one.name == other.name and one.rank == other.rank and one.notes == other.notes
+        assert list(one.columns) == list(other.columns) and np.array_equal(one.time, other.time)
+        assert all(np.array_equal(one.columns[name], other.columns[name], equal_nan=True) for name in one.columns)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    with pytest.raises(NoSource, match="neither a file nor a folder"):
+        tables_of(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match="--read-gib above 0"):
+        ReadLimits(gib=0.0)
