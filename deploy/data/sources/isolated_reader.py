@@ -145,7 +145,9 @@ def _unpacked(file: IO[bytes], path: Path, limits: ReadLimits) -> list[Table]:
 
 
 def _table(arrays: Any, i: str, about: dict[str, Any]) -> Table:
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in about["plain"].items()}
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in about["plain"].items()
+    }
     values |= {name: arrays[f"{i}.{name}"] for name in about["arrays"]}
     columns = {name: arrays[f"{i}.columns.{k}"] for k, name in enumerate(about["columns"])}
     return Table(columns=columns, **values)
@@ -176,17 +178,21 @@ def read_here(reader: str, path: Path) -> list[Table]:
 def _answer(reader: str, path: Path, out: IO[bytes]) -> None:
     """Write the tables, or the error, to `out`."""
     try:
-        np.savez(out, **packed(read_here(reader, path)))
+        _save(out, packed(read_here(reader, path)))
         return
     except MemoryError:
-        header = {"memory": True}
+        header: dict[str, Any] = {"memory": True}
     except ModuleNotFoundError as error:
         header = {"missing": error.name, "error": str(error)}
     except NoSource as error:
         header = {"error": str(error)}
     out.seek(0)
     out.truncate()
-    np.savez(out, **{HEADER: _as_array(header)})
+    _save(out, {HEADER: _as_array(header)})
+
+
+def _save(out: IO[bytes], arrays: dict[str, Any]) -> None:
+    np.savez(out, **arrays)
 
 
 def set_limits(seconds: float, size: int) -> None:
