@@ -21,10 +21,13 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
 
 BAG_ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap.zstd")  # besides .mcap, which logs of runs share
-BAG, OWN = "ros_bag:read", "a log of a run"
+BAG, PARQUET, JSON, OWN = "ros_bag:read", "parquet_files:read", "json_lines:read", "a log of a run"
 READERS = {
     ".csv": "csv_file:read",
-    ".parquet": "column_files:read_parquet",
+    ".parquet": PARQUET,
+    ".jsonl": JSON,
+    ".ndjson": JSON,
+    ".json": JSON,
     ".bag": BAG,
     ".db3": BAG,
     ".bin": "ardupilot_log:read",
@@ -32,7 +35,7 @@ READERS = {
     ".tlog": "tlog_file:read",
     ".ulg": "px4_log:read",
 }
-KINDS = f"{', '.join(READERS)}, .mcap (a ROS 1 or ROS 2 bag, or a log of a run), and folders of bags and of runs"
+KINDS = f"{', '.join(READERS)}, .mcap (a bag, or a log of a run), and folders of bags, of Parquet files and of runs"
 ALL_STEPS = 1_000_000  # of a Brakeline log
 
 
@@ -49,7 +52,11 @@ def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
     reader = reader_of(path)
     if reader == OWN:
         raise NoSource(f"{path} is a log of a run: it has no tables")
-    tables = read_isolated(reader, path, options.limits)
+    return with_time(read_isolated(reader, path, options.limits), path, options)
+
+
+def with_time(tables: list[Table], path: Path, options: LogOptions) -> list[Table]:
+    """Return tables with their time, their source and the ranks that the user chose. Raises NoSource."""
     column, unit = options.fields.get(TIME, ""), options.units.get(TIME, "")
     tables = [replace(t if t.name else stamped(in_header_units(t), column, unit), source=path.name) for t in tables]
     return options.ranked(tables)
@@ -67,6 +74,8 @@ def reader_of(path: Path) -> str:
         names = [file.name.lower() for file in path.iterdir()]
         if any(name == "metadata.yaml" or name.endswith(BAG_ENDINGS) for name in names):
             return BAG
+        if any(path.rglob("*.parquet")):
+            return PARQUET
         return OWN if not (logs := list(path.glob("*.mcap"))) or not is_ros(logs[0]) else BAG
     if not path.is_file():
         raise NoSource(f"{path} is neither a file nor a folder")

@@ -27,7 +27,8 @@ import psutil
 
 from brakeline.deploy.data.description_template import fill_template
 from brakeline.deploy.data.embedded_description import read_embedded_description
-from brakeline.deploy.data.importer import OWN, reader_of, tables_of
+from brakeline.deploy.data.importer import OWN, reader_of, tables_of, with_time
+from brakeline.deploy.data.log_options import PLAIN
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.schema_inference import infer_schema
@@ -117,7 +118,8 @@ def read_foreign(reader: str, path: Path) -> None:
     """Read a foreign log as `robot new --from` and `import` do, without a process of its own."""
     tables = own_errors(read_here, reader, path)
     packed(tables)
-    for use in (describe, lambda tables: resample(tables, ROBOT, {})):
+    tables = own_errors(with_time, tables, path, PLAIN)
+    for use in (describe, lambda tables: resample(tables, ROBOT, PLAIN)):
         with suppress(Refused):
             own_errors(use, tables)
 

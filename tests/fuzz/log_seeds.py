@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
-from tests.deploy.data.bags import EPOCH, write_bin, write_parquet, write_text_log
+from tests.deploy.data.bags import EPOCH, write_bin, write_json_lines, write_parquet, write_text_log
 from tests.deploy.data.porter import drive, write_csv
 from tests.logs.sample_log import Writer
 
@@ -118,6 +118,7 @@ def run_log(path: Path) -> Path:
 # For each format: the file's ending and how to write it.
 SEEDS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "csv": (".csv", lambda path: write_csv(path, *DRIVE)),
+    "jsonl": (".jsonl", lambda path: write_json_lines(path, *DRIVE)),
     "parquet": (".parquet", lambda path: write_parquet(path, *DRIVE)),
     "ros2-db3": (".db3", ros2_bag),
     "ros2-mcap": (".mcap", ros2_bag),

@@ -63,7 +63,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "deploy.data.sources.ardupilot_log",
     ),
     "pyulog": ("deploy.data.sources.px4_log",),
-    "pyarrow": ("deploy.data.sources.column_files", "deploy.data.sources.csv_file"),
+    "pyarrow": ("deploy.data.sources.parquet_files", "deploy.data.sources.csv_file"),
     "numba": ("safety.compilation",),
     "proxsuite": ("safety.filter.qp_solver",),
     "mujoco": ("sim",),

@@ -189,7 +189,7 @@ def _ros1(path: Path, types: Collection[str], contents: BagContents) -> Iterator
                     )
         except BROKEN as error:
             lost = path.stat().st_size - file.tell()
-            contents.damage.append(f"the recording is cut off ({error}); {lost} bytes at its end are not used")
+            contents.damage.append(f"{error}: reading ends there, {lost} bytes before the end; the rest is lost")
     contents.topics |= set(topics.values())
 
 

@@ -22,6 +22,7 @@ from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
 
 ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap", ".mcap.zstd")
+FIXED = "/tf_static"  # poses of parts on the robot, which do not move
 FIRST = ("/odom", "/cmd_vel")  # topics that are preferred over others of the same type
 
 
@@ -117,6 +118,8 @@ def files_of(path: Path) -> list[Path]:
 def _add_messages(file: Path, messages: MessageTables, contents: BagContents) -> None:
     types, unreadable = dict[BagTopic, Typestore | None](), Counter[str]()
     for topic, received, raw in stored_messages(file, KINDS, contents):
+        if topic.name == FIXED:
+            continue
         if topic not in types:
             types[topic] = _types_or_none(topic, contents)
         if (store := types[topic]) is None:

@@ -17,12 +17,13 @@ import numpy as np
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
 from brakeline.deploy.data.sources.message_tables import Columns, MessageKind, MessageTables
 from brakeline.deploy.data.sources.north_east_down import GRAVITY, add_accelerations, enu, force
-from brakeline.deploy.data.sources.source_table import Table
+from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.errors import NoSource
 
 TIME = struct.Struct(">Q")  # µs, before each frame
 V1, V2, SIGNED = 0xFE, 0xFD, 13  # first bytes of frames; bytes of a signature
 VELOCITY_IGNORED, YAW_RATE_IGNORED = 0b111000, 0x800  # in a setpoint's type mask
+RESTART = 0.5  # s: if the vehicle's stamps step back further, its clock was set anew
 MAX_DRIFT_RATE = 0.05  # s per s between the two clocks: a simulator on a busy machine needs it
 
 
@@ -81,7 +82,7 @@ def read(path: Path) -> list[Table]:
     if len(vehicles) > 1:
         raise NoSource(f"{path} contains several vehicles: systems {', '.join(map(str, sorted(vehicles)))}")
     tables = messages.tables(f"the log contains none of the messages {', '.join(KINDS)}")
-    return add_accelerations([t if t.name == SENT else _on_recorder_clock(t) for t in tables])
+    return add_accelerations([t if t.name == SENT else _on_recorder_clock(t, path) for t in tables])
 
 
 def _parser() -> Any:
@@ -90,15 +91,26 @@ def _parser() -> Any:
     return parser
 
 
-def _on_recorder_clock(table: Table) -> Table:
-    """Shift the vehicle's stamps by the smallest offset in s of all messages k: `late_k + MAX_DRIFT_RATE |t - t_k|`."""
+def _on_recorder_clock(table: Table, path: Path) -> Table:
+    """Date a table by the vehicle's stamps, on the recorder's clock. Each part between two restarts is on its own."""
     stamps = next((unit * table.columns[name] for name, unit in VEHICLE_STAMPS.items() if name in table.columns), None)
     if stamps is None or len(table.time) < 2:
         return table
-    late, drift = table.time - stamps, MAX_DRIFT_RATE * stamps
+    restarts = np.flatnonzero(np.diff(stamps) < -RESTART) + 1
+    parts = zip(np.split(table.time, restarts), np.split(stamps, restarts), strict=True)
+    time = np.concatenate([_dated(received, stamps) for received, stamps in parts])
+    order = np.argsort(time, kind="stable")
+    columns = {name: values[order] for name, values in table.columns.items()}
+    note = f"{path}: the stamps of {table.name} step back {len(restarts)} times: the parts are dated one by one"
+    return replace(table, time=time[order], columns=columns, notes=(*table.notes, *[note] * bool(len(restarts))))
+
+
+def _dated(received: Array, stamps: Array) -> Array:
+    """Shift stamps by the smallest offset in s of all messages k: `late_k + MAX_DRIFT_RATE |t - t_k|`."""
+    late, drift = received - stamps, MAX_DRIFT_RATE * stamps
     since = np.minimum.accumulate(late - drift) + drift
     until = np.minimum.accumulate((late + drift)[::-1])[::-1] - drift
-    return replace(table, time=stamps + np.minimum(since, until))
+    return np.asarray(stamps + np.minimum(since, until))
 
 
 def _frames(data: bytes) -> Iterator[tuple[int, bytes]]:

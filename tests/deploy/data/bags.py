@@ -1,5 +1,6 @@
 """Bags and logs written by others' writers, or byte by byte, with what `porter.drive` gives."""
 
+import json
 import math
 import struct
 
@@ -19,6 +20,25 @@ EPOCH = 1_760_000_000_123_456_789  # ns
 def write_parquet(path, time, values):
     columns = {"time": time} | dict(zip(COLUMNS, values.T, strict=True)) | {"note": ["a"] * len(time)}
     pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    return path
+
+
+def write_parquet_folder(path, time, values):
+    """Twelve parts, as programs for large data write them: part-2 comes before part-10."""
+    path.mkdir()
+    for i, rows in enumerate(np.array_split(np.arange(len(time)), 12)):
+        write_parquet(path / f"part-{i}.parquet", time[rows], values[rows])
+    (path / "_SUCCESS").touch()
+    return path
+
+
+def write_json_lines(path, time, values):
+    """One object a line, with text that no column holds."""
+    rows = [
+        {"time": float(t), **dict(zip(COLUMNS, map(float, row), strict=True))}
+        for t, row in zip(time, values, strict=True)
+    ]
+    path.write_text("".join(json.dumps(row | {"note": "a"}) + "\n" for row in rows))
     return path
 
 

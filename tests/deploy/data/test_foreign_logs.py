@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 
+from brakeline.actors.mavlink.ardupilot_dialect import mavlink as dialect
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import OWN, reader_of, tables_of
 from brakeline.deploy.data.sources import isolated_reader
@@ -162,6 +164,21 @@ def test_impossible_stamps_are_left_out(driven, tmp_path):
     path.write_bytes(data)
     tables = read_here("ardupilot_log:read", path)
     assert seconds(tables) < 21.0 and "1 messages with impossible time stamps are left out" in tables[0].notes[0]
+
+
+def test_a_vehicle_that_restarts_its_clock_is_dated_in_parts(tmp_path):
+    vehicle, out = dialect.MAVLink(None, srcSystem=1, srcComponent=1), bytearray()
+    for k in range(200):
+        stamp = 20 * (k if k < 100 else k - 80)
+        message = dialect.MAVLink_local_position_ned_message(stamp, 0.0, 0.1 * k, *[0.0] * 4)
+        out += struct.pack(">Q", 10**15 + 20_000 * k) + message.pack(vehicle)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(out)
+    (table,) = read_here("tlog_file:read", path)
+    assert np.allclose(table.time, 0.02 * np.arange(200)) and np.allclose(
+        table.columns["position.x"], 0.1 * np.arange(200)
+    )
+    assert "step back 1 times" in table.notes[0]
 
 
 # --- parsers are confined -----------------------------------------------------------------------------------------

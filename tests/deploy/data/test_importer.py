@@ -14,7 +14,15 @@ from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import _off_chord
-from tests.deploy.data.bags import write_bag, write_bin, write_parquet, write_ros1_bag, write_text_log
+from tests.deploy.data.bags import (
+    write_bag,
+    write_bin,
+    write_json_lines,
+    write_parquet,
+    write_parquet_folder,
+    write_ros1_bag,
+    write_text_log,
+)
 from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, porter, write_csv
 
 
@@ -42,6 +50,8 @@ SOURCES = {
     "mcap alone": (lambda folder, *drive: write_bag(folder / "b", *drive, storage=StoragePlugin.MCAP) / "b.mcap", 1e-9),
     "ROS 1 bag": (lambda folder, *drive: write_ros1_bag(folder / "a.bag", *drive), 1e-9),
     "parquet": (lambda folder, *drive: write_parquet(folder / "a.parquet", *drive), 1e-9),
+    "JSON lines": (lambda folder, *drive: write_json_lines(folder / "a.jsonl", *drive), 1e-9),
+    "folder of Parquet files": (lambda folder, *drive: write_parquet_folder(folder / "parts", *drive), 1e-9),
     "rover's log": (lambda folder, *drive: write_bin(folder / "a.bin", *drive), 1e-5),
     "rover's log as text": (lambda folder, *drive: write_text_log(folder / "a.log", *drive), 1e-5),
 }
