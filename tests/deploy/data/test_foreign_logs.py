@@ -40,7 +40,7 @@ def bags(driven, tmp_path_factory):
     write_bag(folder / "sqlite", *driven)
     write_ros1_bag(folder / "ros1.bag", *driven)
     for compression in Writer1.CompressionFormat:
-        write_ros1_bag(folder / f"{compression.name}.bag", *driven, compression)
+        write_ros1_bag(folder / f"{compression.name}.bag", *driven, compression=compression)
     return folder
 
 
