@@ -38,7 +38,7 @@ from benchmarks import (
 )
 from benchmarks.timing import Figures, Words
 from brakeline.logs.stacking_table import StackingTable
-from tests.faults import autopilot_disturbances, chaos, crowd, link_faults, link_loss
+from tests.faults import autopilot_disturbances, campaign, chaos, crowd, link_faults, link_loss
 from tests.fuzz import message_fuzz
 
 
@@ -51,9 +51,9 @@ class Bench:
     json: bool = False
     """Print one JSON object on stdout."""
     seed: int = 0
-    """Seed of chaos, cuts and fuzz."""
+    """Seed of chaos, campaign, cuts and fuzz."""
     kills: int = 100
-    """Faults of chaos."""
+    """Faults of chaos and campaign."""
     faults: int = 60
     """Faults of cuts."""
     delay: float = 0.0
@@ -67,7 +67,8 @@ class Bench:
     minutes: float = 10.0
     """Duration of flights, of each policy in each arena [min]."""
     folder: Path = Path("runs/flights")
-    """Folder of the data, logs and figures of flights, upsets and cuts. What it has already is not flown again."""
+    """Folder of the data, logs and figures of flights, upsets, cuts and campaign. What it has already is not done
+    again."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ BENCHMARKS = {
     "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
+    "campaign": Benchmark(campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }
 

@@ -79,6 +79,10 @@ class InvalidField(BrakelineError, ValueError):
         self.field = field
 
 
+class BadText(BrakelineError, ValueError):
+    """A text is no JSON or TOML, or is nested too deeply."""
+
+
 class BadLink(BrakelineError, ValueError):
     """A link's URL has a form that `brakeline.messaging.byte_links` does not support."""
 
@@ -271,7 +275,10 @@ class DamagedPart(CheckpointError):
     """A part of the checkpoint is missing, damaged, or does not fit; `part` names it."""
 
     def __init__(self, part: str, where: Path, why: str) -> None:
-        super().__init__(f"{where}: the part {part!r} is {why}")
+        super().__init__(
+            f"{where}: the part {part!r} is {why}. Restore the folder from a copy; or move it away, and learn again "
+            "from the log: `brakeline train --resume RUN --from-logs RUN`"
+        )
         self.part = part
 
 

@@ -1,9 +1,12 @@
 """Checkpoints: the whole state of a learner on disk.
 
-A checkpoint is a folder, `<root>/000042/`. It holds one safetensors file for each part, and `manifest.json` with the
-hash of each file and the plain values of the parts. The function `save` writes a folder `.partial`, renames it, and
-replaces the one-line file `latest` atomically. It deletes older checkpoints last. A kill or a full disk at any moment
-therefore leaves `latest` at a whole checkpoint. The function `load` verifies every hash.
+A checkpoint is a folder, `<root>/000042/`. It holds one safetensors file for each part, `manifest.json` with the hash
+of each file and the plain values of the parts, and `manifest.sha256` with the hash of the manifest (`sha256sum -c`
+checks it). The function `save` writes a folder `.partial`, renames it, notes its number in the file `latest`, and
+deletes the checkpoints before it last. A kill or a full disk at any moment therefore leaves a whole checkpoint.
+
+The latest checkpoint is the folder with the highest number. The file `latest` shows that this folder is not lost: no
+folder with a number as high as the noted one is an error, never a fresh start. The function `load` verifies every hash.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -21,46 +25,51 @@ import safetensors.numpy
 
 from brakeline.errors import CheckpointError, DamagedPart
 from brakeline.learner.checkpoint_state import PartState
+from brakeline.messaging.structured_text import parse_json
 
-FORMAT = 1
+FORMAT = 2
 CHECKPOINT = "checkpoint"  # the folder of a run's checkpoints
 LATEST = "latest"
 MANIFEST = "manifest.json"
+MANIFEST_HASH = "manifest.sha256"
 PARTIAL = ".partial"
+NUMBER = re.compile(r"\d{6,18}")  # the name of a checkpoint's folder
 
 
 def exists(root: Path) -> bool:
-    """Return whether there is a checkpoint."""
-    return (root / LATEST).exists()
+    """Return whether there is a checkpoint, or a trace of one that is lost.
+
+    Raises:
+        CheckpointError: the folder cannot be read.
+    """
+    return (root / LATEST).exists() or bool(_folders(root))
 
 
 def save(root: Path, parts: dict[str, PartState], about: dict[str, Any]) -> Path:
-    """Write the latest checkpoint, and return its folder.
+    """Write the latest checkpoint, and return its folder. Delete the checkpoints before it, and nothing else.
 
     Args:
         about: identifies the run (robot, configuration, …).
 
     Raises:
-        CheckpointError: the checkpoint could not be written; the previous one is unchanged.
+        CheckpointError: the checkpoint could not be written, or the one before is lost; what is there stays.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
         place = root / f"{int(latest(root).name) + 1 if exists(root) else 1:06d}"
         partial = root / PARTIAL
-        for leftover in (partial, place):  # of a save that was killed
-            shutil.rmtree(leftover, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)  # of a save that was killed
         partial.mkdir()
-        _write(partial, parts, about)
+        _write_parts(partial, parts, about)
         partial.rename(place)
-        pointer = root / (LATEST + ".new")
-        pointer.write_text(place.name)
-        _sync(pointer)
-        pointer.replace(root / LATEST)
+        _sync(root)  # before anything is deleted
+        _write(root / (LATEST + ".new"), place.name.encode())
+        (root / (LATEST + ".new")).replace(root / LATEST)
     except (OSError, safetensors.SafetensorError) as error:
         shutil.rmtree(root / PARTIAL, ignore_errors=True)
         raise CheckpointError(f"{root}: not written: {error}") from error
-    for old in root.iterdir():
-        if old.is_dir() and old != place:
+    for old in _folders(root):
+        if old != place:
             shutil.rmtree(old, ignore_errors=True)
     return place
 
@@ -74,7 +83,7 @@ def load(root: Path, names: tuple[str, ...]) -> tuple[dict[str, PartState], dict
     """
     place = latest(root)
     manifest = _manifest(place)
-    return {name: _read(place, name, manifest["parts"].get(name)) for name in names}, manifest["about"]
+    return {name: _part(place, name, manifest["parts"].get(name)) for name in names}, manifest["about"]
 
 
 def latest(root: Path) -> Path:
@@ -82,59 +91,98 @@ def latest(root: Path) -> Path:
 
     Raises:
         CheckpointError: there is no checkpoint.
-        DamagedPart: `latest` names a folder that does not exist.
+        DamagedPart: `latest` names a later checkpoint than there is.
     """
+    folders, noted = _folders(root), _noted(root)
+    if not folders and noted is None:
+        raise CheckpointError(f"{root}: there is no checkpoint")
+    if not folders or (noted is not None and int(folders[-1].name) < noted):
+        raise DamagedPart(LATEST, root, f"missing: there are {', '.join(path.name for path in folders) or 'none'}")
+    return folders[-1]
+
+
+def _folders(root: Path) -> list[Path]:
+    """Return the folders of the checkpoints, the latest one last."""
     try:
-        name = (root / LATEST).read_text().strip()
+        folders = [path for path in root.iterdir() if NUMBER.fullmatch(path.name) and path.is_dir()]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise CheckpointError(f"{root}: not readable: {error}") from error
+    return sorted(folders, key=lambda path: int(path.name))
+
+
+def _noted(root: Path) -> int | None:
+    """Return the number in the file `latest`; None if there is no such file. Raises DamagedPart."""
+    try:
+        name = (root / LATEST).read_bytes().decode(errors="replace").strip()
     except FileNotFoundError:
-        raise CheckpointError(f"{root}: there is no checkpoint") from None
-    if not name.isdecimal() or not (root / name).is_dir():
-        raise DamagedPart(LATEST, root, "missing")
-    return root / name
+        return None
+    except OSError as error:
+        raise DamagedPart(LATEST, root, f"not readable: {error}") from error
+    if not NUMBER.fullmatch(name):
+        raise DamagedPart(LATEST, root, f"damaged: {name[:40]!r} is no number of a checkpoint")
+    return int(name)
 
 
-def _write(folder: Path, parts: dict[str, PartState], about: dict[str, Any]) -> None:
+def _write_parts(folder: Path, parts: dict[str, PartState], about: dict[str, Any]) -> None:
     listed = {}
     for name, state in parts.items():
-        path = folder / f"{name}.safetensors"
-        safetensors.numpy.save_file({key: np.ascontiguousarray(t) for key, t in state.tensors.items()}, path)
-        _sync(path)
-        listed[name] = {"sha256": _hash(path), "values": state.values}
-    path = folder / MANIFEST
-    path.write_text(json.dumps({"format": FORMAT, "about": about, "parts": listed}, indent=1, sort_keys=True))
-    _sync(path)
+        payload = safetensors.numpy.save({key: np.ascontiguousarray(t) for key, t in state.tensors.items()})
+        _write(folder / f"{name}.safetensors", payload)
+        listed[name] = {"sha256": _hash(payload), "values": state.values}
+    text = json.dumps({"format": FORMAT, "about": about, "parts": listed}, indent=1, sort_keys=True).encode()
+    _write(folder / MANIFEST, text)
+    _write(folder / MANIFEST_HASH, f"{_hash(text)}  {MANIFEST}\n".encode())
     _sync(folder)
 
 
 def _manifest(place: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads((place / MANIFEST).read_text())
-    except FileNotFoundError:
-        raise DamagedPart(MANIFEST, place, "missing") from None
-    except ValueError as error:
-        raise DamagedPart(MANIFEST, place, f"damaged: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not {"about", "parts"} <= manifest.keys():
-        raise DamagedPart(MANIFEST, place, f"not of format {FORMAT}")
-    return manifest
+    """Return the manifest, which is parsed only if its hash is right. Raises DamagedPart."""
+    text, stated = _read(place, MANIFEST, MANIFEST), _read(place, MANIFEST_HASH, MANIFEST)
+    if stated != f"{_hash(text)}  {MANIFEST}\n".encode():
+        raise DamagedPart(MANIFEST, place, f"damaged: its hash is not the one in {MANIFEST_HASH}")
+    manifest = parse_json(text)
+    if manifest.get("format") != FORMAT:
+        raise DamagedPart(MANIFEST, place, f"not of format {FORMAT}, but of another version of Brakeline")
+    loaded: dict[str, Any] = manifest
+    return loaded
 
 
-def _read(place: Path, name: str, entry: dict[str, Any] | None) -> PartState:
-    path = place / f"{name}.safetensors"
-    if entry is None or not path.exists():
-        raise DamagedPart(name, place, "missing")
-    if _hash(path) != entry["sha256"]:
+def _part(place: Path, name: str, entry: dict[str, Any] | None) -> PartState:
+    if entry is None:
+        raise DamagedPart(name, place, "missing in the manifest")
+    payload = _read(place, f"{name}.safetensors", name)
+    if _hash(payload) != entry["sha256"]:
         raise DamagedPart(name, place, "damaged: its hash is not the one in the manifest")
-    return PartState(safetensors.numpy.load_file(path), entry["values"])
+    return PartState(safetensors.numpy.load(payload), entry["values"])
 
 
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _read(place: Path, file: str, part: str) -> bytes:
+    """Return the bytes of a file of a checkpoint. Raises DamagedPart."""
+    try:
+        return (place / file).read_bytes()
+    except FileNotFoundError:
+        raise DamagedPart(part, place, f"missing: there is no {file}") from None
+    except OSError as error:
+        raise DamagedPart(part, place, f"not readable: {error}") from error
 
 
-def _sync(path: Path) -> None:
-    """Flush a file or folder to the disk."""
-    handle = os.open(path, os.O_RDONLY)
+def _write(path: Path, payload: bytes) -> None:
+    """Write a file to the disk."""
+    with path.open("wb") as file:
+        file.write(payload)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _hash(payload: bytes) -> str:
+    return hashlib.sha256(payload).hexdigest()
+
+
+def _sync(folder: Path) -> None:
+    """Flush the entries of a folder to the disk."""
+    handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

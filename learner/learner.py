@@ -29,10 +29,10 @@ from brakeline.learner.td3 import TD3
 from brakeline.learner.transition_reader import LATEST, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
+from brakeline.messaging.flow_limits import AHEAD
 from brakeline.messaging.task import RobotWithTask
 
 MOST_ACTORS = 2048
-AHEAD = 1000  # steps that an actor may be ahead of its permission, which it may have from an earlier learner
 
 
 class Part(Protocol):
@@ -239,6 +239,8 @@ class Learner:
             staleness=float(np.mean(ages)) if ages else 0.0,
             limiter_error=self._limiter.error,
             done=self.done,
+            limit=self._limits,
+            refused=self.rejected + self.surplus,
         )
 
     def may_save(self) -> bool:
@@ -276,7 +278,7 @@ class Learner:
         for name, restore in restorers.items():
             try:
                 restore(states[name])
-            except (ValueError, TypeError, KeyError, IndexError) as error:
+            except Exception as error:  # of another version, for instance
                 raise DamagedPart(name, root, f"damaged: {error}") from error
         self._encode()
         if self._published_updates != self._td3.updates:

@@ -150,6 +150,7 @@ class LearnerLoop:
                 outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "accepted"
                 log.info("actor %s: %s", join.actor, outcome)
                 answer.set_result(reply.SerializeToString())
+                self._metrics_at = -1e9  # tell the new limits before the actor's first steps
             except Exception as error:  # the bus sends it to the actor
                 answer.set_exception(error)
         return taken

@@ -95,6 +95,8 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
     if setup:
         yield "configuration", ", ".join(setup)
     yield "steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s"))
+    if figures.get("refused"):
+        yield "[red]steps that do not count[/]", f"{figures['refused']}: repeated, or not permitted by the learner"
     yield "episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"])
     for name in ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts"):
         yield name.replace("_", " "), _share(figures[name], episodes, within.get(name))

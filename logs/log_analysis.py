@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from brakeline.logs.metrics import Metrics, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find
 from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
 
 SETUP = ("method", "certificate", "policy", "arena", "perception", "seed")
@@ -56,6 +56,7 @@ class RunAnalysis:
         self.intervention_maps: defaultdict[str, InterventionMap] = defaultdict(InterventionMap)
         self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
+        self._received = 0  # when the recorder received the message in hand, without jumps of its clock [ns]
         self._buffers: dict[LogChannel, tuple[EpisodeSampler, ActorBuffer]] = {}
         self._read(log)
         for sampler in self.samplers.values():
@@ -90,13 +91,14 @@ class RunAnalysis:
                 STEP.name: self._step,
                 EXCHANGE.name: self._exchange,
                 EPISODE.name: lambda series, episode: self._buffer(series)[1].about.append(episode),
-                HEALTH.name: lambda _, health: self.timeline.health(health),
-                LOG.name: lambda _, line: self.timeline.line(line),
+                HEALTH.name: lambda _, health: self.timeline.health(health, self._received),
+                LOG.name: lambda _, line: self.timeline.line(line, self._received),
             }
         rejected, add = RejectedMessages(), self.metrics.add
-        for series, message, _, _ in log.decoded():
+        for series, message, log_time, _ in log.decoded():
             try:
-                if add(series.key, message) and (handle := handlers.get(series.topic)) is not None:
+                self._received = log.clock.at(log_time)
+                if add(series.key, message, self._received) and (handle := handlers.get(series.topic)) is not None:
                     handle(series, message)
             except Exception as error:  # reject one message and go on
                 log.malformed += 1
@@ -108,7 +110,7 @@ class RunAnalysis:
             self.intervention_maps[series.robot].step(state, step)
         sampler, buffer = self._buffer(series)
         sampler.step(buffer, step)
-        self.timeline.step(step.header.wall_time)
+        self.timeline.step(self._received)
 
     def _exchange(self, series: LogChannel, exchange: Any) -> None:
         self.training[series.robot].exchange(exchange)
@@ -139,9 +141,15 @@ class RunAnalysis:
             "seconds": metrics.seconds(),
             **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
-            "cuts": [str(cut) for cut in log.cuts],
+            "cuts": cuts_in(log),
             "metadata": _metadata(log),
         }
+
+
+def cuts_in(log: Log) -> list[str]:
+    """Return the damage of a log that has been read, one line each."""
+    jumps = [f"the recorder's clock jumped by {jump:+.0f} s: the figures leave that out" for jump in log.clock.jumps]
+    return [*(str(cut) for cut in log.cuts), *jumps]
 
 
 def perception_in(conditions: Mapping[str, str]) -> str:
@@ -181,7 +189,7 @@ class LogAnalysis:
             "metadata": _common([run["metadata"] for run in rows.values()]),
             "log": [str(path) for log in logs for path in log.paths],
             "segments": [_segment(segment) for log in logs for segment in log.segments],
-            "cuts": [str(cut) for log in logs for cut in log.cuts],
+            "cuts": [cut for log in logs for cut in cuts_in(log)],
             "malformed": sum(log.malformed for log in logs),
             **({} if episode is None else {"episode": episode, "episode_detail": details}),
         }
@@ -209,7 +217,7 @@ def _metadata(log: Log) -> Figures:
     metadata: Figures = {name: dict(values) for name, values in log.metadata.items() if name != "brakeline"}
     if "json" in metadata.get("configuration", {}):
         with contextlib.suppress(ValueError):  # a configuration that is not JSON stays a string
-            metadata["configuration"] = json.loads(metadata["configuration"]["json"])
+            metadata["configuration"] = parse_json(metadata["configuration"]["json"])
     return metadata
 
 

@@ -55,6 +55,39 @@ class DamagedBytes:
         return f"{file}{self.lost} bytes at {where} cannot be read ({self.reason})"
 
 
+@dataclass(frozen=True)
+class ChangedBytes(DamagedBytes):
+    """A part of a finished file in which bytes outside the chunks were changed, such as metadata or an index."""
+
+    def __str__(self) -> str:
+        file = "" if self.path is None else f"{self.path}: "
+        return f"{file}bytes were changed between {self.at} and {self.at + self.lost} ({self.reason})"
+
+
+class Checksum:
+    """The running checksums of a file: of its data, then of its summary."""
+
+    def __init__(self, magic: bytes) -> None:
+        self._begin, self._crc = 0, zlib.crc32(magic)
+        self.damaged = False  # the reader has reported damage of this part already
+
+    def check(self, opcode: int, head: bytes, content: bytes, at: int) -> ChangedBytes | None:
+        """Take in a record that begins at a byte. Returns the damage of the part that it ends."""
+        stated, damage = 0, None
+        if opcode == Opcode.DATA_END:
+            stated, part = int.from_bytes(content[:4], "little"), "data"
+        elif opcode == Opcode.FOOTER:
+            stated, part = int.from_bytes(content[16:20], "little"), "summary"
+            self._crc = zlib.crc32(head + content[:16], self._crc)
+        else:
+            self._crc = zlib.crc32(content, zlib.crc32(head, self._crc))
+        if stated and stated != self._crc and not self.damaged:
+            damage = ChangedBytes(self._begin, at - self._begin, f"the checksum of its {part} is wrong", at_end=False)
+        if opcode == Opcode.DATA_END:
+            self._begin, self._crc, self.damaged = at + len(head) + len(content), 0, False
+        return damage
+
+
 @dataclass(slots=True, eq=False)
 class LogChannel:
     """A channel of the file: the messages published at one key.
@@ -117,6 +150,7 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
     if not MAGIC.startswith(magic):
         raise NotMcap(f"the file starts with {magic!r}")
     good = len(magic)  # offset of the end of the last complete record
+    checksum = Checksum(magic)
     while True:
         head = file.read(_HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
@@ -132,6 +166,8 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
             yield DamagedBytes(good, size - good, reason, at_end=True)
             return
         content = file.read(length)
+        if (changed := checksum.check(opcode, head, content, good)) is not None:
+            yield changed
         try:
             if opcode == Opcode.CHUNK:
                 yield from _unpacked(_uncompressed(content), tables)
@@ -142,8 +178,24 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) 
             else:
                 yield from _plain(opcode, content, tables)
         except BROKEN as error:
+            checksum.damaged = True
             yield DamagedBytes(good, end - good, str(error) or type(error).__name__, at_end=False)
         good = end
+
+
+def has_whole_summary(file: IO[bytes], size: int) -> bool:
+    """Return whether the summary of a file is there, and has the right checksum if the file states one."""
+    footer = _HEAD.size + 20
+    file.seek(max(0, size - len(MAGIC) - footer))
+    last = file.read()
+    if len(last) < footer + len(MAGIC) or not last.endswith(MAGIC) or last[0] != Opcode.FOOTER:
+        return False
+    start, stated = (int.from_bytes(last[at : at + n], "little") for at, n in ((_HEAD.size, 8), (_HEAD.size + 16, 4)))
+    end = size - len(MAGIC) - footer
+    if not 0 < start <= end:
+        return False
+    file.seek(start)
+    return not stated or zlib.crc32(file.read(end - start) + last[: footer - 4]) == stated
 
 
 def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:

@@ -22,6 +22,7 @@ from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import KINDS, EpisodeStats, Figures, closed_loop
 from brakeline.logs.quantiles import QuantileSketch
 from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.step_admission import StepAdmission
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
@@ -43,7 +44,7 @@ class PublisherStream:
     duplicates: int = 0
     published: int = 0  # largest count known from a sequence number or from the process's Health
     last: int = 0
-    first_at: int = 0  # ns since the Unix epoch, of publication
+    first_at: int = 0  # ns, of receipt
     last_at: int = 0
 
     @property
@@ -60,7 +61,7 @@ class ProcessFigures:
         silences: how often no Health message came for `SILENT` seconds.
         longest_silence: s.
         runs: the starts of the process.
-        last_health_at: ns since the Unix epoch.
+        last_health_at: ns, of receipt.
     """
 
     starts: int = 0
@@ -83,6 +84,7 @@ class Metrics:
         learners: the latest metrics by robot.
         processes: by name.
         log_lines: counts by level.
+        admission: decides which steps count.
     """
 
     def __init__(self, topics: Iterable[Topic] = RECORDED, robots: RecordedRobots | None = None) -> None:
@@ -101,6 +103,8 @@ class Metrics:
         self.learners: dict[str, pb.LearnerMetrics] = {}
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()
+        self.admission = StepAdmission()
+        self._now = 0  # ns, when the message in hand was received
         self._tube_stats = partial(TubeStats, self._robots)
         self._roots = {topic.key.split("/", 1)[0] for topic in topics}
         self._handlers: dict[type[Message], Callable[[Any], None]] = {
@@ -111,8 +115,13 @@ class Metrics:
             pb.LogLine: self._log_line,
         }
 
-    def add(self, key: str, message: Any) -> bool:
-        """Add a message that was published at `key`; return False for a duplicate, which is only counted.
+    def add(self, key: str, message: Any, received: int | None = None) -> bool:
+        """Add a message that was published at `key`; return False for one that is only counted: repeated, or refused.
+
+        Args:
+            key: on the bus.
+            message: of the type of the topic.
+            received: time of receipt on a clock without jumps [ns]. Defaults to the time of publication.
 
         Raises:
             Implausible: the message is from a new publisher, actor or process, and there are too many.
@@ -127,9 +136,11 @@ class Metrics:
         stream.last = sequence
         if sequence > stream.published:
             stream.published = sequence
-        stream.last_at = header.wall_time
+        self._now = stream.last_at = header.wall_time if received is None else received
         if not stream.first_at:
             stream.first_at = stream.last_at
+        if isinstance(message, pb.Step) and not self.admission.admit(message):
+            return False
         handler = self._handlers.get(type(message))
         if handler is not None:
             handler(message)
@@ -196,10 +207,11 @@ class Metrics:
     def _add_learner(self, metrics: pb.LearnerMetrics) -> None:
         _get_or_create(self.learners, metrics.robot, pb.LearnerMetrics)
         self.learners[metrics.robot] = metrics
+        self.admission.learner(metrics)
 
     def _health(self, health: pb.Health) -> None:
         process = _get_or_create(self.processes, health.process, ProcessFigures)
-        now = health.header.wall_time
+        now = self._now
         if health.header.run == process.run:
             silence = (now - process.last_health_at) * 1e-9
             process.silences += silence > SILENT
@@ -250,6 +262,7 @@ def merge_runs(runs: Mapping[str, Metrics]) -> Figures:
     return figures | {
         "seconds": seconds,
         "steps_per_s": figures["steps"] / seconds if seconds > 0.0 else None,
+        "refused": sum(run.admission.refused for run in runs.values()),
         "driven_s": math.fsum(run.seconds(STEP) for run in runs.values()),
         "robots": {robot: closed_loop(robots[robot]) for robot in sorted(robots)},
         "actors": {name: closed_loop([stats]) for name, stats in actors.items()},
@@ -287,5 +300,5 @@ def covered(spans: Iterable[tuple[int, int]]) -> float:
 
 def learner(metrics: pb.LearnerMetrics) -> Figures:
     """Return a learner's latest metrics by the names of the message's fields."""
-    names = [field.name for field in metrics.DESCRIPTOR.fields if field.name not in ("header", "robot")]
+    names = [field.name for field in metrics.DESCRIPTOR.fields if field.name not in ("header", "robot", "limit")]
     return {name: getattr(metrics, name) for name in names}

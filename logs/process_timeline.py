@@ -39,8 +39,9 @@ class ProcessTimeline:
         self.steps: Counter[int] = Counter()  # steps by bin
         self._latest: dict[str, Life] = {}
 
-    def health(self, health: pb.Health) -> None:
-        name, now, run = health.process, health.header.wall_time * 1e-9, health.header.run
+    def health(self, health: pb.Health, received: int) -> None:
+        """Add a sign of life that was received at this time, ns."""
+        name, now, run = health.process, received * 1e-9, health.header.run
         life = self._latest.get(name)
         if life is not None and life.run == run and (now - life.end <= SILENT or len(self.lives) >= MOST_LIVES):
             life.end = max(life.end, now)
@@ -51,18 +52,18 @@ class ProcessTimeline:
         if life is not None and life.run == run:
             life.goodbye = health.last
 
-    def line(self, line: pb.LogLine) -> None:
+    def line(self, line: pb.LogLine, received: int) -> None:
+        """Add a log line that was received at this time, ns."""
         if line.level in LEVELS:
-            at = line.header.wall_time * 1e-9
-            row = {"t": at, "process": line.process, "level": line.level, "text": line.text[:300]}
+            row = {"t": received * 1e-9, "process": line.process, "level": line.level, "text": line.text[:300]}
             if len(self.lines) < MOST_LINES // 2:
                 self.lines.append(row)
             else:
                 self.last_lines.append(row)
 
-    def step(self, wall_time: int) -> None:
-        """Count a step that was published at this time, ns."""
-        now = wall_time * 1e-9
+    def step(self, received: int) -> None:
+        """Count a step that was received at this time, ns."""
+        now = received * 1e-9
         if self.begin is None:
             self.begin = now
         number = int((now - self.begin) / self.width)

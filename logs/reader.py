@@ -20,7 +20,8 @@ from brakeline.errors import Implausible, LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, Row, records
 from brakeline.logs.mcap_contents import is_ros
 from brakeline.logs.recorded_robots import RecordedRobots
-from brakeline.logs.segment import being_written, name_of, number_of
+from brakeline.logs.run_clock import RunClock
+from brakeline.logs.segment import ABOUT, CLOCK, STEADY, being_written, name_of, number_of
 from brakeline.messaging.message_checks import check
 from brakeline.messaging.topics import TOPICS
 
@@ -94,6 +95,7 @@ class Log:
     cuts: list[DamagedBytes | MissingSegment] = field(default_factory=list)
     malformed: int = 0
     segments: list[LogSegment] = field(default_factory=list)
+    clock: RunClock = field(default_factory=RunClock)  # `clock.at(log_time)` for each message in turn
     robots: RecordedRobots = field(default_factory=RecordedRobots)
 
     def __iter__(self) -> Iterator[Record]:
@@ -127,6 +129,7 @@ class Log:
             raise LogError(f"{path} is a ROS bag, not the log of a run: read it with `brakeline import {path}`")
         segment = LogSegment(path, path.stat().st_size, recording=being_written(path))
         self.segments.append(segment)
+        self.clock.begin_file()
         try:
             with path.open("rb") as file:
                 for item in records(file, segment.size, self._channel):
@@ -140,6 +143,8 @@ class Log:
                         self.cuts.append(replace(item, path=path, reason=reason))
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
+                        if item.name == ABOUT and item.metadata.get(CLOCK) == STEADY:
+                            self.clock.trust()
                         if item.name == "robots":
                             self.robots.describe(item.metadata)
                     elif isinstance(item, Attachment):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterable, Mapping
 
 from brakeline.errors import UnknownRobot
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import robot_with_task
 
 log = logging.getLogger("brakeline.logs")
@@ -24,7 +24,7 @@ class RecordedRobots:
         """Add the robots that a log's metadata describe. A malformed description is skipped with a warning."""
         for name, text in descriptions.items():
             try:
-                robot = refuse_shipped_name(robot_from_description(json.loads(text), f"the log's {name}"))
+                robot = refuse_shipped_name(robot_from_description(parse_json(text), f"the log's {name}"))
             except ValueError as error:
                 log.warning("%s", error)
                 continue

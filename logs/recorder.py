@@ -154,7 +154,11 @@ class Recording:
         self.save()
         self._close(sync=True)
         if self._inbox.bytes:
-            log.error("%d bytes of messages could not be recorded: %s", self._inbox.bytes, self.failure)
+            size = self._inbox.bytes
+            log.error("%d bytes of messages could not be recorded: %s", size, self.failure)
+            while batch := self._inbox.oldest():
+                self._inbox.remove(batch)
+                self._inbox.dropped.update(sample.key for sample in batch)
 
     def _entries(self, sample: Sample) -> list[Entry]:
         """Return the entries of a sample: itself, also if it is malformed, and what `derive` adds."""
@@ -248,7 +252,9 @@ def main(settings: BusSettings, log_settings: LogSettings, source: str = "record
         for subscription in subscriptions:
             subscription.close()
         recording.finish()
-        log.info("recorded %d messages to %s", recording.recorded.total(), recording.path)
+        dropped = inbox.dropped.total()
+        level = logging.ERROR if dropped else logging.INFO
+        log.log(level, "recorded %d messages to %s, dropped %d", recording.recorded.total(), recording.path, dropped)
 
 
 def _until_quiet(inbox: Inbox, recording: Recording) -> None:

@@ -11,7 +11,6 @@ import fcntl
 import itertools
 import os
 import re
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,8 @@ from google.protobuf.message import Message
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from brakeline.messaging.steady_clock import steady_time_ns
+
 NO_SCHEMA = 0
 CHUNK = 256 * 1024  # bytes before compression; a flush ends a chunk early
 MOST_CHANNELS = 2**16 - 1  # per file: MCAP numbers channels with two bytes
@@ -30,8 +31,12 @@ TIME_LIMIT = 2**64  # ns: MCAP stores smaller times only
 Metadata = Mapping[str, Mapping[str, str]]
 Attachments = Mapping[str, bytes]  # file contents by name, e.g. model sets
 
+ABOUT = "brakeline"  # metadata of each log
+CLOCK, STEADY = "clock", "steady"  # an entry of the metadata of a log
 TIMES = {
-    "log_time": "ns since the Unix epoch, when the recorder received the message",
+    CLOCK: STEADY,
+    "log_time": "ns since the Unix epoch, when the recorder received the message, by the clock at the recorder's "
+    "start: later jumps of the computer's clock do not show",
     "publish_time": "ns of simulated (or the robot's) time where the message has one, header.time > 0; "
     "else ns since the Unix epoch, when it was published, header.wall_time",
     "topic": "the key on the bus without its prefix",
@@ -140,16 +145,16 @@ class Segment:
         self.path, self._file = path, file
         self._spool = BufferedFile(file)
         output: Any = self._spool  # the writer uses `write`, `tell` and `flush`
-        self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK)
+        self._writer: Any = mcap.writer.Writer(output, chunk_size=CHUNK, enable_data_crcs=True)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.empty = True
         self._writer.start(profile="", library="brakeline")
         about = TIMES | {"segment": str(number_of(path)[1])}
-        for name, values in (("brakeline", about), *metadata.items()):
+        for name, values in ((ABOUT, about), *metadata.items()):
             self._writer.add_metadata(name, dict(values))
         for name, data in (attachments or {}).items():
-            now = time.time_ns()
+            now = steady_time_ns()
             self._writer.add_attachment(now, now, name, "application/octet-stream", data)
         self._writer.flush()  # type: ignore[no-untyped-call]
 

@@ -1340,6 +1340,26 @@ Global___Flow: _TypeAlias = Flow  # noqa: Y015
 class LearnerMetrics(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
+    @_typing.final
+    class LimitEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.int
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.int = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
     HEADER_FIELD_NUMBER: _builtins.int
     ROBOT_FIELD_NUMBER: _builtins.int
     STEPS_FIELD_NUMBER: _builtins.int
@@ -1356,6 +1376,8 @@ class LearnerMetrics(_message.Message):
     STALENESS_FIELD_NUMBER: _builtins.int
     LIMITER_ERROR_FIELD_NUMBER: _builtins.int
     DONE_FIELD_NUMBER: _builtins.int
+    LIMIT_FIELD_NUMBER: _builtins.int
+    REFUSED_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     steps: _builtins.int
     """transitions inserted"""
@@ -1374,8 +1396,14 @@ class LearnerMetrics(_message.Message):
     """mean of weights_version - step's version"""
     limiter_error: _builtins.float
     done: _builtins.bool
+    refused: _builtins.int
+    """steps that the learner did not take: not valid, not permitted, or after the end"""
     @_builtins.property
     def header(self) -> Global___Header: ...
+    @_builtins.property
+    def limit(self) -> _containers.ScalarMap[_builtins.str, _builtins.int]:
+        """per actor: the largest `index` it may publish; figures count no step far beyond"""
+
     def __init__(
         self,
         *,
@@ -1395,10 +1423,12 @@ class LearnerMetrics(_message.Message):
         staleness: _builtins.float = ...,
         limiter_error: _builtins.float = ...,
         done: _builtins.bool = ...,
+        limit: _abc.Mapping[_builtins.str, _builtins.int] | None = ...,
+        refused: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["actor_loss", b"actor_loss", "critic_loss", b"critic_loss", "done", b"done", "duplicates", b"duplicates", "header", b"header", "limiter_error", b"limiter_error", "mean_q", b"mean_q", "missing", b"missing", "replay_size", b"replay_size", "robot", b"robot", "staleness", b"staleness", "steps", b"steps", "steps_per_s", b"steps_per_s", "updates", b"updates", "updates_per_s", b"updates_per_s", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["actor_loss", b"actor_loss", "critic_loss", b"critic_loss", "done", b"done", "duplicates", b"duplicates", "header", b"header", "limit", b"limit", "limiter_error", b"limiter_error", "mean_q", b"mean_q", "missing", b"missing", "refused", b"refused", "replay_size", b"replay_size", "robot", b"robot", "staleness", b"staleness", "steps", b"steps", "steps_per_s", b"steps_per_s", "updates", b"updates", "updates_per_s", b"updates_per_s", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

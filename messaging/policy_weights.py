@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from brakeline.errors import BadWeights
 from brakeline.messaging.perceptrons import Layer, check_layers
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Array, shipped_robots
+from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
 Matrix = NDArray[np.float32]
@@ -122,8 +123,8 @@ def decode(data: bytes, robot: RobotWithTask | None = None) -> MLP:
     try:
         read: Any = safetensors.deserialize  # Any: it comes without types
         entries = dict(read(data))
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-        about = json.loads(header["__metadata__"]["policy"])
+        header = parse_json(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        about = parse_json(header["__metadata__"]["policy"])
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
         raise BadWeights(f"not a policy file: {error}") from error
     robot = _robot(about, robot)

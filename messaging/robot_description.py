@@ -8,7 +8,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from functools import lru_cache
@@ -18,8 +17,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from brakeline.errors import BadDescription, UnknownRobot
+from brakeline.errors import BadDescription, BadText, UnknownRobot
 from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP, REAL_TIME_SUFFIX, Disc, Limit, Robot
+from brakeline.messaging.structured_text import parse_toml
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")
 MAX_NAME_LENGTH = 64
@@ -135,9 +135,9 @@ def read_robot(path: Path) -> Robot:
 def _parse(text: str, source: str) -> Robot:
     """Return the robot in the text of a file; each text is validated once."""
     try:
-        return robot_from_description(tomllib.loads(text), source)
-    except tomllib.TOMLDecodeError as error:
-        raise BadDescription(source, [("", f"not TOML: {error}")]) from error
+        return robot_from_description(parse_toml(text), source)
+    except BadText as error:
+        raise BadDescription(source, [("", str(error))]) from error
 
 
 def robot_from_description(values: Any, source: str = "this") -> Robot:

@@ -15,7 +15,6 @@ import importlib
 import importlib.util
 import json
 import sys
-import tomllib
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +32,7 @@ from brakeline.messaging.robot import (
     Robot,
     robot_named,
 )
+from brakeline.messaging.structured_text import parse_toml
 
 TASK_SUFFIX = ".task.toml"
 _STRICT = ConfigDict(extra="forbid")
@@ -339,7 +339,7 @@ def read_task(path: Path) -> Task:
 
 def _with_base(path: Path) -> dict[str, Any]:
     """Return the values in a task's file, with those of the task that it is `like` as defaults."""
-    values = tomllib.loads(path.read_text())
+    values = parse_toml(path.read_text())
     base = values.pop("like", None)
     return ({} if base is None else _with_base(path.with_name(f"{base}{TASK_SUFFIX}"))) | values
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -44,7 +45,7 @@ def decode_frame(raw: bytes, outgoing: bool) -> CapturedFrame | None:
     """Return the frame of some bytes; None if they are not a frame."""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(raw))
-    except mavlink.MAVError:
+    except (mavlink.MAVError, IndexError, ValueError, struct.error):  # the last three of bytes that end too early
         return None
     return CapturedFrame(outgoing, raw, message)
 

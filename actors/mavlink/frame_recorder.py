@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
 from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.steady_clock import steady_time_ns
 
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import CapturedFrame
@@ -33,7 +33,7 @@ class FrameRecorder:
 
     def record(self, frame: CapturedFrame) -> None:
         """Collect a frame that was sent or received just now."""
-        self.add(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+        self.add(pb.MavlinkFrame(wall_time=steady_time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
     def add(self, frame: pb.MavlinkFrame) -> None:
         """Collect a frame that another process sent or received."""

@@ -6,7 +6,6 @@ a simulator sends it over MAVLink beside the estimate (`MavlinkGroundTruth`).
 
 from __future__ import annotations
 
-import json
 import math
 import socket
 from collections.abc import Callable
@@ -17,6 +16,7 @@ import numpy as np
 
 from brakeline.actors.mavlink.telemetry import Array, GeoPosition
 from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.structured_text import parse_json
 from brakeline.sim.quadrotor import QUADROTOR
 
 FARTHEST = 1e5  # m, m/s, ...: no vehicle is farther away, or faster
@@ -44,7 +44,7 @@ class UdpGroundTruth:
             except BlockingIOError:
                 return
             with self._rejected.skip_on_error("truth"):
-                self._take(json.loads(data))
+                self._take(parse_json(data))
 
     def close(self) -> None:
         """Stop listening."""

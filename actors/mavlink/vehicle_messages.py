@@ -22,6 +22,7 @@ from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
 from brakeline.sim.vehicle import Period
@@ -56,7 +57,7 @@ def request_message(request: FlightRequest) -> pb.FlightRequest:
 def request_of(message: pb.FlightRequest) -> FlightRequest:
     """Return the flight request in a message."""
     try:
-        robot = robot_from_description(json.loads(message.robot))
+        robot = robot_from_description(parse_json(message.robot))
         robot = robot.in_real_time() if message.late else robot
         obstacles = tuple(obstacles_of(message.obstacles, robot.position_dim))
     except (ValueError, RecursionError) as error:

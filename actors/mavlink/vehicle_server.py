@@ -40,6 +40,7 @@ from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.stop_signals import stop_on_signals
 
 log = logging.getLogger("brakeline.flight")
@@ -223,7 +224,7 @@ class VehicleServer:
         return pb.CommitReply(number=command.number, in_time=in_time)
 
     def _store_frame(self, frame: CapturedFrame) -> None:
-        self._frames.append(pb.MavlinkFrame(wall_time=time.time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+        self._frames.append(pb.MavlinkFrame(wall_time=steady_time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
     def _send_updates(self) -> None:
         """Send each period as it begins. What arrives while there is no actor goes to the next one."""

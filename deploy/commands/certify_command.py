@@ -14,7 +14,7 @@ from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
-from brakeline.deploy.data.data_paths import model_path, record_path
+from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.progress import under_way
@@ -158,6 +158,7 @@ class CertifyCommand:
             ModelSigner.load(keys).sign(model, data).save(path)
         else:
             model.save(path)
+        note_mode(model.robot, model.model_config)
 
     def _load(self) -> tuple[Path, Dataset, str]:
         """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""

@@ -12,7 +12,7 @@ from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.certify_command import bounds_in_words, validation_table
 from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.data.build_lock import folder_lock
-from brakeline.deploy.data.data_paths import model_path, record_path
+from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
 from brakeline.deploy.data.simulated_recording import SEED, load_or_record
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings, fly
 from brakeline.messaging.task import robot_maybe_with_task
@@ -75,6 +75,7 @@ class CollectCommand:
             else:
                 used = model_path(model.robot, model.model_config)
                 model.save(used)
+                note_mode(model.robot, model.model_config)
                 figures["model"] = str(used)
                 text.append(f"{used}: in use from now on")
         print_result(self.json, figures, *text, *(f"missing: {line}" for line in flight.missing))

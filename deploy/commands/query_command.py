@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -23,6 +22,7 @@ from brakeline.messaging.robot import robot_named
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import describe_verification
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.filter_client import Answer
 
@@ -129,7 +129,7 @@ def load_scan(path: Path, dim: int) -> RangeMeasurement:
     kind = Scan if dim == 2 else RangeImage
     names = [field.name for field in fields(kind) if field.name != "followed"]
     try:
-        values = json.loads(path.read_text())
+        values = parse_json(path.read_text())
         if not isinstance(values, dict) or not values.keys() <= set(names):
             raise BadScan(f"{path}: not a {kind.__name__}, which is a JSON object of {', '.join(names)}")
         return kind(**values)

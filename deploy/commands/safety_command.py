@@ -33,17 +33,22 @@ class SafetyCommand:
         """Answer requests until SIGINT or SIGTERM. Returns the exit status."""
         from brakeline.deploy.run.run_keys import check_adaptable, check_signer
         from brakeline.safety.service.server import SafetySettings, main
+        from brakeline.safety.service.signature import TrustedSigners
 
         model_config, accept_bound = self.filtering.model_config(), self.filtering.accept_bound
         robots = [robot_maybe_with_task(robot) for robot in self.robots]
         bus = self.endpoints.bus()
         if self.adapt:
             check_signer(bus.keys)
-        for robot in robots:
-            model = method_for(robot, self.filtering.method, model_config, accept_bound)
+        paths = tuple(method_path(robot, self.filtering.method, model_config) for robot in robots)
+        trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
+        for robot, path in zip(robots, paths, strict=True):
+            if trust is None:
+                model = method_for(robot, self.filtering.method, model_config, accept_bound)
+            else:  # a model that this service built would have no signature
+                model = trust.load_model(path)
             if self.adapt:
                 check_adaptable(model)
-        paths = tuple(method_path(robot, self.filtering.method, model_config) for robot in robots)
         limits = {robot.name: robot.accept_bound for robot in robots}
         with ExitStack() as beside:
             if self.adapt:

@@ -35,7 +35,7 @@ class StatusCommand:
 
         def receive_learner(sample: Sample) -> None:
             message = sample.message()
-            names = [f.name for f in message.DESCRIPTOR.fields if f.name not in ("header", "robot")]
+            names = [f.name for f in message.DESCRIPTOR.fields if f.name not in ("header", "robot", "limit")]
             learners[message.robot] = {name: getattr(message, name) for name in names}
 
         with Bus(self.endpoints.bus(), f"viewer.status-{time.time_ns() % 10**6}") as bus:

@@ -2,6 +2,7 @@
 
 data/<robot>/record.safetensors                     the recorded trajectories
 data/<robot>/<certificate>-<mode>.safetensors       the model set in use, made from them
+data/<robot>/<certificate>.in_use                    the mode that was put to use last, for mode auto
 data/<robot>/<rival>.safetensors                    the rival's networks, pre-trained (<rival>+<task> for another task)
 data/<robot>/models/<version>.safetensors           every version a service has used
 """
@@ -12,6 +13,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from brakeline.errors import BadModel
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import TASK_SEPARATOR, Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT, ONE_STEP, ModelConfig
@@ -30,14 +33,41 @@ def record_path(robot: Robot) -> Path:
 def model_path(robot: Robot, model_config: ModelConfig) -> Path:
     """Return the path of the model set in use with this error bound and mode.
 
-    Mode `AUTO` gives the newer one of the modes one-step and direct, and direct if there is none.
+    Mode `AUTO` gives the mode that was put to use last (`note_mode`), whatever the times of the files are. If none was,
+    it gives the mode of which there is a model set, and direct if there are both or none.
+
+    Raises:
+        BadModel: the note is damaged.
     """
     if model_config.mode != AUTO:
         return data_root() / robot.name / f"{model_config.certificate}-{model_config.mode}.safetensors"
-    direct, one_step = (model_path(robot, replace(model_config, mode=mode)) for mode in (DIRECT, ONE_STEP))
-    if not one_step.exists() or (direct.exists() and direct.stat().st_mtime > one_step.stat().st_mtime):
-        return direct
-    return one_step
+    paths = {mode: model_path(robot, replace(model_config, mode=mode)) for mode in (DIRECT, ONE_STEP)}
+    order = dict.fromkeys((_noted_mode(robot, model_config) or DIRECT, DIRECT, ONE_STEP))
+    return next((paths[mode] for mode in order if paths[mode].exists()), paths[DIRECT])
+
+
+def note_mode(robot: Robot, model_config: ModelConfig) -> None:
+    """Note that the model set of this mode was put to use, for mode `AUTO`. Other modes do not take part."""
+    if model_config.mode in (DIRECT, ONE_STEP):
+        write_atomically(_note_path(robot, model_config), model_config.mode.encode())
+
+
+def _note_path(robot: Robot, model_config: ModelConfig) -> Path:
+    return data_root() / robot.name / f"{model_config.certificate}.in_use"
+
+
+def _noted_mode(robot: Robot, model_config: ModelConfig) -> str:
+    """Return the mode that was put to use last; empty if none was. Raises BadModel."""
+    path = _note_path(robot, model_config)
+    try:
+        mode = path.read_bytes().decode(errors="replace").strip()
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        raise BadModel(f"{path}: {error}") from error
+    if mode not in (DIRECT, ONE_STEP):
+        raise BadModel(f"{path}: no mode is called {mode!r:.40}: certify again with --use, or give --mode")
+    return mode
 
 
 def method_path(robot: Robot, method: str, model_config: ModelConfig) -> Path:

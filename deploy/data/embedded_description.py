@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from brakeline.deploy.data.description_template import toml_key, toml_value
 from brakeline.errors import NoSource
 from brakeline.logs.reader import open_log
+from brakeline.messaging.structured_text import parse_json
 
 ROBOTS = "robots"  # metadata of a log: robot name -> description as JSON
 
@@ -37,7 +37,7 @@ def read_embedded_description(path: Path, name: str) -> str:
     if len(descriptions) > 1 and name not in descriptions:
         raise NoSource(f"{path} holds the robots {', '.join(descriptions)}: name the file after the one that you want")
     chosen = name if name in descriptions else next(iter(descriptions))
-    described = json.loads(descriptions[chosen]) | {"name": name}
+    described = parse_json(descriptions[chosen]) | {"name": name}
     return f"# The description of {chosen} from {path.name}.\n" + "\n".join(_lines(described)) + "\n"
 
 

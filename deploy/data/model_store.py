@@ -70,7 +70,9 @@ def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], ac
             return load()
         except BadModel as error:
             if path.exists():
-                console.print(f"[yellow]{activity} again:[/] {error}")
+                aside = path.with_suffix(".replaced")
+                path.replace(aside)  # somebody may want to know what it was
+                console.print(f"[yellow]{activity} again:[/] {error}; the file before is now {aside}")
         return build()
 
 

@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Protocol
 from brakeline.deploy.interpreter import end_with_parent, spawning
 from brakeline.errors import ResultError
 from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.structured_text import parse_json
 
 LONGEST_LINE = 500  # characters per progress message
 
@@ -60,7 +61,7 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     path = result_path(results, job)
     if not path.exists():
         return None
-    result: dict[str, Any] = json.loads(path.read_text())
+    result: dict[str, Any] = parse_json(path.read_text())
     stored, current = result.get("study", {}), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
@@ -120,7 +121,7 @@ def _run_in_workers(
         while under_way:
             done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
             while reader.poll():
-                say(*json.loads(reader.recv_bytes()))
+                say(*parse_json(reader.recv_bytes()))
             for future in done:
                 job = under_way.pop(future)
                 if future.exception() is not None:

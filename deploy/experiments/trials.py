@@ -26,6 +26,7 @@ from brakeline.learner.learner import Learner
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE, STEP, Topic
 from brakeline.sim.scripted_policies import Policy, scripted
@@ -74,7 +75,7 @@ class TrialLog:
         """Add a message, and number it."""
         key = topic.at(robot=message.robot, source=message.actor)
         self._count[key] = number = self._count.get(key, 0) + 1
-        header, now = message.header, time.time_ns()
+        header, now = message.header, steady_time_ns()
         header.sequence, header.source, header.run, header.wall_time = number, message.actor, RUN, now
         self._waiting.append(
             Entry(key, type(message), message.SerializeToString(), now, int(header.time * 1e9) or now, number)

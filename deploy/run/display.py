@@ -162,7 +162,9 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     console.print(show({name: value for name, value in figures.items() if name != "topics"}))
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
-    console.print(f"messages lost: {lost}; restarts: {restarts or 'none'}")
+    console.print(f"messages lost on the way to the display: {lost}; restarts: {restarts or 'none'}")
+    if (log := figures.get("log_messages")) is not None:
+        console.print(log_line(log))
     if fed := figures.get("from_logs"):
         known_before = f"{fed.get('known', 0)} that the learner had already"
         console.print(f"steps from logs: {fed.get('published', 0)}, and {known_before}")
@@ -172,6 +174,14 @@ def summary(console: Console, figures: dict[str, Any]) -> None:
     lines = [f"log:    {figures['log'] or 'not recorded'}", *(f"policy: {path}" for path in figures["policies"])]
     for line in (*lines, *(f"next:   {command}" for command in following(figures))):
         console.print(line, markup=False)
+
+
+def log_line(log: dict[str, Any]) -> str:
+    """Say how many messages the log has, how many it lacks, and why."""
+    if not log["missing"] and not log["failures"]:
+        return f"messages in the log: {log['recorded']}, all that were published"
+    why = f" ({escape('; '.join(log['failures']))})" if log["failures"] else ""
+    return f"messages in the log: {log['recorded']}; [red]NOT in the log: {log['missing']}[/]{why}"
 
 
 def following(figures: dict[str, Any]) -> list[str]:

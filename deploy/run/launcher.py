@@ -15,15 +15,21 @@ from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
 from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed_run
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
-from brakeline.errors import LaunchError
+from brakeline.errors import LaunchError, LogError
+from brakeline.learner.checkpoint import CHECKPOINT
+from brakeline.learner.checkpoint import exists as checkpoint_exists
+from brakeline.learner.checkpoint import latest as latest_checkpoint
+from brakeline.logs.log_length import count_by_key
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.topics import RECORDED
+from brakeline.messaging.topics import HEALTH, RECORDED
+from brakeline.messaging.topics import LOG as LOG_LINES
 from brakeline.safety.methods import Model
 from brakeline.safety.service.plan_token import write_key
 
@@ -35,6 +41,7 @@ RECORDER_TIMEOUT = 30.0  # s after which the run starts without a recorder, whos
 LAST_MESSAGES_TIMEOUT = 2.0  # s, longest wait for the last messages of processes that have ended
 SILENCE = 0.5  # s without a message after which the launcher takes the last message to have arrived
 FIGURES = "figures.json"
+SEGMENTS = f"{Path(LOG).stem}*{Path(LOG).suffix}"  # the files of a log
 
 
 def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
@@ -44,13 +51,16 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         The configuration to run: of a new run, with the mode of its model sets.
 
     Raises:
-        LaunchError: the folder holds another run.
+        LaunchError: the folder holds another run, or the run to resume has lost its checkpoint.
+        DamagedPart: the checkpoint of the run to resume is lost in part.
         BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
         ValueError: the run adapts, and a model set is not of mode one-step.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
+    if resume and not config.policy and not config.from_logs:
+        _check_resumable(config, folder)
     models: list[Model] = []
     if config.filtered and resume:
         models = models_of_resumed_run(config, folder)
@@ -60,6 +70,24 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         check_adaptable(model)
     folder.mkdir(parents=True, exist_ok=True)
     return config
+
+
+def _check_resumable(config: RunConfig, folder: Path) -> None:
+    """Check that each learner of the run has a checkpoint, so that none begins anew without a word.
+
+    Raises:
+        LaunchError: a learner has none.
+        DamagedPart: it is lost in part.
+    """
+    for spec in process_specs(config):
+        root = folder / spec.name / CHECKPOINT
+        if spec.kind == "learner" and not checkpoint_exists(root):
+            raise LaunchError(
+                f"{folder}: there is no checkpoint in {root}. Learn again from the run's log: `brakeline train "
+                f"--resume {folder} --from-logs {folder}`. Or begin anew in another folder: --out"
+            )
+        if spec.kind == "learner":
+            latest_checkpoint(root)
 
 
 class Launcher:
@@ -80,6 +108,7 @@ class Launcher:
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self.ending = False
+        self._earlier: set[Path] = set()  # files of the log from before a resumption
         self._inbox: deque[Sample] = deque()
         self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
 
@@ -123,7 +152,10 @@ class Launcher:
                 process.notes["outcome"] = f"failed: {failure}" if failure is not None else outcome
         self._drain()
         figures = self.figures()
-        (self.folder / FIGURES).write_text(json.dumps(figures, indent=2))
+        try:
+            write_atomically(self.folder / FIGURES, json.dumps(figures, indent=2).encode())
+        except OSError as error:  # the caller shows them all the same
+            log.error("the figures were not saved: %s", error)
         if failure is not None:
             raise failure
         return figures
@@ -150,9 +182,30 @@ class Launcher:
         paths = {
             "folder": str(self.folder),
             "log": str(self.folder / LOG) if self.config.record else None,
+            "log_messages": self._log_messages() if self.config.record else None,
             "policies": [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))],
         }
         return setup | self.metrics.figures() | outcome | paths
+
+    def _log_messages(self) -> dict[str, Any]:
+        """Return how many messages the log of this start of the run has, and how many more were published.
+
+        The signs of life and log lines of the recorder and the launcher do not count: they go on after the log's end.
+        """
+        recorded: Counter[str] = Counter()
+        recorder = self.metrics.processes.get("recorder")
+        failures = [] if recorder is None or not recorder.notes.get("failure") else [recorder.notes["failure"]]
+        for path in sorted(set(self.folder.glob(SEGMENTS)) - self._earlier):
+            try:
+                recorded += count_by_key(path)
+            except (LogError, OSError) as error:
+                failures.append(str(error))
+        published: Counter[str] = Counter()
+        for (key, _), stream in self.metrics.streams.items():
+            published[key] += stream.published
+        own = {topic.at(source=name) for topic in (HEALTH, LOG_LINES) for name in ("recorder", "launcher")}
+        missing = sum(max(0, count - recorded[key]) for key, count in published.items() if key not in own)
+        return {"recorded": recorded.total(), "missing": missing, "failures": failures}
 
     @property
     def finished(self) -> bool:
@@ -189,7 +242,8 @@ class Launcher:
 
     def _claim_folder(self) -> None:
         """Write the files that the processes read, and make runs/latest point to this run."""
-        (self.folder / CONFIG).write_text(encode(self.config))
+        self._earlier = set(self.folder.glob(SEGMENTS))
+        write_atomically(self.folder / CONFIG, encode(self.config).encode())
         write_endpoint(self.folder, self.bus)
         if self.bus.keys is None:
             write_key(self.folder / KEYS)  # so that each service accepts the plans that another one verified
@@ -223,7 +277,7 @@ class Launcher:
             sample = self._inbox.popleft()
             with self._rejected.skip_on_error(sample.key):
                 message = sample.message()
-                self.metrics.add(sample.key, message)
+                self.metrics.add(sample.key, message, sample.received)
                 if sample.topic.name == "health":
                     for child in self.processes:
                         if child.spec.name == message.process:

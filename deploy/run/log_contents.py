@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import logging
 from importlib.metadata import version
 from pathlib import Path
 
 from brakeline.deploy.run.mavlink_json import Derive, frames_as_json
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_models import model_in_run
+from brakeline.errors import BadModel
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.recorded_robots import RecordedRobots
-from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.methods import DDPC, load
+from brakeline.safety.methods import DDPC, Model, load
+
+log = logging.getLogger("brakeline.recorder")
 
 
 def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
@@ -38,9 +42,18 @@ def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
     robots = [robot_maybe_with_task(name) for name in config.robots]
     groups["robots"] = {robot.kind: json.dumps(robot.description) for robot in robots}
     for robot in robots if config.filtered else ():
-        model = load(model_in_run(config, folder, robot))
-        groups[f"model {robot.name}"] = {"version": model.version, **model.about}
+        if (model := _model(config, folder, robot)) is not None:
+            groups[f"model {robot.name}"] = {"version": model.version, **model.about}
     return groups
+
+
+def _model(config: RunConfig, folder: Path, robot: Robot) -> Model | None:
+    """Return the model that the run uses; None if it is no longer readable, which must not end the recorder."""
+    try:
+        return load(model_in_run(config, folder, robot))
+    except BadModel as error:
+        log.error("model not in the log: %s", error)
+        return None
 
 
 def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
@@ -49,11 +62,14 @@ def attachments(config: RunConfig, folder: Path) -> dict[str, bytes]:
         return {}
     files = {}
     for name in config.robots:
-        model = load(model_in_run(config, folder, robot_maybe_with_task(name)))
-        files[model_attachment_name(model.robot.name, model.version)] = model.encode()
+        if (model := _model(config, folder, robot_maybe_with_task(name))) is not None:
+            files[model_attachment_name(model.robot.name, model.version)] = model.encode()
         robot = robot_named(name).name
-        archived = (folder / robot / "models").glob("*.safetensors")
-        files |= {model_attachment_name(robot, path.stem): path.read_bytes() for path in archived}
+        for path in sorted((folder / robot / "models").glob("*.safetensors")):
+            try:
+                files[model_attachment_name(robot, path.stem)] = path.read_bytes()
+            except OSError as error:  # the log has then no model for the decisions that this one made
+                log.error("model not in the log: %s: %s", path, error)
     return files
 
 

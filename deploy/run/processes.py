@@ -12,6 +12,7 @@ from brakeline.deploy.run.run_config import RunConfig
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.robot import robot_named
+from brakeline.messaging.structured_text import parse_json
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 CERTIFIER = "certify.adapt"  # name of the process that certifies anew; its certificate is that of `certify`
@@ -88,5 +89,5 @@ def launcher_pid(folder: Path) -> int:
 
 
 def _read_endpoint(folder: Path) -> dict[str, Any]:
-    values: dict[str, Any] = json.loads((folder / ENDPOINT).read_text())
+    values: dict[str, Any] = parse_json((folder / ENDPOINT).read_text())
     return values

@@ -13,6 +13,7 @@ import tyro
 from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.model_config import AUTO, DDPC, ModelConfig
 from brakeline.safety.model.model_config import METHODS as FILTERS
 from brakeline.sim.sim_conditions import Conditions
@@ -176,7 +177,7 @@ def decode(text: str) -> RunConfig:
     """
     from pydantic import TypeAdapter, ValidationError  # here, so that `--help` does not wait for it
 
-    values: Any = json.loads(text)
+    values: Any = parse_json(text)
     if isinstance(values, dict):
         values = {FORMER_NAMES.get(name, name): value for name, value in values.items()}
     try:

@@ -14,7 +14,7 @@ from brakeline.safety.methods import Model, load
 from brakeline.safety.model.model_set import ONE_STEP, ModelSet
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.server import archive_path
-from brakeline.safety.service.signature import KEY, ModelSigner, seal_of, write_signer
+from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, write_signer
 
 KEYS = "keys"  # folder in the run's folder
 OTHER_ROLES = ("launcher", "viewer", "client", "certify")  # that may join the bus, besides the run's processes
@@ -39,11 +39,13 @@ def sign_models(config: RunConfig, folder: Path, keys: Path) -> None:
     """
     if not (keys / KEY).exists():
         return
-    signer = ModelSigner.load(keys)
+    signer, trust = ModelSigner.load(keys), TrustedSigners.load(keys)
     for name in config.robots if config.filtered else ():
         model = load(model_in_run(config, folder, robot_maybe_with_task(name)))
         archived = archive_path(folder, model.robot.name, model.version)
-        if not seal_of(archived).exists():
+        try:
+            trust.load_model(archived)
+        except Untrusted:  # it has no seal yet, or not a whole one
             signer.sign(model).save(archived)
 
 

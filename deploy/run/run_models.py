@@ -16,14 +16,15 @@ from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.progress import console
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.errors import BadModel
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import Model, load
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.server import archive_path
-from brakeline.safety.service.signature import TrustedSigners, seal_of
+from brakeline.safety.service.server import IN_USE, archive_path
+from brakeline.safety.service.signature import SignedModel, TrustedSigners, seal_of
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -51,6 +52,7 @@ def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[
         for path in (source, seal_of(source)):
             if path.exists():
                 shutil.copyfile(path, kept.with_suffix(path.suffix))
+        write_atomically(kept.with_name(IN_USE), model.version.encode())
         models.append(model)
     modes = {model.model_config.mode for model in models if isinstance(model, ModelSet)}
     if config.model_config.mode == AUTO and len(modes) == 1:
@@ -93,22 +95,44 @@ def model_in_run(config: RunConfig, folder: Path, robot: Robot, trust: TrustedSi
 
 
 def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path | None:
-    """Return the model that a service of this run used last, so that a restarted service uses it again.
+    """Return the model that a restarted service of this run uses again.
 
     Args:
-        trust: the accepted signers, on a bus with keys. The function skips models that others signed.
+        trust: the accepted signers, on a bus with keys. The model that they signed last is the newest. Without keys,
+            the archive notes which model was put to use last. The times of the files never count.
 
     Returns:
         The file; None if there is none.
     """
     versions = archive_path(folder, robot, "*")
-    newest = sorted(versions.parent.glob(versions.name), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-    for path in newest:
+    paths = sorted(versions.parent.glob(versions.name))
+    if trust is None:
+        return _noted_model(versions.parent, paths)
+    numbered = []
+    for path in paths:
         try:
-            if trust is not None:
-                trust.load_model(path)
+            numbered.append((trust.number(SignedModel.load(path)), path))
+        except BadModel as error:
+            log.warning("model not used: %s", error)
+    for _, path in sorted(numbered, reverse=True):
+        try:
+            trust.load_model(path)
         except BadModel as error:
             log.warning("model not used: %s", error)
             continue
         return path
     return None
+
+
+def _noted_model(archive: Path, paths: list[Path]) -> Path | None:
+    """Return the model that an archive of these models notes as put to use last, or its only one, if it is whole."""
+    try:
+        path = paths[0] if len(paths) == 1 else archive / f"{(archive / IN_USE).read_text().strip()}.safetensors"
+        if path not in paths:
+            raise BadModel(f"{archive / IN_USE} names no model that is there")
+        load(path)
+    except (OSError, ValueError) as error:
+        if paths:
+            log.warning("model not used: %s", error)
+        return None
+    return path

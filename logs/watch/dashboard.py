@@ -152,7 +152,8 @@ class Dashboard:
         message = sample.message()
         with self._lock:
             self._last_message = time.monotonic()
-            self.metrics.add(sample.key, message)
+            if not self.metrics.add(sample.key, message, sample.received):
+                return
             if isinstance(message, pb.LogLine):
                 if message.level in ("WARNING", "ERROR"):
                     self._lines.append(f"{message.process}: {headline(message.text)}")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import zenoh
 from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error
+from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.topics import Topic
 
 
@@ -40,7 +40,7 @@ class Publisher:
             if self._stamped:
                 header: pb.Header = message.header  # type: ignore[attr-defined]
                 header.sequence, header.source, header.run = self.count + 1, self._source, self._run
-                header.wall_time = time.time_ns()
+                header.wall_time = steady_time_ns()
             with as_bus_error(f"cannot publish at {self.key}"):
                 self._sender.put(message.SerializeToString())
             self.count += 1

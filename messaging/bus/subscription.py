@@ -17,6 +17,7 @@ from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error
 from brakeline.messaging.message_checks import NAME, check
 from brakeline.messaging.rejected_messages import RejectedMessages
+from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.topics import Topic
 
 MOST_KEYS = 2048  # of one subscription; samples at further keys are rejected
@@ -123,7 +124,7 @@ class Listener(Subscription):
         if size > self._topic.largest:
             raise Malformed(f"{key}: {size} bytes; a message has at most {self._topic.largest}")
         self._heard[key] = time.monotonic()
-        self._handler(Sample(self._topic, key, sample.payload.to_bytes(), time.time_ns()))
+        self._handler(Sample(self._topic, key, sample.payload.to_bytes(), steady_time_ns()))
 
     def _admit(self, key: str) -> None:
         """Check a new key. Raises Malformed."""

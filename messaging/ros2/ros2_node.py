@@ -41,6 +41,7 @@ from brakeline.messaging.ros2.rmw_names import (
     full_name,
     topic_key,
 )
+from brakeline.messaging.steady_clock import steady_time_ns
 
 M = TypeVar("M")
 ROUTER = "tcp/localhost:7447"  # rmw_zenoh's default
@@ -211,7 +212,7 @@ class RosNode:
                 raise Malformed(f"{len(sample.payload)} bytes; a message has at most {LARGEST}")
             payload = sample.payload.to_bytes()
             if self._tap is not None:
-                self._tap(entity.topic, kind, payload, time.time_ns(), qos)
+                self._tap(entity.topic, kind, payload, steady_time_ns(), qos)
             handler(decode(kind, payload))
 
         subscription = Subscription(entity.topic, receiver, take, self.rejected)

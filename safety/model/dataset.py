@@ -17,6 +17,7 @@ from brakeline.errors import BadData, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.tensor_file import pack, unpack
 
 Array = NDArray[np.float64]
@@ -159,7 +160,7 @@ class Dataset:
             robot = (
                 robot_named(name)
                 if described is None
-                else refuse_shipped_name(robot_from_description(json.loads(described), name))
+                else refuse_shipped_name(robot_from_description(parse_json(described), name))
             )
         except (UnknownRobot, ValueError, TypeError) as error:
             raise BadData(f"{path}: {error}") from error

@@ -17,6 +17,7 @@ from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import FORMER_LAYOUTS, REAL_TIME_SUFFIX, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
@@ -214,7 +215,7 @@ class ModelSet:
             more = tensors["domain"], tensors["basis"], dict(about["about"])
             one_step = OneStep.of_tensors(tensors) if model_config.mode == ONE_STEP else None
             stands = int(about.get("stands", 0))
-        except (KeyError, TypeError, ValueError, UnknownRobot) as error:
+        except Exception as error:  # whatever a hostile file makes a parser raise
             raise BadModel(f"no model set: {error!r}") from error
         if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
@@ -287,7 +288,7 @@ def robot_in(about: dict[str, Any]) -> Robot:
         if about.get("layout") != FORMER_LAYOUTS.get(name):
             raise UnknownRobot(f"{name}: neither a description nor the layout of a robot known before there were any")
         return robot_named(name)
-    robot = robot_from_description(json.loads(about["description"]), "the model set's robot")
+    robot = robot_from_description(parse_json(about["description"]), "the model set's robot")
     robot = robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
     if robot.name != name:
         raise UnknownRobot(f"the model set is of {name!r}, its description of {robot.name!r}")

@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from brakeline.errors import BadTensors
+from brakeline.messaging.structured_text import parse_json
 
 
 def pack(tensors: Mapping[str, NDArray[Any]], entry: str, about: Mapping[str, Any]) -> bytes:
@@ -48,7 +49,7 @@ def unpack(payload: bytes, entry: str) -> tuple[dict[str, NDArray[Any]], dict[st
         BadTensors: the bytes are no safetensors file, or the entry is missing or no JSON object.
     """
     try:
-        about = json.loads(_metadata(payload)[entry])
+        about = parse_json(_metadata(payload)[entry])
         tensors = load(payload)
     except KeyError as error:
         raise BadTensors(f"there is no {error} in it") from error
@@ -73,5 +74,5 @@ def _contiguous(tensors: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 def _metadata(payload: bytes) -> dict[str, str]:
     size = int.from_bytes(payload[:8], "little")
-    found: dict[str, str] = json.loads(payload[8 : 8 + size]).get("__metadata__", {})
+    found: dict[str, str] = parse_json(payload[8 : 8 + size]).get("__metadata__", {})
     return found

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.errors import BadModel, UnknownRobot
+from brakeline.errors import BadModel
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import LidarRays
@@ -88,7 +88,7 @@ class Pretrained:
             settings = {str(name): float(value) for name, value in about["settings"].items()}
             rays = _rays(tensors, about)
             model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]), rays)
-        except (KeyError, TypeError, ValueError, UnknownRobot) as error:
+        except Exception as error:  # whatever a hostile file makes a parser raise
             raise BadModel(f"no pretrained model: {error!r}") from error
         if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")

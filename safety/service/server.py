@@ -12,6 +12,7 @@ from time import perf_counter_ns
 
 from brakeline.errors import BadModel, BadRequest, BusError, NoModel, StaleModel, UnknownRobot, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
@@ -29,6 +30,8 @@ from brakeline.safety.service.wire import batch_of, decision_reply, digest, erro
 
 log = logging.getLogger("brakeline.safety")
 
+IN_USE = "in_use"  # in the archive of a robot: the version that a service put to use last
+
 
 @dataclass
 class ModelRegistry:
@@ -41,6 +44,7 @@ class ModelRegistry:
         accept_bound: largest bound that the user accepts explicitly, in place of `limits`.
         filters: the method in use, by the robot's name.
         known: versions that have been in use.
+        numbers: number of the signature of the method in use, by the robot's name; 0: not signed.
     """
 
     archive: Path | None = None
@@ -48,17 +52,20 @@ class ModelRegistry:
     accept_bound: float | None = None
     filters: dict[str, Method] = field(default_factory=dict)
     known: set[str] = field(default_factory=set)
+    numbers: dict[str, int] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
-    def install(self, model: Model, signed: SignedModel | None = None) -> None:
+    def install(self, model: Model, signed: SignedModel | None = None, number: int = 0) -> None:
         """Use a model from now on. Running decisions finish with the model before.
 
         Args:
             model: a model set or a rival's model.
             signed: the signed file that it comes from, for the archive.
+            number: of its signature.
 
         Raises:
-            BadModel: the model does not fit its robot, or uses the name of another robot that Brakeline ships.
+            BadModel: the model does not fit its robot, or uses the name of another robot that Brakeline ships; or it
+                was signed before the model in use.
             TooLoose: the bound in its validation report is larger than the accepted one.
         """
         robot = model.robot
@@ -70,11 +77,26 @@ class ModelRegistry:
         except UnknownRobot as error:
             raise BadModel(str(error)) from error
         with self._lock:
+            if number < (in_use := self.numbers.get(robot.name, 0)):
+                raise BadModel(
+                    f"{robot.name}: {method.version} was signed before the model in use (number {number}, not above "
+                    f"{in_use}). To go back to it, sign it again: `brakeline keys FOLDER --sign FILE`"
+                )
+            self.numbers[robot.name] = number
             self.filters[model.robot.name] = method
             self.known.add(method.version)
         log.info("%s: model %s in use (%s)", model.robot.name, method.version, type(method).__name__)
         if self.archive is not None:
-            (signed or model).save(archive_path(self.archive, model.robot.name, method.version))
+            self._save(archive_path(self.archive, model.robot.name, method.version), signed or model)
+
+    @staticmethod
+    def _save(path: Path, model: Model | SignedModel) -> None:
+        """Add a model to the archive. If that fails, the service goes on, and says so."""
+        try:
+            model.save(path)
+            write_atomically(path.with_name(IN_USE), path.stem.encode())
+        except OSError as error:
+            log.error("a model is in use but could not be archived, so a restarted service will not use it: %s", error)
 
     def method_for(self, request: pb.Request) -> Method:
         """Return the method for a request. Raises UnknownRobot, NoModel or StaleModel."""
@@ -279,7 +301,8 @@ def main(settings: SafetySettings) -> None:
             if trust is None:
                 models.install(load(path))
             else:
-                models.install(trust.load_model(path), SignedModel.load(path))
+                signed = SignedModel.load(path)
+                models.install(trust.load_model(path), signed, trust.number(signed))
 
         def replace(sample: Sample) -> None:
             try:
@@ -287,11 +310,9 @@ def main(settings: SafetySettings) -> None:
                 if trust is None:
                     raise Untrusted("without keys, a service takes no models over the bus: it cannot check signatures")
                 signed = SignedModel(message.file, message.claim, message.signature)
-                models.install(trust.open(signed, message.robot), signed)
+                models.install(trust.open(signed, message.robot), signed, trust.number(signed))
             except (BadModel, BusError) as error:
                 log.error("a model was refused: %s", error)
-            except OSError as error:
-                log.error("a model is in use but could not be archived: %s", error)
 
         before = perf_counter_ns() * 1e-9, 0.0  # time of the last figures, and the busy time until then [s]
 

@@ -1,17 +1,21 @@
 """Signatures of models: an Ed25519 signature by a key that no process of a run needs, made where the data are.
 
 signer.key          the private key, in the folder of keys of the person who certifies; keep it offline
+signer.last         the number of the last signature by this key
 signers/NAME.json   a public key that a service trusts, and the robots whose models it may sign
 MODEL.seal          beside a model's file: a claim and its signature
 
-The signature covers a claim about the file: its SHA-256, robot, layout and version, and the recorded domain. A service
-checks the signature before it reads anything else of a model.
+The signature covers a claim about the file: its SHA-256, robot, layout and version, the recorded domain, and the number
+of the signature, which orders the models of a robot. A number is the time of signing [ns since the Unix epoch], or one
+more than the number before if the clock was set back. A service checks the signature before it reads anything else of a
+model, and takes no model with a lower number than that of the model in use.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -27,15 +31,17 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from brakeline.errors import Untrusted
+from brakeline.errors import BadModel, Untrusted
 from brakeline.messaging.atomic_files import write_atomically, write_secret
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.methods import Model, decode
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import Array, ModelSet
 from brakeline.safety.model.windows import windows
 
 CONTEXT = b"brakeline model 1\n"  # signed with each claim, so that a signature is valid for nothing else
-KEY, SIGNERS = "signer.key", "signers"
+KEY, LAST, SIGNERS = "signer.key", "signer.last", "signers"
+MOST = 2**63  # numbers of signatures are below
 ANY = "*"  # in a signer's list of robots: it may sign models of all
 
 
@@ -57,7 +63,7 @@ class SignedModel:
     def load(cls, path: Path) -> Self:
         """Read a model's file and its seal. Raises Untrusted if either is missing or not readable."""
         try:
-            seal = json.loads(seal_of(path).read_bytes())
+            seal = parse_json(seal_of(path).read_bytes())
             return cls(path.read_bytes(), str(seal["claim"]).encode(), bytes.fromhex(seal["signature"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise Untrusted(
@@ -73,8 +79,9 @@ def seal_of(path: Path) -> Path:
 class ModelSigner:
     """Signs models with a private key."""
 
-    def __init__(self, key: Ed25519PrivateKey) -> None:
-        self._key = key
+    def __init__(self, key: Ed25519PrivateKey, last: Path) -> None:
+        """last: the file with the number of the last signature."""
+        self._key, self._last = key, last
 
     @classmethod
     def load(cls, folder: Path) -> Self:
@@ -85,7 +92,7 @@ class ModelSigner:
             raise Untrusted(f"{folder / KEY}: no key to sign models with: {error}") from error
         if not isinstance(key, Ed25519PrivateKey):
             raise Untrusted(f"{folder / KEY}: not an Ed25519 key")
-        return cls(key)
+        return cls(key, folder / LAST)
 
     def sign(self, model: Model, data: Dataset | None = None) -> SignedModel:
         """Return a model with a signed claim about it.
@@ -95,7 +102,7 @@ class ModelSigner:
             data: the data set that the model set was made from. Without it, the claim states the model set's domain.
 
         Raises:
-            Untrusted: the model set's domain is larger than the data's.
+            Untrusted: the model set's domain is larger than the data's, or the number of the signature cannot be noted.
         """
         file = model.encode()
         domain = None
@@ -108,9 +115,20 @@ class ModelSigner:
             "version": model.version,
             "sha256": hashlib.sha256(file).hexdigest(),
             "domain": None if domain is None else domain.tolist(),
+            "number": self._next_number(),
         }
         words = json.dumps(claim, sort_keys=True).encode()
         return SignedModel(file, words, self._key.sign(CONTEXT + words))
+
+    def _next_number(self) -> int:
+        """Return the number of the next signature, and note it. Raises Untrusted."""
+        try:
+            last = int(self._last.read_text()) if self._last.exists() else 0
+            number = max(time.time_ns(), last + 1)
+            write_atomically(self._last, str(number).encode())
+        except (OSError, ValueError) as error:
+            raise Untrusted(f"{self._last}: the number of the signature cannot be noted: {error}") from error
+        return number
 
 
 @dataclass(frozen=True)
@@ -125,10 +143,10 @@ class TrustedSigners:
         signers = []
         for path in sorted((folder / SIGNERS).glob("*.json")):
             try:
-                signer = json.loads(path.read_bytes())
+                signer = parse_json(path.read_bytes())
                 key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(signer["key"]))
                 signers.append((key, tuple(map(str, signer["robots"]))))
-            except (ValueError, KeyError, TypeError) as error:
+            except (OSError, ValueError, KeyError, TypeError) as error:
                 raise Untrusted(f"{path}: no signer's public key: {error!r}") from error
         return cls(tuple(signers))
 
@@ -156,8 +174,13 @@ class TrustedSigners:
             if claim[name] != value:
                 raise Untrusted(f"the model's {name} is {value}, but {claim[name]} was signed")
         if isinstance(model, ModelSet):
-            _within(model, np.array(claim["domain"], float))
+            _within(model, _domain_in(claim))
         return model
+
+    def number(self, signed: SignedModel) -> int:
+        """Return the number of the signature. Raises Untrusted if no trusted signer signed the claim."""
+        self._robots_of_signer(signed)
+        return int(_claim(signed)["number"])
 
     def load_model(self, path: Path) -> Model:
         """Return the model in a file with a seal beside it. Raises like `open`, with the file's name."""
@@ -165,6 +188,8 @@ class TrustedSigners:
             return self.open(SignedModel.load(path))
         except Untrusted as error:
             raise Untrusted(f"{path}: {error}") from error
+        except BadModel as error:
+            raise BadModel(f"{path}: {error}") from error
 
     def _robots_of_signer(self, signed: SignedModel) -> tuple[str, ...]:
         """Return the robots whose models the signer may sign. Raises Untrusted if the signer is not trusted."""
@@ -197,15 +222,27 @@ def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = 
 def _claim(signed: SignedModel) -> dict[str, Any]:
     """Return the claim that was signed. Raises Untrusted if it is not readable."""
     try:
-        claim = json.loads(signed.claim)
-        return {name: claim[name] for name in ("robot", "layout", "version", "sha256", "domain")}
-    except (ValueError, KeyError, TypeError) as error:
+        claim = parse_json(signed.claim)
+        known = {name: claim[name] for name in ("robot", "layout", "version", "sha256", "domain")}
+        number = claim.get("number", 0)  # earlier versions wrote none
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise Untrusted(f"the claim about the model can't be read: {error!r}") from error
+    if type(number) is not int or not 0 <= number < MOST:
+        raise Untrusted(f"the number of the signature is {number!r:.40}")
+    return known | {"number": number}
+
+
+def _domain_in(claim: dict[str, Any]) -> Array:
+    """Return the recorded domain that a claim states. Raises Untrusted."""
+    try:
+        return np.array(claim["domain"], float)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise Untrusted(f"the claim does not state the recorded domain: {error}") from error
 
 
 def _within(model: ModelSet, recorded: Array) -> None:
     """Raise Untrusted if a model set's domain is larger than the recorded one (2, regressor_dim)."""
     if recorded.shape != model.domain.shape:
         raise Untrusted("the claim does not state the recorded domain")
-    if (model.domain[0] < recorded[0]).any() or (model.domain[1] > recorded[1]).any():
+    if not ((model.domain[0] >= recorded[0]).all() and (model.domain[1] <= recorded[1]).all()):  # NaN fails too
         raise Untrusted("the model claims a wider domain than was recorded")

@@ -27,7 +27,7 @@ from tests.faults.network_hosts import Hosts
 ROBOTS = ("ground", "quadrotor")
 CUT = (0.3, 6.0)  # s that a cable is out
 PROGRESS = 20  # steps of each robot between two faults
-PATIENCE = 120.0  # s until all goes on after a fault
+PATIENCE = 240.0  # s until all goes on after a fault
 ROUTERS = "the cable between the routers"
 LAST = 300  # steps more, at the end
 

@@ -174,7 +174,7 @@ class Fleet:
         self.close()
 
     def _hear(self, sample: Sample) -> None:
-        self.metrics.add(sample.key, sample.message())
+        self.metrics.add(sample.key, sample.message(), sample.received)
 
     def _prepare(self) -> None:
         keys = self.folder / "keys"

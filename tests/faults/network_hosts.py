@@ -42,6 +42,8 @@ class Hosts:
         self._started: list[subprocess.Popen[bytes]] = []
         self._folder = tempfile.TemporaryDirectory(prefix=self._name)
         self.clock = self._compiled() if self._clocks else None
+        for host, hours in self._clocks.items():
+            self.set_clock(host, hours)
         try:
             self._build()
         except NoHosts:
@@ -74,11 +76,19 @@ class Hosts:
         """Put it in again."""
         ip(f"-n {self._ns('switch')} link set port{host} up")
 
+    def set_clock(self, host: int, hours: float) -> None:
+        """Set a host's clock: `hours` ahead. Processes that run already see the jump."""
+        with self._clock_file(host).open("r+b" if self._clock_file(host).exists() else "wb") as file:
+            file.write(round(3600 * hours).to_bytes(8, "little", signed=True))
+        self._clocks[host] = hours
+
+    def _clock_file(self, host: int) -> Path:
+        return Path(self._folder.name) / f"clock-{host}"
+
     def start(self, host: int, words: list[str], output: Path, **environment: str) -> subprocess.Popen[bytes]:
         """Start a process on a host, with the host's clock; append its output to a file."""
         if self.clock is not None and host in self._clocks:
-            ahead = round(3600 * self._clocks[host])
-            environment |= {"LD_PRELOAD": str(self.clock), "BRAKELINE_AHEAD": str(ahead)}
+            environment |= {"LD_PRELOAD": str(self.clock), "BRAKELINE_AHEAD": str(self._clock_file(host))}
         command, env = ["ip", "netns", "exec", self._ns(host), *words], os.environ | environment
         with output.open("ab") as out:
             popen = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=env)

@@ -242,7 +242,7 @@ def test_lives_of_a_process_that_fell_silent_and_was_started_again() -> None:
         for second in seconds:
             health = pb.Health(process="a", last=second == 13)
             health.header.run, health.header.wall_time = run, BEGIN + second * SECOND
-            timeline.health(health)
+            timeline.health(health, health.header.wall_time)
     lives = [(life.start - BEGIN / 1e9, life.end - BEGIN / 1e9, life.goodbye, life.restart) for life in timeline.lives]
     assert lives == [(0.0, 2.0, False, False), (9.0, 10.0, False, False), (12.0, 13.0, True, True)]
 

@@ -1,10 +1,13 @@
 """The recorder over a real bus, killed, and on a disk that fills up."""
 
 import errno
+import itertools
 import os
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,9 +19,11 @@ from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import open_log, read
 from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.logs.segment import BufferedFile, Entry
+from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, LEARNER, LOG, STEP
+from tests.faults.failing_calls import Died, failing, full
 from tests.logs.conftest import Say, Start
 
 
@@ -138,6 +143,42 @@ def test_recording_survives_a_full_disk_and_resumes(
     assert levels[0] == "INFO" and set(levels[1:]) == {"WARNING"}  # more than one where only a header still fitted
 
 
+@pytest.mark.parametrize("error", [full, Died])
+def test_a_full_disk_or_a_kill_at_any_call_loses_nothing_without_a_word(
+    tmp_path: Path, say: Say, monkeypatch: pytest.MonkeyPatch, error: Callable[[], BaseException]
+) -> None:
+    monkeypatch.setattr("brakeline.logs.recorder.RETRY", 0.0)
+    lines = [say("log/a", pb.LogLine(text=f"line {number}")) for number in range(12)]
+    failed = set()
+    for at in itertools.count():
+        folder = tmp_path / str(at)
+        inbox = Inbox()
+        settings = LogSettings(folder / "run.mcap", rotation=Rotation(mib=1e-4))
+        recording = Recording(settings, inbox)
+        with failing(folder, at, error) as disk, suppress(Died):
+            for line in lines[:3]:
+                inbox.put(line)
+                recording.save()
+        if len(disk.seen) <= at:
+            recording.finish()
+            break
+        failed.add(disk.seen[at])
+        recorded = recording.recorded.total()
+        if error is Died:  # another recorder goes on, with what it hears
+            inbox = Inbox()
+            recording = Recording(settings, inbox)
+        for line in lines[8:]:
+            inbox.put(line)
+        recording.finish()
+        log = open_log(folder)
+        numbers = [record.message.header.sequence for record in log]
+        if error is full:
+            assert numbers[-4:] == [9, 10, 11, 12] and set(numbers) >= {1, 2, 3}, (at, disk.seen)
+        assert numbers == sorted(set(numbers)) and set(range(1, recorded + 1)) <= set(numbers)
+        assert numbers[-4:] == [9, 10, 11, 12]
+    assert {"mkdir", "open", "write"} <= failed
+
+
 def test_a_disk_that_stays_full_is_reported_at_the_end(
     tmp_path: Path, say: Say, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +188,7 @@ def test_a_disk_that_stays_full_is_reported_at_the_end(
     inbox.put(say("log/a", pb.LogLine(text="x")))
     recording.finish()
     assert "could not be recorded" in caplog.text
+    assert inbox.dropped == {"log/a": 1} and not inbox.bytes, "Health says how many"
     assert list(tmp_path.glob("*.mcap")) == []
     assert "No space left" in recording.failure
 

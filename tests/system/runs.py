@@ -94,7 +94,7 @@ class Run:
                 return None
 
         def take(sample: Sample) -> None:
-            self.metrics.add(sample.key, sample.message())
+            self.metrics.add(sample.key, sample.message(), sample.received)
 
         if self._bus is None:
             self._bus = Bus(until(settings, "an endpoint"), "viewer.test")

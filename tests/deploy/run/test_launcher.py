@@ -1,15 +1,25 @@
 """Test the launcher against malformed messages, and its processes against modules in the working directory."""
 
+import io
+import itertools
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from brakeline.deploy.interpreter import spawning
-from brakeline.deploy.run.launcher import Launcher
+from brakeline.deploy.run.display import summary
+from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
-from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode
+from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
 from brakeline.deploy.run.supervisor import SupervisedProcess
+from brakeline.errors import DamagedPart, LaunchError
+from brakeline.learner import checkpoint
+from brakeline.learner.checkpoint import CHECKPOINT
+from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
@@ -79,3 +89,81 @@ def test_processes_do_not_import_modules_of_the_working_directory(
     worker.join(60.0)
     assert worker.exitcode == 0
     assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
+
+
+def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path) -> None:
+    config = RunConfig(method="none")
+    with pytest.raises(LaunchError, match=f"no checkpoint in .*--resume {tmp_path} --from-logs {tmp_path}"):
+        prepare(config, tmp_path, resume=True)
+    root = tmp_path / "learner" / CHECKPOINT
+    checkpoint.save(root, {}, {})
+    prepare(config, tmp_path, resume=True)
+    (root / "000001").rename(tmp_path / "elsewhere")
+    with pytest.raises(DamagedPart, match="latest"):
+        prepare(config, tmp_path, resume=True)
+    prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "\xff", '{"a":' * 100_000, '{"steps": 1e999}', '{"robots": 5}'])
+def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.json").write_bytes(text.encode("latin1"))
+    with pytest.raises(ValueError, match=r"config\.json is no run's configuration"):
+        load(tmp_path / "config.json")
+
+
+def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_path: Path, launcher: Launcher) -> None:
+    """The launcher heard all ten steps; the recorder wrote six, then the disk was full."""
+    launcher._earlier = {tmp_path / "run.mcap"}
+    for name, count in (("run.mcap", 10), ("run_0001.mcap", 4), ("run_0002.mcap", 2)):
+        segment = open_segment(tmp_path / "run.mcap", {})
+        assert segment.path.name == name
+        segment.save([Entry("step/ground/a", pb.Step, b"", 1, 1, number) for number in range(count)])
+        if name == "run_0001.mcap":
+            segment.abandon()  # its recorder was killed: it has no summary
+        else:
+            segment.finish()
+    for number in range(10):
+        say(launcher, STEP, pb.Step(header=pb.Header(sequence=number + 1), actor="a"))
+    notes = {"failure": "[Errno 28] No space left on device"}
+    recorder = pb.Health(header=pb.Header(sequence=7), process="recorder", notes=notes)
+    launcher.metrics.add("health/recorder", recorder, 1)
+    figures = launcher.figures()
+    assert figures["log_messages"] == {"recorded": 6, "missing": 4, "failures": [notes["failure"]]}
+    assert sum(topic["missing"] for topic in figures["topics"].values()) == 6, "of the recorder's signs of life"
+    shown = printed(summary, figures)
+    assert "messages in the log: 6; NOT in the log: 4 ([Errno 28] No space left on device)" in shown
+    (tmp_path / "run_0003.mcap").write_bytes(b"no log at all")
+    (failure,) = launcher.figures()["log_messages"]["failures"][1:]
+    assert "run_0003.mcap is not an MCAP file" in failure
+
+
+def printed(show: Callable[[Console, object], None], figures: object) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    show(console, figures)
+    return console.file.getvalue()
+
+
+def test_steps_that_the_learner_refuses_do_not_count(launcher: Launcher) -> None:
+    """An actor floods: 20 steps that it may take, then thousands beyond its limit, repeated ones and ones gone back."""
+
+    def step(number: int, episode: int = 0, step: int | None = None) -> pb.Step:
+        place = {"index": number, "episode": episode, "step": number if step is None else step}
+        step_ = pb.Step(robot="ground", actor="a", speed=1.0, **place)
+        step_.header.sequence = next(sequence)
+        return step_
+
+    sequence = itertools.count(1)
+    launcher.metrics.add("metrics/ground", pb.LearnerMetrics(robot="ground", limit={"a": 20}), 1)
+    for number in range(1, 21):
+        say(launcher, STEP, step(number))
+    for number in (5, 20):
+        say(launcher, STEP, step(number))
+    for number in range(5000, 9000):
+        say(launcher, STEP, step(number, 1))
+    say(launcher, STEP, step(21, 0, 3))
+    say(launcher, STEP, step(0, 9))
+    figures = launcher.figures()
+    assert (figures["steps"], figures["refused"]) == (20, 4004)
+    assert "4004: repeated, or not permitted by the learner" in printed(summary, figures)
+    say(launcher, STEP, step(21))
+    assert launcher.figures()["steps"] == 21

@@ -1,17 +1,17 @@
 """A run begins with copies of the models in use, and goes on with them when it is resumed."""
 
 import json
-import os
 from dataclasses import replace
 
 import pytest
 
-from brakeline.deploy.data.data_paths import model_path
+from brakeline.deploy.data.data_paths import model_path, note_mode
 from brakeline.deploy.run.launcher import prepare
 from brakeline.deploy.run.processes import CONFIG
 from brakeline.deploy.run.run_config import RunConfig, encode, load
 from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import BadModel, TooLoose
+from brakeline.learner import checkpoint
 from brakeline.safety.model.model_config import AUTO, DIRECT, ONE_STEP
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.robots import GROUND
@@ -19,13 +19,13 @@ from tests.robots import GROUND
 SHIPPED = ModelSet.load("ground")
 
 
-def use(mode: str, factor: float, age: float = 0.0) -> ModelSet:
-    """Put a model set of a mode to use, as old as asked. factor: on its bounds."""
+def use(mode: str, factor: float) -> ModelSet:
+    """Put a model set of a mode to use. factor: on its bounds."""
     first = SHIPPED.steps[0]
     model = replace(SHIPPED, steps=(replace(first, w=factor * first.w), *SHIPPED.steps[1:]))
     path = model_path(GROUND, ModelConfig(mode=mode))
     model.save(path)
-    os.utime(path, (1e9 - age, 1e9 - age))
+    note_mode(GROUND, ModelConfig(mode=mode))
     return model
 
 
@@ -39,6 +39,7 @@ def begun(folder):
     """Return the configuration with which a run in a folder begins, as saved."""
     config = prepare(RunConfig(), folder, resume=False)
     (folder / CONFIG).write_text(encode(config))
+    checkpoint.save(folder / "learner" / checkpoint.CHECKPOINT, {}, {})
     return load(folder / CONFIG)
 
 
@@ -48,8 +49,8 @@ def test_a_run_pins_the_mode_and_the_model_set_that_it_begins_with(folder, capsy
     config = begun(folder)
     assert config.model_config.mode == DIRECT
     assert json.loads((folder / CONFIG).read_text())["model_config"]["mode"] == DIRECT
-    second = use(ONE_STEP, 1.1, age=-10.0)
-    assert model_path(GROUND, ModelConfig(mode=AUTO)) == model_path(GROUND, ModelConfig(mode=ONE_STEP)), "the newer one"
+    second = use(ONE_STEP, 1.1)
+    assert model_path(GROUND, ModelConfig(mode=AUTO)) == model_path(GROUND, ModelConfig(mode=ONE_STEP)), "the last one"
     third = use(DIRECT, 1.2)
     assert len({model.version for model in (first, second, third)}) == 3
     capsys.readouterr()

@@ -1,0 +1,57 @@
+"""No bit of a finished log can be flipped without a word: chunks, metadata, attachments and summary have checksums."""
+
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from brakeline.errors import LogError
+from brakeline.logs.log_length import count_by_key
+from brakeline.logs.mcap_container import MAGIC
+from brakeline.logs.reader import open_log
+from brakeline.logs.segment import Entry, open_segment
+from brakeline.messaging import brakeline_pb2 as pb
+
+KEY = "step/ground/a"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    log = open_segment(tmp_path / "run.mcap", {"run": {"seed": "7"}}, {"model/ground/x": bytes(100)})
+    for number in range(30):
+        step = pb.Step(actor="a", step=number).SerializeToString()
+        log.save([Entry(KEY, pb.Step, step, 10**18 + number, 10**18 + number, number)])
+    log.finish()
+    return log.path
+
+
+def test_a_whole_log_has_no_damage(path: Path) -> None:
+    log = open_log(path)
+    assert len(list(log)) == 30 and log.cuts == []
+    assert count_by_key(path) == {KEY: 30}
+
+
+def test_each_flipped_bit_is_named(path: Path) -> None:
+    whole, random = path.read_bytes(), Random(0)
+    places = [*(random.randrange(len(whole)) for _ in range(150)), whole.index(b"seed"), len(whole) - 1]
+    for place in places:
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << random.randrange(8)]) + whole[place + 1 :])
+        log = open_log(path)
+        try:
+            read = len(list(log))
+        except LogError as error:
+            assert place < len(MAGIC) and "run.mcap" in str(error)
+            continue
+        assert log.cuts and all("run.mcap" in str(cut) for cut in log.cuts), place
+        assert read <= 30
+
+
+def test_counts_by_the_summary_are_right_or_by_the_messages(path: Path) -> None:
+    whole, random = path.read_bytes(), Random(1)
+    summary = whole.rindex(b"seed")
+    for _ in range(40):
+        place = random.randrange(summary, len(whole))
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << random.randrange(8)]) + whole[place + 1 :])
+        assert count_by_key(path)[KEY] <= 30
+    path.write_bytes(whole[:-1])
+    assert count_by_key(path) == {KEY: 30}
