@@ -103,8 +103,9 @@ class FailingFile:
 def failing(folder: Path, at: int, error: Callable[[], BaseException] = Died) -> Iterator[DiskCalls]:
     """Within the block, each change below the folder fails after `at` of them. A full disk can still delete."""
     calls = DiskCalls(folder, at, error, frees_space=error is full)
+    wrapped: dict[str, Any] = {name: calls.wrapped(name) for name in CHANGES}
     with (
-        patch.multiple(os, **{name: calls.wrapped(name) for name in CHANGES}, fdopen=calls.opened(os.fdopen)),
+        patch.multiple(os, **wrapped, fdopen=calls.opened(os.fdopen)),
         patch.object(io, "open", calls.opened(io.open)),
         patch.object(builtins, "open", calls.opened(builtins.open)),
     ):

@@ -180,7 +180,8 @@ def test_a_dangling_link_in_the_archive_is_named_and_nothing_ends(model, keys, t
     assert newest_model(tmp_path, "ground", TrustedSigners.load(keys)) == path
     files = attachments(RunConfig(model_config=ModelConfig()), tmp_path)
     assert any(model.version in name for name in files)
-    assert [gone.name in record.getMessage() for record in caplog.records] == [True, True]
+    named = [record.getMessage() for record in caplog.records if gone.name in record.getMessage()]
+    assert len(named) == 2
 
 
 @pytest.mark.parametrize("domain", [float("nan"), float("inf"), "1", [[1.0], [1.0, 2.0]], {}, 10**400])
@@ -201,6 +202,7 @@ DEEP = b'{"a":' * 200_000
 def test_whatever_is_signed_a_reading_error_is_ours(model: ModelSet, keys: Path, tmp_path: Path) -> None:
     trust, signed = TrustedSigners.load(keys), ModelSigner.load(keys).sign(model)
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
+    assert isinstance(key, Ed25519PrivateKey)
     deep = len(DEEP).to_bytes(8, "little") + DEEP
     for file in (deep, b"", b"\xff" * 9, signed.file[:-1]):
         with pytest.raises(BadModel):
