@@ -4,12 +4,14 @@ everybody finds another router and another replica, the learner moves, and every
 
 from collections import Counter
 from contextlib import suppress
+from subprocess import CalledProcessError
 
 import pytest
 
 from brakeline.learner.checkpoint import exists
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.reader import read
+from tests.faults.campaign import campaign
 from tests.faults.five_hosts import MOVED, Fleet
 from tests.faults.network_hosts import Hosts, NoHosts
 from tests.waiting import until
@@ -78,3 +80,15 @@ def test_hosts_are_cut_off_killed_and_left_and_the_run_ends_with_every_step_coun
     if hosts.clock is not None:
         apart = [r.log_time - r.message.header.wall_time for r in logs[1] if r.key == f"step/ground/{ACTOR}"]
         assert max(apart) * 1e-9 < -11 * 3600.0
+
+
+@pytest.mark.long
+def test_a_slice_of_the_campaign_of_random_faults(data_folder, tmp_path):
+    """The whole is `python -m benchmarks campaign`."""
+    try:
+        figures = campaign(20, 1, tmp_path)
+    except (NoHosts, CalledProcessError) as error:
+        pytest.skip(f"no namespaces or volumes here: {error}")
+    assert figures["faults"]["value"] == 20
+    for name in ("collisions", "damage that nothing named", "figures that were wrong", "legs that did not go on"):
+        assert figures[name]["value"] == 0, (tmp_path / "campaign-1.jsonl").read_text()
