@@ -8,10 +8,14 @@ from subprocess import CalledProcessError
 
 import pytest
 
+from brakeline.deploy.data.data_paths import model_path
 from brakeline.learner.checkpoint import exists
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.reader import read
+from brakeline.messaging.robot import robot_named
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.faults.campaign import campaign
+from tests.faults.chaos import ROBOTS
 from tests.faults.five_hosts import MOVED, Fleet
 from tests.faults.network_hosts import Hosts, NoHosts
 from tests.waiting import until
@@ -83,8 +87,11 @@ def test_hosts_are_cut_off_killed_and_left_and_the_run_ends_with_every_step_coun
 
 
 @pytest.mark.long
-def test_a_slice_of_the_campaign_of_random_faults(data_folder, tmp_path):
+def test_a_slice_of_the_campaign_of_random_faults(tmp_path, monkeypatch):
     """The whole is `python -m benchmarks campaign`."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    for name in ROBOTS:
+        ModelSet.load(name).save(model_path(robot_named(name), ModelConfig()))
     try:
         figures = campaign(20, 1, tmp_path)
     except (NoHosts, CalledProcessError) as error:
