@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.errors import UnknownRobot
+from brakeline.errors import BadInput, UnknownRobot
 
 Array = NDArray[np.float64]
 
@@ -228,6 +228,21 @@ class Robot:
     def zero_input(self) -> Array:
         """Return the input (m,) within the bounds that is closest to zero: the input before the first decision."""
         return np.asarray(np.clip(0.0, self.low(), self.high()))
+
+    def clip_input(self, wanted: Array, before: Array) -> Array:
+        """Return the input (m,) closest to the wanted one within the bounds, and within the slew of the one before.
+
+        >>> robot_named("ground").clip_input(np.array([9.0, 0.0]), before=np.zeros(2))
+        array([0.25, 0.  ])
+
+        Raises:
+            BadInput: the wanted input is not m finite numbers.
+        """
+        wanted = np.asarray(wanted, dtype=np.float64)
+        if wanted.shape != (self.action_dim,) or not np.isfinite(wanted).all():
+            raise BadInput(f"the input of {self.name} must be {self.action_dim} finite numbers, not {wanted!r}")
+        slew = np.asarray(self.action_slew)
+        return np.clip(np.clip(wanted, before - slew, before + slew), self.low(), self.high())
 
     def is_stop_input(self, inputs: Array) -> NDArray[np.bool_]:
         """Return whether inputs (..., m) are zero where a standing robot has zero: (...,)."""

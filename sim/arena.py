@@ -76,19 +76,3 @@ def room_boundary(half_width: float, height: float | None) -> tuple[Obstacle, ..
         *walls,
         *(Obstacle(BOX, (0.0, 0.0, z), size) for z in (-0.5 * SLAB_THICKNESS, height + 0.5 * SLAB_THICKNESS)),
     )
-
-
-def staged_arena(
-    *obstacles: Obstacle,
-    start: tuple[float, ...] = (0.0, 0.0, 0.0),
-    goal: tuple[float, ...] = (4.0, 4.0),
-    half_width: float = 5.0,
-    height: float | None = None,
-) -> Arena:
-    """Return a closed room around the origin with given obstacles, for tests.
-
-    The room is in the plane. With a `height` it is in space: start, goal and obstacles then have three coordinates.
-    """
-    obstacles = (*obstacles, *room_boundary(half_width, height))
-    radius = 0.25 if height is None else 1.0
-    return Arena("staged", obstacles, start, goal, radius, 300, room_bounds(half_width, height))

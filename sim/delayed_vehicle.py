@@ -8,7 +8,7 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle, clip_input
+from brakeline.sim.vehicle import MakeVehicle, Period, Vehicle
 
 
 class DelayedVehicle:
@@ -32,7 +32,7 @@ class DelayedVehicle:
 
     def step(self, input: Array) -> Period:
         """Carry out the input in force for one period, then put the argument (m,), clipped, in force."""
-        following = clip_input(self._robot, input, self.input)
+        following = self._robot.clip_input(input, self.input)
         period = self._vehicle.step(self.input)
         self.input = following
         return period

@@ -16,7 +16,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
 from brakeline.sim.sim_conditions import Conditions
-from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle, clip_input
+from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
 
 GROUND = robot_named("ground")
@@ -104,7 +104,7 @@ class TurtleBot(SimulatedVehicle):
         Raises:
             BadInput: the input is not two finite numbers.
         """
-        self.input = clip_input(GROUND, input, self.input)
+        self.input = GROUND.clip_input(input, self.input)
 
     def begin_period(self, input: Array) -> None:
         """Set the wheels, and begin to record samples."""

@@ -10,7 +10,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import NoiseLevels, cut_normal, heading_of, wrap
-from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
+from brakeline.sim.vehicle import Period, SimulatedVehicle
 
 SAMPLES = 10  # of the position in a period
 SCALE_ERROR = 0.003  # standard deviation of odometry's relative error, constant over an episode
@@ -64,7 +64,7 @@ class PlanarRobot(SimulatedVehicle):
         raise NotImplementedError
 
     def step(self, input: Array) -> Period:
-        self.input = clip_input(self.robot, input, self.input)
+        self.input = self.robot.clip_input(input, self.input)
         before = self.true
         poses, collision = self._run()
         self.true = self._state()

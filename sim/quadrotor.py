@@ -19,7 +19,7 @@ from brakeline.sim.flight_controller import GRAVITY, STILL, FlightController, Ve
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, Quaternion, rotate
 from brakeline.sim.ground_estimator import heading_of
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
-from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
+from brakeline.sim.vehicle import Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
 from brakeline.sim.wind import Wind, WindProcess
 
@@ -90,7 +90,7 @@ class Quadrotor(SimulatedVehicle):
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:
-        self.input = clip_input(QUADROTOR, input, self.input)
+        self.input = QUADROTOR.clip_input(input, self.input)
         x, y, z = self.input.tolist()
         self.controller.setpoint = (x, y, z)
         self.begin_period()

@@ -9,23 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
-
-
-def clip_input(robot: Robot, input: Array, before: Array) -> Array:
-    """Return the input (m,) that a robot executes after `before` (m,): within its bounds and its slew.
-
-    Raises:
-        BadInput: the input is not m finite numbers.
-    """
-    input = np.asarray(input, dtype=np.float64)
-    if input.shape != (robot.action_dim,) or not np.isfinite(input).all():
-        raise BadInput(f"the input of {robot.name} must be {robot.action_dim} finite numbers, not {input!r}")
-    slew = np.asarray(robot.action_slew)
-    return np.clip(np.clip(input, robot.low(), robot.high()), before - slew, before + slew)
 
 
 @dataclass(frozen=True)

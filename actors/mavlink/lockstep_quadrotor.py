@@ -14,7 +14,7 @@ from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, MOTION, SOURCES,
 from brakeline.errors import CommandRefused
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from brakeline.sim.vehicle import Period, clip_input
+from brakeline.sim.vehicle import Period
 
 
 class Endpoint(Protocol):
@@ -51,7 +51,7 @@ class LockstepVehicle(ABC):
             BadInput: the input is not three finite numbers.
             AutopilotGone: the autopilot does not answer.
         """
-        self.input, start = clip_input(self._robot, input, self.input), self.measured[:3]
+        self.input, start = self._robot.clip_input(input, self.input), self.measured[:3]
         self._vehicle.begin_period()
         path = self._fly()
         period = self._vehicle.end_period(self.measured, path - start)

@@ -23,7 +23,7 @@ from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import Period, clip_input
+from brakeline.sim.vehicle import Period
 
 log = logging.getLogger("brakeline.flight")
 
@@ -116,7 +116,7 @@ class MavlinkVehicle(PeriodicVehicle):
         Raises:
             BadInput: an input is not three finite numbers.
         """
-        rows = [clip_input(self._robot, row, row) for row in np.asarray(plan, float)]
+        rows = [self._robot.clip_input(row, row) for row in np.asarray(plan, float)]
         with self._changed:
             in_time = self.current_period.number < number
             if in_time:
@@ -200,7 +200,7 @@ class MavlinkVehicle(PeriodicVehicle):
     def _begin_next(self, now: float) -> None:
         """Begin a period: send its input first, then report on the period before."""
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
-        self._velocity = clip_input(self._robot, following, self.current_period.input)
+        self._velocity = self._robot.clip_input(following, self.current_period.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.current_period.report.measured[:3], self._state(now)

@@ -11,7 +11,7 @@ from brakeline.deploy.commands.command_output import console, errors, print_resu
 from brakeline.deploy.commands.common_options import Json, Robot
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.data.model_store import pretrained
-from brakeline.deploy.data.rival_pretraining import recipe_for
+from brakeline.deploy.data.rival_pretraining import config_for
 from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
@@ -38,9 +38,9 @@ class PretrainCommand:
     def run(self) -> int:
         """Pretrain or tune the method. Returns the exit status."""
         robot = robot_with_task(self.robot)
-        recipe = recipe_for(self.method, robot)
+        config = config_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
-        model = pretrained(robot, self.method, replace(recipe, **changed), again=not self.tune)
+        model = pretrained(robot, self.method, replace(config, **changed), again=not self.tune)
         if self.tune:
             return self._tune(model, robot)
         path = method_path(robot, self.method, ModelConfig())

@@ -26,7 +26,7 @@ from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.pretrained import Pretrained
 
 if TYPE_CHECKING:
-    from brakeline.deploy.data.rival_pretraining import ModelConfig as RivalRecipe
+    from brakeline.deploy.data.rival_pretraining import RivalConfig
 
 M = TypeVar("M")
 
@@ -135,23 +135,23 @@ def method_for(
         raise ValueError(f"there is no method {method!r}; choose one of {', '.join(METHODS)}")
     if robot.late:
         raise ValueError(f"{method} has no real-time mode: its decision is for the period of the request")
-    from brakeline.deploy.data.rival_pretraining import recipe_for
+    from brakeline.deploy.data.rival_pretraining import config_for
 
     robot = needs_task(robot)
-    return pretrained(robot, method, recipe_for(method, robot))
+    return pretrained(robot, method, config_for(method, robot))
 
 
-def pretrained(robot: RobotWithTask, method: str, model_config: RivalRecipe, again: bool = False) -> Pretrained:
+def pretrained(robot: RobotWithTask, method: str, config: RivalConfig, again: bool = False) -> Pretrained:
     """Return a rival's model of this configuration. Pre-train it if the file is missing, or if `again`."""
     path = method_path(robot, method, ModelConfig())
-    build = partial(_pretrain, path, robot, method, model_config)
+    build = partial(_pretrain, path, robot, method, config)
     if again:
         with folder_lock(path.parent):
             return build()
-    return _load_or_build(path, partial(_load_rival, path, model_config), build, f"pre-training {method}")
+    return _load_or_build(path, partial(_load_rival, path, config), build, f"pre-training {method}")
 
 
-def _load_rival(path: Path, model_config: RivalRecipe) -> Pretrained:
+def _load_rival(path: Path, config: RivalConfig) -> Pretrained:
     """Load a rival's model. Raises BadModel if the file is missing, damaged or of another configuration."""
     from brakeline.deploy.data.rival_pretraining import made_by
 
@@ -159,16 +159,16 @@ def _load_rival(path: Path, model_config: RivalRecipe) -> Pretrained:
         model = Pretrained.decode(path.read_bytes())
     except OSError as error:
         raise BadModel(f"{path}: {error}") from error
-    if not made_by(model, model_config):
+    if not made_by(model, config):
         raise BadModel(f"{path} was trained with another configuration")
     return model
 
 
-def _pretrain(path: Path, robot: RobotWithTask, method: str, model_config: RivalRecipe) -> Pretrained:
+def _pretrain(path: Path, robot: RobotWithTask, method: str, config: RivalConfig) -> Pretrained:
     from brakeline.deploy.data.rival_pretraining import pretrain
 
-    with under_way(f"pre-training {method} for {robot.name}", model_config.samples) as advance:
-        model = pretrain(robot, model_config, advance)
+    with under_way(f"pre-training {method} for {robot.name}", config.samples) as advance:
+        model = pretrain(robot, config, advance)
     model.save(path)
     about = model.about
     console.print(

@@ -29,7 +29,7 @@ STANDING = 2  # periods to observe after the input is zero
 
 
 @dataclass(frozen=True)
-class SecasRecipe:
+class SecasConfig:
     """Configuration of SECAS. Dalal et al. use one hidden layer of 10 units, Adam at 1e-4, 1000 random episodes."""
 
     samples: int = 40_000
@@ -40,7 +40,7 @@ class SecasRecipe:
 
 
 @dataclass(frozen=True)
-class SailrRecipe:
+class SailrConfig:
     """Configuration of SAILR. Wagener et al. use three layers of 256, Adam at 1e-3, γ 0.99, smoothing 0.5, η 0.08."""
 
     samples: int = 80_000
@@ -84,8 +84,8 @@ class Costs:
 class _Drive:
     """A running environment that starts a new episode when one ends."""
 
-    def __init__(self, robot: RobotWithTask, recipe: SecasRecipe | SailrRecipe, each: Each) -> None:
-        self._env = environment(robot, recipe.arena, SEED_OFFSET + recipe.seed)
+    def __init__(self, robot: RobotWithTask, config: SecasConfig | SailrConfig, each: Each) -> None:
+        self._env = environment(robot, config.arena, SEED_OFFSET + config.seed)
         self._each, self._episode = each, -1
         self.observation: Any = None
         self.info: dict[str, Any] = {}
@@ -107,13 +107,13 @@ class _Drive:
         return np.asarray(self.info["input_in_force"])
 
 
-def transitions(robot: RobotWithTask, recipe: SecasRecipe, each: Each = lambda: None) -> Transitions:
+def transitions(robot: RobotWithTask, config: SecasConfig, each: Each = lambda: None) -> Transitions:
     """Record `samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
-    drive = _Drive(robot, recipe, each)
-    policy = scripted("random", robot, np.random.default_rng((recipe.seed, 1)))
+    drive = _Drive(robot, config, each)
+    policy = scripted("random", robot, np.random.default_rng((config.seed, 1)))
     constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
-    while len(rows) < recipe.samples:
+    while len(rows) < config.samples:
         drive.ready()
         seen, before = drive.observation, constraints(drive.observation, drive.info["state"])
         executed = drive.step(policy(seen, drive.info)) / robot.high()
@@ -122,14 +122,14 @@ def transitions(robot: RobotWithTask, recipe: SecasRecipe, each: Each = lambda: 
     return Transitions(seen, inputs, changes, drive.collisions)
 
 
-def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) -> Costs:
+def costs(robot: RobotWithTask, config: SailrConfig, each: Each = lambda: None) -> Costs:
     """Record about `samples` steps: repeatedly drive up to `lead` periods, then brake to a stop.
 
     The cost of a step is max(0, 1 − clearance/smoothing), with smoothing in m; after a collision it stays 1. Sums are
     discounted by γ and scaled by 1 − γ (Wagener et al. 2021, appendix D).
     """
-    drive, gamma = _Drive(robot, recipe, each), recipe.gamma
-    rng = np.random.default_rng((recipe.seed, 2))
+    drive, gamma = _Drive(robot, config, each), config.gamma
+    rng = np.random.default_rng((config.seed, 2))
     drivers = [scripted(name, robot, rng) for name in POLICIES]
     braked: list[tuple[Any, float]] = []
     driven: list[tuple[Array, float, Any, bool]] = []
@@ -139,7 +139,7 @@ def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) 
         seen = drive.observation
         pair = np.concatenate([seen, normalised_input(robot, drive.step(action))])
         collided = bool(drive.info["collision"])
-        cost = 1.0 if collided else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / recipe.smoothing)
+        cost = 1.0 if collided else max(0.0, 1.0 - max(drive.info["clearance"], 0.0) / config.smoothing)
         driven.append((pair, (1.0 - gamma) * cost, drive.observation, collided))
         return cost
 
@@ -158,10 +158,10 @@ def costs(robot: RobotWithTask, recipe: SailrRecipe, each: Each = lambda: None) 
             to_go = amount + gamma * to_go
             braked.append((observation, (1.0 - gamma) * to_go))
 
-    while len(driven) < recipe.samples:
+    while len(driven) < config.samples:
         drive.ready()
         policy: Policy = drivers[int(rng.integers(len(drivers)))]
-        for _ in range(int(rng.integers(recipe.lead + 1))):
+        for _ in range(int(rng.integers(config.lead + 1))):
             if not drive.ended:
                 action = policy(drive.observation, drive.info)
                 # Replace half of the actions by random ones, because the critics must rate any action.

@@ -20,13 +20,6 @@ def brake(robot: Robot, before: Array) -> Array:
     return np.where(robot.zero_at_rest, before - np.clip(before, -slew, slew), before)
 
 
-def clip_input(robot: Robot, wanted: Array, before: Array) -> Array:
-    """Return the input (m,) closest to the wanted one within bounds and slew of the input in force."""
-    slew = np.asarray(robot.action_slew)
-    low, high = np.maximum(robot.low(), before - slew), np.minimum(robot.high(), before + slew)
-    return np.asarray(np.minimum(np.maximum(wanted, low), high))
-
-
 def braking_plan(robot: Robot, first: Array) -> Array:
     """Return the plan (N, m): `first`, then μ. Its last input is zero: the horizon suffices to brake from any input."""
     plan = np.zeros((robot.horizon, robot.action_dim))
@@ -41,7 +34,7 @@ def braking_decision(robot: Robot, request: Request, version: str, reason: str, 
     before = request.input_in_force
     return Decision(
         kind=FAILSAFE,
-        plan=braking_plan(robot, clip_input(robot, brake(robot, before), before)),
+        plan=braking_plan(robot, robot.clip_input(brake(robot, before), before)),
         tube_center=np.zeros((0, robot.position_dim)),
         tube_half_width=np.zeros((0, robot.position_dim)),
         predicted=NO_PREDICTION,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
+from brakeline.safety.filter.braking import braking_decision, braking_plan
 from brakeline.safety.filter.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SAILR as SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -66,7 +66,7 @@ class Sailr:
         check_for_rival(robot, request, self.observed)
         if not request.finite:
             return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = clip_input(robot, request.action, request.input_in_force)
+        proposal = robot.clip_input(request.action, request.input_in_force)
         advantage = self.advantage(request.observation, proposal)
         if advantage > self.threshold:
             reason = f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}"

@@ -23,7 +23,7 @@ from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
+from brakeline.safety.filter.braking import braking_decision, braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.model.model_config import SECAS as SECAS
@@ -148,19 +148,19 @@ class Secas:
         check_for_rival(robot, request, self.observed)
         if not request.finite:
             return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = clip_input(robot, request.action, request.input_in_force)
+        proposal = robot.clip_input(request.action, request.input_in_force)
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c
         action, solver, iterations, solve_ns = proposal, "", 0, 0
         r = proposal / self.scale
         if (G @ r - d > TOLERANCE).any():
-            corrected = clip_input(robot, closed_form(r, G, d) * self.scale, request.input_in_force)
+            corrected = robot.clip_input(closed_form(r, G, d) * self.scale, request.input_in_force)
             if (G @ (corrected / self.scale) - d > TOLERANCE).any():  # several are active, or a bound is
                 before = perf_counter_ns()
                 low, high = self._bounds(request.input_in_force)
                 a, solver, iterations = quadratic(r, G, d, low, high)
                 solve_ns = perf_counter_ns() - before
-                corrected = clip_input(robot, a * self.scale, request.input_in_force)
+                corrected = robot.clip_input(a * self.scale, request.input_in_force)
             action = corrected
         worst = float((d - G @ (action / self.scale)).min())
         changed = bool((np.abs(action - proposal) > TOLERANCE * self.scale).any())
@@ -185,4 +185,4 @@ class Secas:
     def _bounds(self, before: Array) -> tuple[Array, Array]:
         """Return the lowest and the highest scaled input that the slew allows after the one in force."""
         robot = self.robot
-        return clip_input(robot, robot.low(), before) / self.scale, clip_input(robot, robot.high(), before) / self.scale
+        return robot.clip_input(robot.low(), before) / self.scale, robot.clip_input(robot.high(), before) / self.scale

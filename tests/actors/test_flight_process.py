@@ -10,11 +10,12 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.errors import TakeoffNotVerified
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.safety.model.model_config import ModelConfig
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
 from tests.accepting import BOUND
+from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
 
 

@@ -13,13 +13,14 @@ from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.errors import BadInput, CommandRefused, NoAutopilot
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
 
 RULES = ("px4", "ardupilot")

@@ -27,12 +27,13 @@ from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.validation import ValidationReport
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Vehicle
 from tests.accepting import BOUND
+from tests.arenas import staged_arena
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")

@@ -13,7 +13,7 @@ from brakeline.logs.decision_view import body_discs, decision_view
 from brakeline.logs.watch.dashboard import RobotPanel
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import robot_named
-from brakeline.sim.arena import staged_arena
+from tests.arenas import staged_arena
 from tests.browser import CHROMIUM, Page
 from tests.robots import GROUND
 

@@ -13,9 +13,9 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import BeamTracks
 from brakeline.messaging.sensor_messages import scan_message, scan_of
 from brakeline.safety.perception.displayed_map import map_for_display, reserved_boxes
-from brakeline.sim.arena import staged_arena
 from brakeline.sim.range_sensors import FanScanner
 from brakeline.sim.sim_conditions import Perception
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 

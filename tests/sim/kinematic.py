@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from brakeline.sim.arena import Arena
-from brakeline.sim.vehicle import Period, SimulatedVehicle, clip_input
+from brakeline.sim.vehicle import Period, SimulatedVehicle
 from tests.robots import QUADROTOR
 
 LAG = 0.2  # s
@@ -31,7 +31,7 @@ class PointMass(SimulatedVehicle):
         return self.true + self._rng.uniform(-bound, bound)
 
     def step(self, input: np.ndarray) -> Period:
-        self.input = clip_input(QUADROTOR, input, self.input)
+        self.input = QUADROTOR.clip_input(input, self.input)
         start, path = self.measured[:3], np.empty((self.samples, 3))
         position, velocity = self.true[:3], self.true[3:6]
         time = QUADROTOR.period / self.samples

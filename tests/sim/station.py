@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import LandedState
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
+from tests.arenas import staged_arena
 
 LOCAL, BODY, BODY_OFFSET = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_OFFSET_NED
 VELOCITY, VELOCITY_YAW, VELOCITY_RATE = 0x0DC7, 0x09C7, 0x05C7

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from brakeline.errors import BadInput
-from brakeline.sim.arena import staged_arena
 from brakeline.sim.arena_generator import arena_kind, draw_arena, goal_sequence
 from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.quadrotor_policies import QuadrotorRoutePolicy
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()

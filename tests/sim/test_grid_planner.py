@@ -10,9 +10,10 @@ from scipy.ndimage import label
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.grid_planner import Routes
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 

@@ -9,11 +9,11 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena import staged_arena as room
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.vehicle import Period
+from tests.arenas import staged_arena as room
 from tests.robots import GROUND
 
 QUIET = NoiseLevels(scale=0.0)

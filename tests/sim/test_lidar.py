@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.mujoco_obstacles import map_model
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays

@@ -6,9 +6,10 @@ import pytest
 
 from brakeline.messaging.obstacle import SPHERE, Obstacle
 from brakeline.messaging.robot import Robot
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 REACH = 3.0  # m

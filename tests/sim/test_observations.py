@@ -8,11 +8,12 @@ from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
-from brakeline.sim.arena import same_room, staged_arena
+from brakeline.sim.arena import same_room
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.traffic import Crowd
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 RNG = np.random.default_rng(0)

@@ -8,11 +8,12 @@ import pytest
 
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.flight_controller import FlightController, VelocityAxis
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import MODEL, SAMPLES, Quadrotor
 from brakeline.sim.wind import Wind, WindProcess
+from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
 
 QUIET = QuadrotorNoise(scale=0.0)

@@ -11,11 +11,12 @@ import pytest
 from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.task import RobotWithTask
-from brakeline.sim.arena import Arena, staged_arena
+from brakeline.sim.arena import Arena
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.quadrotor_policies import QuadrotorCarefulPolicy, QuadrotorRoutePolicy, StopPrediction, full_speed
 from brakeline.sim.scripted_policies import scripted
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.kinematic import PointMass
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from brakeline.errors import NoFleet
-from brakeline.sim.arena import same_room, staged_arena
+from brakeline.sim.arena import same_room
 from brakeline.sim.arena_generator import draw_fleet
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv, GroundWorld
 from brakeline.sim.sim_conditions import Conditions, Perception
+from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 AHEAD = np.array([0.25, 0.0])

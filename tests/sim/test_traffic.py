@@ -7,13 +7,14 @@ import pytest
 
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.sim.arena import room_boundary, staged_arena
+from brakeline.sim.arena import room_boundary
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.quadrotor import Quadrotor
 from brakeline.sim.traffic import Crowd, CrowdSensor, MoverKind
+from tests.arenas import staged_arena
 from tests.robots import GROUND
 
 KIND = MoverKind(count=(4, 4), radius=0.2, speed=1.2, acceleration=1.0, keep=1.0)

@@ -13,7 +13,7 @@ from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP
 from brakeline.safety.model.windows import PLAN, windows
 from brakeline.sim.quadrotor import SAMPLES
-from brakeline.sim.vehicle import Period, clip_input
+from brakeline.sim.vehicle import Period
 from tests.robots import QUADROTOR
 
 LATE = QUADROTOR.in_real_time()
@@ -32,7 +32,7 @@ class Sluggish:
         self.current_period = ControlPeriod(0, np.zeros(3), self._report(np.zeros((SAMPLES, 3))))
 
     def commit(self, plan: np.ndarray, number: int) -> bool:
-        self.plan = [clip_input(QUADROTOR, row, row) for row in plan]
+        self.plan = [QUADROTOR.clip_input(row, row) for row in plan]
         return True
 
     def wait(self, number: int) -> ControlPeriod:
@@ -53,7 +53,7 @@ class Sluggish:
         following = self.plan.pop(0) if self.plan else np.zeros(3)
         self.current_period = ControlPeriod(
             self.current_period.number + 1,
-            clip_input(QUADROTOR, following, self.current_period.input),
+            QUADROTOR.clip_input(following, self.current_period.input),
             self._report(np.array(path)),
         )
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.rival_pretraining import RECIPES, SailrRecipe, SecasRecipe, made_by, pretrain
+from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
@@ -11,7 +11,7 @@ from tests.robots import GROUND
 
 
 def test_transitions_are_whole_scaled_and_the_same_again():
-    one, same, other = (transitions(GROUND, SecasRecipe(samples=400, seed=seed)) for seed in (1, 1, 2))
+    one, same, other = (transitions(GROUND, SecasConfig(samples=400, seed=seed)) for seed in (1, 1, 2))
     assert one.observation.shape == (400, 26) and one.action.shape == (400, 2) and one.change.shape == (400, 6)
     assert np.array_equal(one.change, same.change) and not np.array_equal(one.change, other.change)
     assert (np.abs(one.action) <= 1.0).all() and (one.action[:, 0] >= 0).all()
@@ -20,7 +20,7 @@ def test_transitions_are_whole_scaled_and_the_same_again():
 
 
 def test_costs_are_of_braking_to_the_end():
-    found = costs(GROUND, SailrRecipe(samples=3000, seed=1))
+    found = costs(GROUND, SailrConfig(samples=3000, seed=1))
     assert found.collisions > 0 and found.collided.sum() == found.collisions
     for cost in (found.braked_cost, found.step_cost):
         assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()
@@ -30,12 +30,12 @@ def test_costs_are_of_braking_to_the_end():
     assert len(found.braked) == len(found.braked_cost) > 500
 
 
-@pytest.mark.parametrize("recipe", [SecasRecipe, SailrRecipe])
-def test_a_pretrained_model_says_what_it_cost(recipe):
-    how = recipe(samples=300, fit=FitConfig(hidden=(8,), epochs=1, batch=32))
+@pytest.mark.parametrize("config_class", [SecasConfig, SailrConfig])
+def test_a_pretrained_model_says_what_it_cost(config_class):
+    config = config_class(samples=300, fit=FitConfig(hidden=(8,), epochs=1, batch=32))
     driven = []
-    model = pretrain(GROUND, how, lambda: driven.append(1))
+    model = pretrain(GROUND, config, lambda: driven.append(1))
     assert len(driven) >= 300 and ready(model).robot is GROUND
     assert model.about["samples"] == "300" and int(model.about["collisions"]) >= 0 and model.about["error"]
-    assert made_by(model, how) and not made_by(model, recipe())
-    assert type(how) is RECIPES[model.method]
+    assert made_by(model, config) and not made_by(model, config_class())
+    assert type(config) is CONFIGS[model.method]

@@ -34,15 +34,15 @@ def rivals(data_folder):
     """Rivals that know next to nothing, made in seconds."""
     little = {"samples": 300, "fit": FitConfig(hidden=(8, 8), epochs=1, batch=32)}
     made = {
-        "secas": partial(rival_pretraining.SecasRecipe, **little),
-        "sailr": partial(rival_pretraining.SailrRecipe, **little),
+        "secas": partial(rival_pretraining.SecasConfig, **little),
+        "sailr": partial(rival_pretraining.SailrConfig, **little),
     }
-    before = dict(rival_pretraining.RECIPES)
-    rival_pretraining.RECIPES.update(made)
+    before = dict(rival_pretraining.CONFIGS)
+    rival_pretraining.CONFIGS.update(made)
     for method in made:
         model_store.method_for(GROUND, method, ModelConfig())
     yield made
-    rival_pretraining.RECIPES.update(before)
+    rival_pretraining.CONFIGS.update(before)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """How a rival's threshold is chosen: by what came of it in closed loop, not by what the model was stored with."""
 
-from brakeline.deploy.data.rival_pretraining import SailrRecipe, SecasRecipe, pretrain, recipe_for
+from brakeline.deploy.data.rival_pretraining import SailrConfig, SecasConfig, config_for, pretrain
 from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
 from brakeline.learner.rival_networks import FitConfig
 from tests.robots import GROUND, QUADROTOR
@@ -19,7 +19,7 @@ def test_safety_counts_among_those_that_cost_the_oracle_nothing():
 
 
 def test_a_threshold_that_never_steps_in_and_one_that_always_does():
-    model = pretrain(GROUND, SailrRecipe(**LITTLE))
+    model = pretrain(GROUND, SailrConfig(**LITTLE))
     told = []
     never, always = tune_threshold(model, GROUND, (1.0, -1.0), 3, told.append)
     assert told == [never, always]
@@ -28,8 +28,8 @@ def test_a_threshold_that_never_steps_in_and_one_that_always_does():
 
 
 def test_each_robot_has_values_of_its_own():
-    model = pretrain(GROUND, SecasRecipe(**LITTLE))
+    model = pretrain(GROUND, SecasConfig(**LITTLE))
     assert max(values_for(model, GROUND)) <= GROUND.footprint
     for method in ("secas", "sailr"):
         for robot in (GROUND, QUADROTOR):
-            assert recipe_for(method, robot).samples > 1000
+            assert config_for(method, robot).samples > 1000

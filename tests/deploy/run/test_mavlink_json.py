@@ -17,9 +17,9 @@ from brakeline.logs.recorder import Inbox, LogSettings, Recording
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import FRAMES, LOG
-from brakeline.sim.arena import staged_arena
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.quadrotor import Quadrotor
+from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
 
 
