@@ -23,6 +23,11 @@ UNVERIFIED = "unverified"  # in place of a version: no model set verified the co
 class Prediction:
     """The predicted set of the next measured state: |state - center| <= half_width, in the frame of `heading`.
 
+    >>> from brakeline import robot_named
+    >>> box = Prediction(center=np.zeros(5), half_width=np.full(5, 0.1), heading=0.0)
+    >>> box.contains(robot_named("ground"), np.array([0.05, 0.0, 0.0, 0.0, 0.0]))
+    True
+
     Attributes:
         center, half_width (n,): the position in center is in the world; its box is turned by heading [rad].
     """
@@ -49,6 +54,14 @@ class BackupPlan:
 
     `accept` takes the plan of a decision, `fallback` goes on with the plan when no decision came. Both return the input
     to execute; for a robot in real time, the input of the next period.
+
+    >>> from brakeline import robot_named
+    >>> backup_plan = BackupPlan(robot_named("ground"))
+    >>> brake = np.array([[0.2, 0.0], [0.1, 0.0], [0.0, 0.0]])
+    >>> backup_plan.accept(brake, model="f3c1", predicted=None, verified=True).tolist()
+    [0.2, 0.0]
+    >>> backup_plan.fallback().tolist()
+    [0.1, 0.0]
 
     Attributes:
         plan (N, m): rest of the plan. Its first row is what to execute without a better answer; in real time, the input

@@ -40,6 +40,13 @@ Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]] 
 class Request:
     """A request: what the filter must know to decide on one input.
 
+    >>> from brakeline import Filter, Obstacle
+    >>> ground = Filter.load("ground")
+    >>> stand, wall = np.zeros((ground.robot.horizon, 2)), Shapes.of([Obstacle("box", (0.25, 0.0), (0.2, 2.0))], dim=2)
+    >>> request = Request(state=np.zeros(5), action=[0.25, 0.0], input_in_force=stand[0], plan=stand, obstacles=wall)
+    >>> ground.decide(request).kind
+    'adjusted'
+
     Attributes:
         state (n,): measured state.
         action (m,): proposal.
@@ -97,6 +104,11 @@ class Request:
 @dataclass(frozen=True)
 class Decision:
     """The answer to a request.
+
+    >>> from brakeline import Filter, InProcess
+    >>> decision = InProcess(Filter.load("ground")).decide(state=[0, 0, 0, 0, 0], action=[0.2, 0], known_free=True)
+    >>> decision.kind, decision.verified, decision.plan.tolist()
+    ('allowed', True, [[0.2, 0.0], [0.0, 0.0], [0.0, 0.0]])
 
     Attributes:
         kind: allowed, adjusted, failsafe or recovering (never verified).

@@ -30,6 +30,11 @@ RESTLESS = "restless"  # entry in `about`: the number of restless trajectories, 
 class Trajectory:
     """One uninterrupted recording of T periods. Two trajectories are equal only if they are the same object.
 
+    >>> states, inputs = np.zeros((4, 5)), np.zeros((3, 2))
+    >>> standing = Trajectory(states, inputs, paths=np.zeros((3, 1, 2)), turned=np.zeros(3))
+    >>> len(standing.inputs)
+    3
+
     Attributes:
         states (T+1, n): measured states.
         inputs (T, m): executed inputs.
@@ -51,6 +56,10 @@ class Trajectory:
 @dataclass(frozen=True)
 class Dataset:
     """Recorded trajectories of one robot.
+
+    >>> data = Dataset.load(RECORDING)  # a file of `brakeline collect` or `brakeline import`
+    >>> data.robot.name, data.periods > 10_000
+    ('ground', True)
 
     Attributes:
         robot: the robot's description.

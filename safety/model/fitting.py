@@ -45,6 +45,10 @@ MOST_ATOMS = 120_000  # rows of W of a matrix zonotope, over the horizon: the ex
 def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
     """Fit a model set: one half of the trajectories fits C, the other half bounds the error.
 
+    >>> from brakeline import Dataset
+    >>> fit_model_set(Dataset.load(RECORDING), ModelConfig())  # a file of `brakeline collect` or `brakeline import`
+    ModelSet('ground', residual, direct, version '...', no bound stated)
+
     Raises:
         BadData: a check of the data failed.
         ErrorBoundError: the data do not support this kind of error bound.

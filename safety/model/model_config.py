@@ -22,7 +22,11 @@ MOST_OUTSIDE = 0.1  # of the windows: sets that more leave promise nothing
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The settings with which a model set is fitted to a data set (docs/method.md §1)."""
+    """The settings with which a model set is fitted to a data set (docs/method.md §1).
+
+    >>> ModelConfig(mode="one-step", windows="free").of_minutes().inflation
+    1.5
+    """
 
     certificate: str = RESIDUAL
     mode: str = DIRECT

@@ -77,6 +77,12 @@ class ValidationReport:
 
     The windows do not overlap, and each includes at least one recorded period after its stop. A window is a violation
     if any part of it is outside its predicted set.
+
+    >>> from brakeline import Dataset, ModelConfig, fit_model_set
+    >>> fitted, held_out = Dataset.load(RECORDING).split((0.7, 0.3))
+    >>> report = validate(fit_model_set(fitted, ModelConfig()), fitted, held_out)
+    >>> report.violations / report.windows < report.bound_plan
+    True
     """
 
     certificate: str
@@ -142,7 +148,13 @@ def most_violations(count: int, limit: float) -> int:
 
 
 def validate(model: ModelSet, fitted: Dataset, held_out: Dataset) -> ValidationReport:
-    """Validate a model set fitted to `fitted` on the trajectories of `held_out`."""
+    """Validate a model set fitted to `fitted` on the trajectories of `held_out`.
+
+    >>> from brakeline import Dataset, ModelConfig, fit_model_set
+    >>> fitted, held_out = Dataset.load(RECORDING).split((0.7, 0.3))
+    >>> validate(fit_model_set(fitted, ModelConfig()), fitted, held_out).windows > 300
+    True
+    """
     return validate_plans(model, fitted, held_out)[0]
 
 

@@ -185,6 +185,10 @@ class SafetyClient(BusClient):
 
     Use a client in one thread at a time. With several robots, use one client for each, or a `FleetClient` for robots
     that share a world.
+
+    >>> with SafetyClient.open(ENDPOINT, "ground", deadline=5.0) as safety:  # of `brakeline safety ground --listen …`
+    ...     safety.decide([0, 0, 0, 0, 0], [0.25, 0], [Obstacle("cylinder", (0.4, 0.0), (0.1,))]).kind
+    'allowed'
     """
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE) -> None:

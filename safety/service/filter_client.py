@@ -30,6 +30,11 @@ Array = NDArray[np.float64]
 class Answer(Decision):
     """A decision as a client returns it.
 
+    >>> from brakeline import Filter, InProcess
+    >>> answer = InProcess(Filter.load("ground")).decide(state=[0, 0, 0, 0, 0], action=[0.2, 0], known_free=True)
+    >>> answer.kind, answer.action.tolist()
+    ('allowed', [0.2, 0.0])
+
     Attributes:
         action: (m,) the input to execute next. This is the plan's first row. For a late robot it is the second row,
             because the first row is in force already.
@@ -51,7 +56,12 @@ class Answer(Decision):
 
 @runtime_checkable
 class FilterClient(Protocol):
-    """Requests decisions about one robot, and keeps its backup plan between two requests."""
+    """Requests decisions about one robot, and keeps its backup plan between two requests.
+
+    >>> from brakeline import Filter, InProcess
+    >>> isinstance(InProcess(Filter.load("ground")), FilterClient)
+    True
+    """
 
     @property
     def robot(self) -> Robot: ...

@@ -35,6 +35,11 @@ class FleetClient(BusClient):
 
     Each period, call `decide` once, or `fallback` if that raised. The robots stand still at the start. Use a client in
     one thread at a time.
+
+    >>> with FleetClient.open(ENDPOINT, "ground", ["left", "right"], deadline=5.0) as fleet:
+    ...     answers = fleet.decide([[0, 1, 0, 0, 0], [0, -1, 0, 0, 0]], [[0.25, 0], [0.25, 0]], known_free=True)
+    >>> [answer.kind for answer in answers]
+    ['allowed', 'allowed']
     """
 
     def __init__(self, bus: Bus, robot: Robot | str, names: Sequence[str], deadline: float = DEADLINE) -> None:
