@@ -30,9 +30,15 @@ class FlightSettings:
     """The autopilot of a flight, and how to fly it."""
 
     url: str
-    system: int = 1  # MAVLink system id
-    truth: int = 0  # UDP port to which a simulator sends the ground truth; 0: none does
-    height: float = 3.0  # m above the ground to climb to, unless the vehicle flies already
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, start of the autopilot's local frame in the world frame
-    raise_limits: bool = False  # raise the autopilot's parameters that are below the robot's bounds
-    lead: bool = False  # send positions ahead of the vehicle instead of velocities
+    system: int = 1
+    """Address the vehicle by this MAVLink system id."""
+    truth: int = 0
+    """Receive the ground truth of a simulator at this UDP port. 0 expects none."""
+    height: float = 3.0
+    """Climb to this height above the ground, unless the vehicle flies already [m]."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place the start of the autopilot's local frame here in the world frame [m]."""
+    raise_limits: bool = False
+    """Raise the autopilot's parameters that are below the robot's bounds."""
+    lead: bool = False
+    """Send positions ahead of the vehicle instead of velocities."""

@@ -47,28 +47,28 @@ class Bench:
     """Run the named benchmarks, or every one that needs neither root nor a quarter of an hour."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Benchmarks to run. Defaults to all but those that run only when you name them."""
+    """Run these benchmarks. By default, all run except those that you have to name."""
     json: bool = False
     """Print one JSON object on stdout."""
     seed: int = 0
-    """Seed of chaos, campaign, cuts and fuzz."""
+    """Draw the faults of chaos, campaign and cuts, and the messages of fuzz, from this seed."""
     kills: int = 100
-    """Faults of chaos and campaign."""
+    """Cause this many faults in chaos and campaign."""
     faults: int = 60
-    """Faults of cuts."""
+    """Cause this many faults in cuts."""
     delay: float = 0.0
-    """Delay of chaos, each way between actors and routers [s]."""
+    """Delay the messages between actors and routers of chaos by this time, each way [s]."""
     messages: int = 1_000_000
-    """Messages of fuzz."""
+    """Send this many messages in fuzz."""
     plans: int = driving_groups.PLANS
-    """Plans of each group of groups."""
+    """Drive this many plans of each group in groups."""
     rate: int = crowd.JUNK
-    """Junk messages of each sender of crowd [1/s]."""
+    """Let each sender of crowd send this many junk messages a second."""
     minutes: float = 10.0
-    """Duration of flights, of each policy in each arena [min]."""
+    """Fly each policy of flights for this long in each arena [min]."""
     folder: Path = Path("runs/flights")
-    """Folder of the data, logs and figures of flights, upsets, cuts and campaign. What it has already is not done
-    again."""
+    """Store the data, logs and figures of flights, upsets, cuts and campaign here. What the folder has is not
+    repeated."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def overview() -> str:
     lines = []
     for name, one in BENCHMARKS.items():
         what = (one.module.__doc__ or "").partition("\n\n")[0].replace("\n", " ")
-        lines.append(f"  {name}: {what}{' (only when named)' if one.named else ''}")
+        lines.append(f"  {name}: {what}{' Runs only if you name it.' if one.named else ''}")
     examples = "  python -m benchmarks decide --json\n  python -m benchmarks chaos --kills 30 --seed 1"
     return "\n".join([Bench.__doc__ or "", "", *lines, "", "examples:", examples])
 

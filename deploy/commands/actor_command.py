@@ -22,31 +22,30 @@ class ActorCommand:
     filtering: options.Unprefixed[options.FilterOptions] = field(default_factory=options.FilterOptions)
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     name: str = f"actor-{os.uname().nodename.split('.')[0]}"
-    """Name of the actor on the bus. Each actor of a run needs its own."""
+    """Give the actor this name on the bus. Each actor of a run needs its own."""
     number: int = 0
-    """Number of the first robot of this process in the run. Robots with the same number and seed see the same
+    """Count the robots of this process from this number on. Robots with the same number and seed see the same
     episodes."""
     robots: int = 1
-    """Robots in this process. They share one request to the safety service."""
+    """Run this many robots in this process. They share one request to the safety service."""
     fleet: int = 0
-    """Robots in this process that share one world and avoid each other. 0 gives each robot a world of its own."""
+    """Run this many robots that share one world and avoid each other. 0 gives each robot a world of its own."""
     seed: options.Seed = 0
     arena: options.ArenaName = "default"
     penalty: float = RunConfig.penalty
-    """Penalty subtracted from the learned reward for a correction by the whole range of an input."""
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input."""
     deadline: float = RunConfig.deadline
-    """Time that the actor waits for an answer of the safety service [s]. Then the robot brakes along its backup plan.
-    """
+    """Wait this long for an answer of the safety service [s]. Then the robot brakes along its backup plan."""
     policy: str = ""
-    """Policy to follow: trained, untrained, random, greedy, adversary, astar, careful, a weights file, or a CSV file of
-    inputs as `brakeline excite` prints them. Defaults to the weights that a learner publishes."""
+    """Follow this policy: trained, untrained, random, greedy, adversary, astar, careful, a weights file, or a CSV file
+    of inputs as `brakeline excite` prints them. Defaults to the weights that a learner publishes."""
     steps: int = 0
-    """With --policy: number of steps. 0 runs until you press ^C."""
+    """With --policy, take this number of steps. 0 runs until you press ^C."""
     mavlink: bool = False
     """Log each MAVLink frame of simulated quadrotors too. With --url the actor always logs them."""
     url: str = ""
-    """Link to a vehicle to fly in real time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The map is the arena
-    drawn with the seed. The safety service must serve quadrotor-late."""
+    """Fly the vehicle behind this link in real time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The map is the
+    arena drawn with the seed. The safety service must serve quadrotor-late."""
     flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
 
     def run(self) -> int:

@@ -27,7 +27,7 @@ class AnalyseCommand:
     episode: int | None = None
     """Show each step of the episode with this number, of each actor."""
     actor: str | None = None
-    """With --episode: show the episode of this actor only."""
+    """With --episode, show the episode of this actor only."""
     verbose: bool = False
     """Show also the conditions of the run: sensor errors, model sets and versions."""
     json: Json = False

@@ -25,39 +25,39 @@ class AutopilotCommand:
     """The options of `brakeline autopilot`."""
 
     url: str = "udpout:127.0.0.1:14540"
-    """Link to serve MAVLink on: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT. PX4's simulator sends to UDP port
-    14540; ArduPilot's listens on TCP port 5760."""
+    """Serve MAVLink on this link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT. PX4's simulator sends to UDP
+    port 14540; ArduPilot's listens on TCP port 5760."""
     rules: Literal["px4", "ardupilot"] = "px4"
-    """Rules of the autopilot: its modes, refusals and parameters."""
+    """Follow the rules of this autopilot: its modes, refusals and parameters."""
     vehicles: int = 1
-    """Number of vehicles, with system ids 1, 2, … They pass through each other."""
+    """Simulate this many vehicles, with system ids 1, 2, … They pass through each other."""
     arena: str = ""
-    """Arena of the quadrotor, drawn with the seed. Defaults to an open field."""
+    """Fly in this arena of the quadrotor, drawn with the seed. Defaults to an open field."""
     seed: Seed = 0
     airborne: bool = False
     """Start armed and hovering at the arena's start, instead of on the ground below it."""
     setpoint_timeout: float | None = None
-    """Time without a setpoint after which the autopilot brakes [s]. Defaults to the parameter of --rules: 1 s for px4,
-    3 s for ardupilot."""
+    """Brake after this time without a setpoint [s]. Defaults to the parameter of --rules: 1 s for px4, 3 s for
+    ardupilot."""
     wind: float = 0.0
-    """Mean wind speed [m/s]. Its direction is drawn with the seed."""
+    """Blow with this mean wind speed [m/s]. The seed draws its direction."""
     gust: float = 0.0
-    """Standard deviation of the wind on each axis [m/s]."""
+    """Let the wind vary on each axis with this standard deviation [m/s]."""
     truth: str = "127.0.0.1:14600"
-    """HOST:PORT to send true states and collisions to, as JSON in UDP datagrams. Empty sends none."""
+    """Send true states and collisions to this HOST:PORT, as JSON in UDP datagrams. Empty sends none."""
     seconds: float = 0.0
-    """Duration [s]. 0 runs until you press ^C."""
+    """Run for this long [s]. 0 runs until you press ^C."""
     px4: Path | None = None
-    """Folder of a PX4 that you built for SITL. It flies the simulated vehicle in lockstep, with its own rules and
-    estimator."""
+    """Fly the simulated vehicle in lockstep with the PX4 in this folder, which you built for SITL. It has its own rules
+    and estimator."""
     speed: float = 1.0
-    """With --px4: speed as a multiple of real time. 0 runs as fast as possible."""
+    """With --px4, run at this multiple of real time. 0 runs as fast as possible."""
     sensors: float = SensorNoise.scale
-    """With --px4: factor on the errors of IMU, magnetometer, barometer and GPS."""
+    """With --px4, scale the errors of IMU, magnetometer, barometer and GPS by this factor."""
     gps: float = SensorNoise.gps_position
-    """With --px4: standard deviation of the GPS position on each axis [m]."""
+    """With --px4, set the standard deviation of the GPS position on each axis [m]."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """With --px4: parameters to set, as NAME VALUE NAME VALUE ..."""
+    """With --px4, set these parameters, as NAME VALUE NAME VALUE ..."""
     json: Json = False
 
     def run(self) -> int:

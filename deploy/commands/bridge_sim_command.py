@@ -29,18 +29,18 @@ class BridgeSimCommand:
     sim_time: bool = False
     """Publish simulated time on /clock, instead of using the time of this machine."""
     factor: float = 1.0
-    """With --sim-time: highest speed, as a multiple of real time. 0 runs as fast as possible."""
+    """With --sim-time, run at most at this multiple of real time. 0 runs as fast as possible."""
     lockstep: bool = False
-    """With --sim-time: wait in each control period for its command, so that no command is late on a busy machine."""
+    """With --sim-time, wait in each control period for its command, so that no command is late on a busy machine."""
     timeout: float = BridgeSettings.timeout
-    """Time without a command after which the base stops [s]."""
+    """Stop the base after this time without a command [s]."""
     stamped: bool = False
     """Expect TwistStamped commands."""
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     bag: Path | None = None
     """Record all received and sent messages as a ROS 2 bag in this folder, which must not exist."""
     seconds: float = 0.0
-    """Duration by the clock of the robot [s]. 0 runs until you press ^C."""
+    """Run for this long by the clock of the robot [s]. 0 runs until you press ^C."""
     json: options.Json = False
 
     def run(self) -> int:

@@ -40,17 +40,17 @@ class CertifyCommand:
     """The options of `brakeline certify`."""
 
     data: Annotated[Path | None, tyro.conf.Positional] = None
-    """A data set, or a log (file or run folder), of which the last steps count. Defaults to the data set in use of
+    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use of
     --robot."""
     certificates: tuple[str, ...] = ()
-    """Error bounds of the linear modes to validate (see docs/certificates.md). Defaults to all of them if you give
+    """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you give
     --mode direct or recursion."""
     mode: Literal["one-step", "direct", "recursion"] | None = None
-    """Prediction mode to validate: one-step rolls out one learned period. Defaults to one-step, or to direct and
+    """Validate this prediction mode; one-step rolls out one learned period. Defaults to one-step, or to direct and
     recursion if you give --certificates. A robot that stops by feedback has no mode one-step."""
     windows: Literal["plan", "free", "auto"] = "auto"
-    """Driving to fit and validate on: plan for plans as the filter makes them, free for any, auto for any if there are
-    too few plans."""
+    """Fit and validate on this driving: plan for plans as the filter makes them, free for any, auto for any if there
+    are too few plans."""
     few: bool = False
     """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled by 1.5
     instead of 1.15, as after `collect --url`."""
@@ -60,9 +60,9 @@ class CertifyCommand:
     until_held: bool = False
     """Widen each envelope until no held-out plan leaves its set, and no further."""
     robot: str = "ground"
-    """Robot whose data set in use to take, or, of a log, whose steps to take."""
+    """Take the data set in use of this robot or, of a log, its steps."""
     last: int = 20_000
-    """Number of last steps of a log to take."""
+    """Take this many last steps of a log."""
     use: bool = False
     """Write the model sets to where the other commands load them from."""
     accept_bound: options.AcceptBound = None

@@ -25,14 +25,15 @@ class CollectCommand:
 
     robot: options.Robot = "ground"
     trajectories: int | None = None
-    """Trajectories to record, each of 300 control periods. Defaults to as many as the plans of the robot need."""
+    """Record this many trajectories of 300 control periods. Defaults to as many as the plans of the robot need."""
     seed: options.Seed = SEED
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     out: Path | None = None
-    """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
+    """Write the data set to this file. Defaults to the data set in use, data/ROBOT/record.safetensors."""
     url: str = ""
-    """Link to a vehicle for its first flight: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The vehicle takes
-    off, flies random targets in a box, slowly at first, and lands. No filter checks this flight: clear the box."""
+    """Fly the vehicle behind this link for the first time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The
+    vehicle takes off, flies random targets in a box, slowly at first, and lands. No filter checks this flight: clear
+    the box."""
     first: options.Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
     accept_bound: options.AcceptBound = None
     json: options.Json = False

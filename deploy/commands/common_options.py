@@ -31,26 +31,31 @@ Mode = Literal["auto", "one-step", "direct", "recursion"]
 Method = Literal["ddpc", "secas", "sailr", "none"]
 
 Robot = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or path of a robot description (.toml).")
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(help="Use this robot. Give its name, or the path of a robot description (.toml)."),
 ]
-Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Log files (.mcap) or run folders.")]
+Logs = Annotated[
+    tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Read these log files (.mcap) or run folders.")
+]
 ReadSeconds = Annotated[
     float,
     tyro.conf.arg(
-        help="Limit on the computing time for reading a foreign log [s]. 0 means 3 s, and 1 s more for each 200 kB."
+        help="Stop reading a foreign log after this computing time [s]. 0 means 3 s, and 1 s more for each 200 kB."
     ),
 ]
-ReadGib = Annotated[float, tyro.conf.arg(help="Limit on the memory for reading a foreign log [GiB].")]
-Seed = Annotated[int, tyro.conf.arg(help="Seed of all random draws. The same seed gives the same result.")]
+ReadGib = Annotated[float, tyro.conf.arg(help="Stop reading a foreign log that needs more than this memory [GiB].")]
+Seed = Annotated[int, tyro.conf.arg(help="Draw everything random from this seed. The same seed gives the same result.")]
 ArenaName = Annotated[
     str,
     tyro.conf.arg(
-        help="Name of the arena. Ground robot: default, open, dense, few-walkers, walkers, many-walkers or crossing. "
-        "Quadrotor: default, dense, tall or traffic. Another robot: one of its task file."
+        help="Drive in arenas of this name. A ground robot has default, open, dense, few-walkers, walkers, "
+        "many-walkers and crossing. A quadrotor has default, dense, tall and traffic. Another robot has those of its "
+        "task file."
     ),
 ]
 RunFolder = Annotated[
-    Path | None, tyro.conf.arg(help="Folder of the run. Defaults to runs/DATE-TIME.", metavar="FOLDER")
+    Path | None, tyro.conf.arg(help="Store the run in this folder. Defaults to runs/DATE-TIME.", metavar="FOLDER")
 ]
 AcceptBound = Annotated[
     float | None,
@@ -62,7 +67,7 @@ AcceptBound = Annotated[
 Pictures = Annotated[
     float,
     tyro.conf.arg(
-        help="Pictures a second and robot that the recorder draws into the log for Foxglove, besides one of each "
+        help="Draw this many pictures a second of each robot into the log for Foxglove, besides one of each "
         "intervention. 0 draws none at all."
     ),
 ]
@@ -71,16 +76,16 @@ Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object o
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """The filter that checks what the policy proposes."""
+    """Choose the filter that checks what the policy proposes."""
 
     method: Method = "ddpc"
-    """Filter method: ddpc (this project's own), secas or sailr (the rivals), or none for no filter."""
+    """Filter with this method: ddpc (this project's own), secas or sailr (the rivals), or none for no filter."""
     certificate: Certificate = "residual"
-    """Error bound of the model set (see docs/certificates.md)."""
+    """Use a model set with this error bound (see docs/certificates.md)."""
     mode: Mode = "auto"
-    """Prediction mode: one-step rolls out one learned period, direct uses one linear predictor for each period of the
-    plan, recursion repeats the paper's linear model, and auto takes the model set that was last put to use (one-step or
-    direct)."""
+    """Predict in this mode: one-step rolls out one learned period, direct uses one linear predictor for each period of
+    the plan, recursion repeats the paper's linear model, and auto takes the model set that was last put to use
+    (one-step or direct)."""
 
     def model_config(self) -> ModelConfig:
         """Return the configuration of the model set that the options select."""
@@ -89,7 +94,7 @@ class FilterOptions:
 
 @dataclass(frozen=True)
 class ServiceOptions(FilterOptions):
-    """The filter that checks what the policy proposes, and how loose its model set may be."""
+    """Choose the filter that checks what the policy proposes, and how loose its model set may be."""
 
     accept_bound: AcceptBound = None
 
@@ -100,33 +105,33 @@ class ServiceOptions(FilterOptions):
 
 @dataclass(frozen=True)
 class PhysicsOptions:
-    """Differences between the simulated robot and the robot that was recorded."""
+    """Set how the simulated robot differs from the robot that was recorded."""
 
     payload: float = 0.0
-    """Mass on top of the robot [kg]."""
+    """Put this mass on top of the robot [kg]."""
     friction: float = 1.0
-    """Friction coefficient of the wheels on the floor."""
+    """Set the friction coefficient of the wheels on the floor."""
     noise: float = 1.0
-    """Factor on all sensor errors."""
+    """Scale all sensor errors by this factor."""
     wind: float = 0.0
-    """Mean wind speed on the quadrotor [m/s]. Its direction is drawn anew for each episode."""
+    """Blow at the quadrotor with this mean wind speed [m/s]. Each episode draws its direction anew."""
     gust: float = 0.0
-    """Standard deviation of the wind on each axis [m/s]."""
+    """Let the wind vary on each axis with this standard deviation [m/s]."""
     perception: Literal["map", "scan"] = "map"
-    """Source of free space: the arena's map, or the scan of a sensor (360 beams on the ground, 90 rings of 180 beams in
-    the air)."""
+    """Take free space from this source: the arena's map, or the scan of a sensor (360 beams on the ground, 90 rings of
+    180 beams in the air)."""
     dropped: float = 0.0
-    """Share of the beams of a scan that return nothing."""
+    """Let this share of the beams of a scan return nothing."""
     false_far: float = 0.0
-    """Share of the beams of a scan that pass through an obstacle."""
+    """Let this share of the beams of a scan pass through an obstacle."""
     ghosts: float = 0.0
-    """Share of the beams of a scan that return from a point where nothing is."""
+    """Let this share of the beams of a scan return from a point where nothing is."""
     blind: float = 0.0
-    """Width of the sector behind the robot that the sensor does not see [deg]."""
+    """Hide a sector of this width behind the robot from the sensor [deg]."""
     late: int = 0
-    """Delay of a scan [control periods]."""
+    """Delay each scan by this number of control periods."""
     tracks: bool = False
-    """With --perception scan: track moving obstacles from scan to scan, so that their speed is known."""
+    """With --perception scan, track moving obstacles from scan to scan, so that their speed is known."""
 
     def conditions(self) -> Conditions:
         """Return the simulator's conditions for these options. Raises ValueError if the options contradict."""
@@ -143,7 +148,7 @@ class PhysicsOptions:
 
 @dataclass(frozen=True)
 class FlightOptions(FlightSettings):
-    """The vehicle behind a MAVLink link, and its place in the arena."""
+    """Describe the vehicle behind a MAVLink link, and its place in the arena."""
 
     url: Annotated[str, tyro.conf.Suppress] = ""
     at_start: bool = False
@@ -158,21 +163,21 @@ class FlightOptions(FlightSettings):
 
 @dataclass(frozen=True)
 class BusOptions:
-    """The message bus. Write endpoints as Zenoh does: tls/HOST:PORT with keys, tcp/HOST:PORT without."""
+    """Join the message bus. Write endpoints as Zenoh does: tls/HOST:PORT with keys, tcp/HOST:PORT without."""
 
     connect: tuple[str, ...] = ()
-    """Routers to connect to. Defaults to the router of the newest run on this machine."""
+    """Connect to these routers. Defaults to the router of the newest run on this machine."""
     listen: tuple[str, ...] = ()
     """Act as the router at these endpoints."""
     keys: Path | None = None
-    """Folder with the keys of this process, as `brakeline keys` makes them. Defaults to $BRAKELINE_KEYS, else to no
+    """Use the keys of this process in this folder, which `brakeline keys` made. Defaults to $BRAKELINE_KEYS, else to no
     keys."""
     insecure: bool = False
     """Listen beyond this machine without keys. Everyone who reaches the bus can then command the robots, and each
     Health message warns of it."""
     metrics: str = ""
-    """PORT of this machine, or HOST:PORT, at which the process serves /metrics (Prometheus), /live and /ready. Without
-    it the process serves none."""
+    """Serve /metrics (Prometheus), /live and /ready at PORT of this machine, or at HOST:PORT. Without it the process
+    serves none."""
 
     def bus(self) -> BusSettings:
         """Return the bus settings. Raises ValueError if there is neither an endpoint nor a run on this machine."""
@@ -185,19 +190,19 @@ class BusOptions:
 
 @dataclass(frozen=True)
 class RunBusOptions:
-    """The message bus of a run, and the keys of its processes."""
+    """Set up the message bus of a run, and the keys of its processes."""
 
     listen: str | None = None
-    """Endpoint of the run's router. Defaults to a free port of this machine."""
+    """Let the run's router listen at this endpoint. Defaults to a free port of this machine."""
     keys: Path | None = None
-    """Folder with the keys of all processes, as `brakeline keys` makes them. Defaults to $BRAKELINE_KEYS, else to keys
-    of the run's own."""
+    """Use the keys of all processes in this folder, which `brakeline keys` made. Defaults to $BRAKELINE_KEYS, else to
+    keys of the run's own."""
     secured: bool = True
     """Make keys for the run if you give none. With --no-secured everyone who reaches the bus can command the robots."""
     insecure: bool = False
     """Allow --listen beyond this machine without keys. Each Health message then warns of it."""
     metrics: str = ""
-    """PORT of this machine, or HOST:PORT, at which the launcher serves /metrics. Its processes use the next ports."""
+    """Serve /metrics of the launcher at PORT of this machine, or at HOST:PORT. Its processes use the next ports."""
 
     def settings(self, config: RunConfig, folder: Path) -> BusSettings:
         """Return the bus settings of the launcher. Makes the run's own keys if the run needs any."""

@@ -39,34 +39,34 @@ class CompareCommand:
     """The options of `brakeline compare`."""
 
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
-    """Robots to compare the methods on."""
+    """Compare the methods on these robots."""
     seeds: tuple[int, ...] = SEEDS
-    """Seeds, each of one training with each method."""
+    """Train each method once from each of these seeds."""
     steps: int | None = None
-    """Training steps. Defaults to the number that the comparison uses for each robot."""
+    """Train for this many steps. Defaults to the number that the comparison uses for each robot."""
     episodes: int | None = None
-    """Evaluation episodes for each seed and arena. Defaults to the number that the comparison uses."""
+    """Evaluate on this many episodes for each seed and arena. Defaults to the number that the comparison uses."""
     arenas: tuple[str, ...] = CellConfig.arenas
-    """Arenas of the evaluation; the training is in the first. Give another --results folder with other arenas."""
+    """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas."""
     methods: tuple[str, ...] = METHODS
-    """Methods to compare."""
+    """Compare these methods."""
     quick: bool = False
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
     workers: int = 2
-    """Trainings at once, each on one core."""
+    """Run this many trainings at once, each on one core."""
     again: bool = False
     """Run again what has results already."""
     conservatism: bool = True
     """Make also the table of error bounds and modes, with the stored policy."""
     penalty: float = 1.0
-    """Penalty subtracted from the learned reward for a correction by the whole range of an input. Give another
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Give another
     --results folder if you change it or --td3."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
-    """Folder of the tables and figures."""
+    """Store the tables and figures in this folder."""
     runs: Path = RUNS
-    """Folder of the logs and policies of the trainings."""
+    """Store the logs and policies of the trainings in this folder."""
     json: Json = False
 
     def run(self) -> int:

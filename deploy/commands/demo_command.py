@@ -14,7 +14,7 @@ class DemoCommand:
     """The options of `brakeline demo`."""
 
     steps: int = EXPERIMENTS["demo"].steps
-    """Training steps."""
+    """Train for this many steps."""
     seed: Seed = 0
     out: RunFolder = None
     json: Json = False

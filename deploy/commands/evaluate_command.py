@@ -20,23 +20,23 @@ class EvaluateCommand:
 
     robot: options.Robot = "ground"
     policy: str = "astar"
-    """Policy to evaluate: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
+    """Evaluate this policy: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
     astar, careful (astar far from obstacles), a weights file, or a CSV file of inputs as `brakeline excite` prints
     them."""
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     arena: options.ArenaName = "default"
     episodes: int = 100
-    """Episodes to drive. A fleet counts those of all its robots, and completes each world."""
+    """Drive this many episodes. A fleet counts those of all its robots, and completes each world."""
     fleet: int = 0
-    """Robots that share one world and avoid each other. 0 evaluates one robot alone."""
+    """Let this many robots share one world and avoid each other. 0 evaluates one robot alone."""
     seed: options.Seed = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""
     episode: int = 0
-    """With --render: number of the episode to draw."""
+    """With --render, draw the episode of this number."""
     beside: bool = False
-    """With --render: draw the same episode without the filter beside it."""
+    """With --render, draw the same episode without the filter beside it."""
     verbose: bool = False
     """Show also the conditions: sensor errors, wind, payload."""
     json: options.Json = False

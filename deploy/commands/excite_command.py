@@ -20,16 +20,15 @@ class ExciteCommand:
 
     robot: Robot = "ground"
     keep: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
-    """Region that the robot stays in: least x, least y, greatest x, greatest y [m]. Each run starts in its middle,
-    along x."""
+    """Stay in this region: least x, least y, greatest x, greatest y [m]. Each run starts in its middle, along x."""
     minutes: float = 10.0
-    """Duration of the driving [min]."""
+    """Drive for this long [min]."""
     seed: Seed = 0
     drive: Path | None = None
     """Drive the inputs in the robot's simulator instead of printing them, and record this log (.mcap). The measured
     position then keeps the robot in the region."""
     json: Json = False
-    """With --drive: print the result as one JSON object on stdout."""
+    """With --drive, print the result as one JSON object on stdout."""
 
     def run(self) -> int:
         """Print or drive the inputs. Returns the exit status."""

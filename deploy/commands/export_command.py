@@ -26,7 +26,7 @@ class ExportCommand:
     tlog: Path | None = None
     """Write each MAVLink frame to this file, which ground stations and pymavlink can read."""
     robot: str = "ground"
-    """With --csv and --minari: robot whose steps to export: a name, or the path of a description (.toml)."""
+    """With --csv and --minari, export the steps of this robot. Give its name, or the path of a description (.toml)."""
     json: Json = False
 
     def run(self) -> int:

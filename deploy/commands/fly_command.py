@@ -28,37 +28,37 @@ class FlyCommand:
     """The options of `brakeline fly`."""
 
     robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
-    """Robot that flies: a name, or the path of a robot description (.toml)."""
+    """Fly this robot. Give its name, or the path of a robot description (.toml)."""
     minutes: float = 10.0
-    """Duration of the flight [min]."""
+    """Fly for this long [min]."""
     policy: str = "astar"
-    """Policy to fly: trained, untrained, random, greedy, adversary, astar, careful, a weights file, or learn to learn
-    from the flight."""
+    """Let this policy fly: trained, untrained, random, greedy, adversary, astar, careful or a weights file. With
+    `learn`, learn a policy from the flight."""
     url: tuple[str, ...] = ()
-    """Links to vehicles: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies alone on its own map,
-    and all share one safety service. Without a link the command simulates the vehicles."""
+    """Fly the vehicles behind these links: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies alone
+    on its own map, and all share one safety service. Without a link the command simulates the vehicles."""
     systems: tuple[int, ...] = ()
-    """MAVLink system ids of the vehicles, one for each link. Defaults to --system for all."""
+    """Address the vehicles by these MAVLink system ids, one for each link. Defaults to --system for all."""
     vehicles: int = 1
-    """Number of simulated vehicles."""
+    """Simulate this many vehicles."""
     flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
     rules: Literal["px4", "ardupilot"] = "px4"
-    """Rules of the simulated autopilot: its modes, refusals and parameters."""
+    """Simulate an autopilot with these rules: modes, refusals and parameters."""
     setpoint_timeout: float = AutopilotConfig.setpoint_timeout
-    """Time without a setpoint after which the simulated autopilot brakes [s]."""
+    """Let the simulated autopilot brake after this time without a setpoint [s]."""
     arena: options.ArenaName = "default"
     seed: options.Seed = 0
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     practice: float = 0.0
-    """Share of the steps at which a vehicle starts to follow its backup plan to the stop, so that the log has the stops
+    """At this share of the steps, let a vehicle begin to follow its backup plan to the stop. The log then has the stops
     that `brakeline certify LOG` needs."""
     adapt: bool = False
     """Certify the vehicle anew in flight: if it needs wider sets than its model set states for long, a certifier
     process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
     deadline: float = 0.12
-    """Time that an actor waits for an answer of the safety service [s]. The answer applies from the next control period
-    (0.2 s) on."""
+    """Let an actor wait this long for an answer of the safety service [s]. The answer applies from the next control
+    period (0.2 s) on."""
     pictures: options.Pictures = RunConfig.pictures
     out: options.RunFolder = None
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)

@@ -29,23 +29,23 @@ class ImportCommand:
     """The options of `brakeline import`."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Logs to import: CSV, Parquet, ROS bags, logs of ArduPilot, PX4 and of own runs (docs/data.md)."""
+    """Import these logs: CSV, Parquet, ROS bags, logs of ArduPilot, PX4 and of own runs (docs/data.md)."""
     robot: str = "ground"
-    """Robot that was logged: a name, or the path of a description (.toml)."""
+    """Read the log of this robot. Give its name, or the path of a description (.toml)."""
     out: Path | None = None
-    """File of the data set. Defaults to data/ROBOT/record.safetensors, the data set in use, which it replaces."""
+    """Write the data set to this file. Defaults to the data set in use, data/ROBOT/record.safetensors."""
     map: tuple[str, ...] = ()
-    """Places of coordinates, inputs and the time in the log, each as NAME=TABLE/FIELD (of a file of columns:
+    """Find coordinates, inputs and the time at these places of the log, each as NAME=TABLE/FIELD (of a file of columns:
     NAME=COLUMN), if they are not at their usual places."""
     unit: tuple[str, ...] = ()
-    """Units of the log, each as NAME=UNIT, where they are not SI: heading=deg, speed=km/h, time=ms."""
+    """Read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
     topics: tuple[str, ...] = ()
-    """Topics or message types to take, where several hold the same quantity."""
+    """Take these topics or message types, where several hold the same quantity."""
     delay: float = 0.0
-    """Time by which the inputs are stamped too early [s]. The report says how much later than its inputs the robot
-    moves."""
+    """Shift the inputs, which are stamped too early, by this time [s]. The report says how much later than its inputs
+    the robot moves."""
     hold: float = HOLD
-    """Time after its last message for which an input counts [s]."""
+    """Let an input count for this time after its last message [s]."""
     read_seconds: ReadSeconds = 0.0
     read_gib: ReadGib = 4.0
     picture: Path | None = None

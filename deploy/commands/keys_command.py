@@ -24,20 +24,20 @@ class KeysCommand:
     """The options of `brakeline keys`."""
 
     folder: Annotated[Path, tyro.conf.Positional] = Path("keys")
-    """Folder of the keys. The command makes it if it does not exist."""
+    """Make the keys in this folder. The command makes the folder if it does not exist."""
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Processes to issue certificates to. Each name begins with its role, such as actor-7. A process that has a
+    """Issue certificates to these processes. Each name begins with its role, such as actor-7. A process that has a
     certificate gets a new one."""
     host: tuple[str, ...] = ()
-    """Names and addresses, besides this machine's, at which others reach the processes that may be routers."""
+    """Let others reach the processes that may be routers at these names and addresses, besides this machine's."""
     days: int = DAYS
-    """Days for which the certificates are valid."""
+    """Let the certificates be valid for this many days."""
     signer: bool = True
     """Make a key that signs models, if there is none. Keep it offline, with the person who certifies models."""
     robots: tuple[str, ...] = (ANY,)
-    """Robots whose models a new signer may sign; * stands for all."""
+    """Let a new signer sign the models of these robots; * stands for all."""
     sign: tuple[Path, ...] = ()
-    """Model files to sign as they are. `brakeline certify --use --keys FOLDER` signs with the data set at hand."""
+    """Sign these model files as they are. `brakeline certify --use --keys FOLDER` signs with the data set at hand."""
     hand_out: Path | None = None
     """Copy the files that each named process needs, and no others, to a folder of its name in this folder. Carry that
     folder to the machine of the process."""

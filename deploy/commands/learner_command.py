@@ -18,16 +18,16 @@ class LearnerCommand:
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     out: Path = Path("runs/learner")
-    """Folder of the checkpoint and the policy."""
+    """Store the checkpoint and the policy in this folder."""
     resume: bool = False
     """Resume from the checkpoint in the folder. It is an error if there is none."""
     resume_if_any: bool = False
     """Resume from the checkpoint in the folder if there is one. Use it if a supervisor restarts the process."""
     name: str = "learner"
-    """Name of the learner on the bus."""
+    """Give the learner this name on the bus."""
     seed: Seed = 0
     steps: int = 100_000
-    """Training steps."""
+    """Train for this many steps."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
 
     def run(self) -> int:

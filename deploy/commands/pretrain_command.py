@@ -23,16 +23,16 @@ class PretrainCommand:
     """The options of `brakeline pretrain`."""
 
     method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
-    """The rival method."""
+    """Pre-train this rival method."""
     robot: Robot = "ground"
     samples: int | None = None
-    """Steps to drive. Defaults to the number that the comparison uses."""
+    """Drive this many steps. Defaults to the number that the comparison uses."""
     seed: int | None = None
-    """Seed of the driving. Defaults to the one that the comparison uses."""
+    """Draw the driving from this seed. Defaults to the one that the comparison uses."""
     tune: bool = False
     """Try values of the method's threshold in closed loop, and name the best. This stores nothing."""
     episodes: int = 60
-    """With --tune: episodes for each policy and value."""
+    """With --tune, drive this many episodes for each policy and value."""
     json: Json = False
 
     def run(self) -> int:

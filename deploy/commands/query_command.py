@@ -38,18 +38,19 @@ class QueryCommand:
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     state: tuple[float, ...] = ()
-    """Measured state, in the order of the robot description. Defaults to rest at the origin."""
+    """Ask about this measured state, in the order of the robot description. Defaults to rest at the origin."""
     action: tuple[float, ...] = ()
-    """Proposed action, in the order of the robot description. Defaults to the highest inputs."""
+    """Propose this action, in the order of the robot description. Defaults to the highest inputs."""
     obstacle: str = ""
-    """Obstacles, separated by commas, such as "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
+    """Describe the obstacles, separated by commas, such as "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
     scan: Path | None = None
-    """JSON file with a scan, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}: the fields of Scan, or in the
-    air of RangeImage (see docs/perception.md). Space that the scan does not show to be free counts as occupied."""
+    """Read a scan from this JSON file, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}: the fields of Scan,
+    or in the air of RangeImage (see docs/perception.md). Space that the scan does not show to be free counts as
+    occupied."""
     known_free: bool = False
     """Declare that all space outside the obstacles is free. Give it if you give neither --obstacle nor --scan."""
     timeout: float = 1.0
-    """Time to wait for the answer [s]."""
+    """Wait this long for the answer [s]."""
     json: Json = False
 
     def run(self) -> int:

@@ -19,10 +19,10 @@ class RecorderCommand:
     """The options of `brakeline recorder`."""
 
     log: Annotated[Path, tyro.conf.Positional] = Path("runs/run.mcap")
-    """Log file to write (.mcap). If the file exists, the recorder writes the next one of the same log."""
+    """Write this log file (.mcap). If the file exists, the recorder writes the next one of the same log."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     name: str = "recorder"
-    """Name of the recorder on the bus."""
+    """Give the recorder this name on the bus."""
     pictures: Pictures = RunConfig.pictures
     rotation: Rotation = field(default_factory=Rotation)
 

@@ -20,8 +20,8 @@ class RecoverCommand:
     """The options of `brakeline recover`."""
 
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays beside it as
-    *.mcap.damaged."""
+    """Repair these log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays
+    beside it as *.mcap.damaged."""
     out: Path | None = None
     """Write the repaired log (of one file) here, and leave the damaged one as it is."""
     json: Json = False

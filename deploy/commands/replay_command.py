@@ -37,7 +37,7 @@ class ReplayCommand:
     certificate: Certificate | None = None
     """Decide with this error bound instead, fitted to the data set in use or to --data."""
     mode: Mode = "direct"
-    """With --certificate or --data: prediction mode."""
+    """With --certificate or --data, predict in this mode."""
     data: Path | None = None
     """Decide with a model set of this data set (a file that `brakeline collect` wrote) instead."""
     margin: float | None = None

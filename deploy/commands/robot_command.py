@@ -27,23 +27,25 @@ class RobotCommand:
     """The options of `brakeline robot`."""
 
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
-    """new writes a description with comments, check lists all mistakes in one, show prints what follows from it."""
+    """Choose what to do: new writes a description with comments, check lists all mistakes in one, show prints what
+    follows from it."""
     file: Annotated[str, tyro.conf.Positional]
-    """The description (.toml). With check and show also the name of a robot that comes with the program."""
+    """Write or read this description (.toml). With check and show, you may name a robot that comes with the program."""
     from_: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
-    """With new: infer values from these logs of one robot (CSV, Parquet, ROS bags, logs of autopilots). The log of a
+    """With new, infer values from these logs of one robot (CSV, Parquet, ROS bags, logs of autopilots). The log of a
     run contains the whole description."""
     map: tuple[str, ...] = ()
-    """With --from: names of coordinates, inputs and the time, and where they are in the log, each as NAME=TABLE/FIELD
-    (of a file of columns: NAME=COLUMN; then no other column is taken). The name of an input begins with `command `."""
+    """With --from, give the names of coordinates, inputs and the time, and their places in the log, each as
+    NAME=TABLE/FIELD (of a file of columns: NAME=COLUMN; then no other column is taken). The name of an input begins
+    with `command `."""
     unit: tuple[str, ...] = ()
-    """With --from: units of the log, each as NAME=UNIT, where they are not SI: heading=deg, speed=km/h, time=ms."""
+    """With --from, read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
     topics: tuple[str, ...] = ()
-    """With --from: topics or message types to take, where several hold the same quantity."""
+    """With --from, take these topics or message types, where several hold the same quantity."""
     read_seconds: ReadSeconds = 0.0
     read_gib: ReadGib = 4.0
     picture: Path | None = None
-    """With show: draw the body and the stop into this image."""
+    """With show, draw the body and the stop into this image."""
     json: Json = False
 
     def run(self) -> int:

@@ -30,12 +30,12 @@ SERVICE_LEAD = 0.12  # s, default of --lead with --connect: an answer over the b
 
 @dataclass(frozen=True)
 class GraphOptions:
-    """The ROS graph."""
+    """Place the node in the ROS graph."""
 
     domain: int = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-    """ROS domain. Defaults to $ROS_DOMAIN_ID, else to 0."""
+    """Join this ROS domain. Defaults to $ROS_DOMAIN_ID, else to 0."""
     namespace: str = "/"
-    """Namespace of the node."""
+    """Put the node into this namespace."""
 
 
 @dataclass(frozen=True)
@@ -44,41 +44,41 @@ class Ros2Command:
 
     robot: options.Robot = "ground"
     router: tuple[str, ...] = (ROUTER,)
-    """Endpoints of the router of rmw_zenoh, as Zenoh writes them."""
+    """Connect to the router of rmw_zenoh at these endpoints, as Zenoh writes them."""
     graph: options.Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
     name: str = "brakeline"
-    """Name of the node."""
+    """Give the node this name."""
     topics: Topics = field(default_factory=Topics)
     stamped: bool = False
     """Expect and send TwistStamped commands, which are the default of Nav2 since Kilted."""
     sim_time: bool = False
     """Take the time from /clock."""
     lead: float | None = None
-    """Time before a control period at which its input is decided [s]. Defaults to 0.04, or to 0.12 with --connect."""
+    """Decide an input this long before its control period [s]. Defaults to 0.04, or to 0.12 with --connect."""
     mount: tuple[float, float, float] | None = None
-    """Pose of the lidar in the frame of the robot: x y yaw [m, rad]. Defaults to the pose in /tf_static."""
+    """Place the lidar at this pose in the frame of the robot: x y yaw [m, rad]. Defaults to the pose in /tf_static."""
     range_error: float = SensorSettings.range_error
-    """Largest error of a range of the lidar [m]."""
+    """Assume that a range of the lidar is wrong by at most this [m]."""
     zero_is_free: bool = False
     """Read a range of 0 as free space: the driver of the lidar reports 0 where it sees nothing within its range."""
     tf: bool = False
     """Take the pose of the robot from /tf instead of odometry messages."""
     odometry_frame: str = SensorSettings.odometry_frame
-    """Frame of the odometry."""
+    """Expect the odometry in this frame."""
     base_frame: str = "base_footprint"
-    """With --tf: frame of the robot. The robot turns about its origin."""
+    """With --tf, take this as the frame of the robot. The robot turns about its origin."""
     fresh: options.Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     connect: tuple[str, ...] = ()
-    """Endpoints of the bus of a safety service to query. Without one the filter runs in this process."""
+    """Query the safety service on the bus at these endpoints. Without one the filter runs in this process."""
     keys: Path | None = None
-    """With --connect: folder with the keys of --client. Defaults to $BRAKELINE_KEYS, else to no keys."""
+    """With --connect, use the keys of --client in this folder. Defaults to $BRAKELINE_KEYS, else to no keys."""
     client: str = "client"
-    """Name on a bus with keys (see `brakeline keys`)."""
+    """Use this name on a bus with keys (see `brakeline keys`)."""
     bag: Path | None = None
     """Record all received and sent messages as a ROS 2 bag in this folder, which must not exist."""
     seconds: float = 0.0
-    """Duration by the clock of the robot [s]. 0 runs until you press ^C."""
+    """Run for this long by the clock of the robot [s]. 0 runs until you press ^C."""
     json: options.Json = False
 
     def run(self) -> int:

@@ -13,7 +13,7 @@ class RouterCommand:
 
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     name: str = "router"
-    """Name of the router on the bus. Each router needs its own."""
+    """Give the router this name on the bus. Each router needs its own."""
 
     def run(self) -> int:
         """Route messages until SIGINT or SIGTERM. Returns the exit status."""

@@ -19,11 +19,11 @@ class SafetyCommand:
     """The options of `brakeline safety`."""
 
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
-    """Robots to serve: names, or paths of robot descriptions (.toml)."""
+    """Serve these robots. Give their names, or paths of robot descriptions (.toml)."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)
     name: str = "safety"
-    """Name of the service on the bus. Each replica needs its own."""
+    """Give the service this name on the bus. Each replica needs its own."""
     adapt: bool = False
     """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
     process fits a model set to the last minutes and puts it to use. It hears the actors on the bus, and needs the keys

@@ -21,7 +21,7 @@ class StatusCommand:
 
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     wait: float = 1.5
-    """Time to listen [s]. Each living process publishes its health once a second."""
+    """Listen for this long [s]. Each living process publishes its health once a second."""
     json: Json = False
 
     def run(self) -> int:

@@ -20,12 +20,12 @@ class TrainCommand(RunConfig):
     """The options of `brakeline train`: the fields of RunConfig, and what a configuration does not hold."""
 
     steps: int = 0
-    """Training steps for each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the logs if
-    there is no actor."""
+    """Train for this many steps of each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the
+    logs if there is no actor."""
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     experiment: str = "default"
-    """Configuration that the other options start from: default, demo or debug."""
+    """Start from this configuration, which the other options change: default, demo or debug."""
     out: options.RunFolder = None
     resume: Path | None = None
     """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""

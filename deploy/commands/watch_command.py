@@ -29,13 +29,13 @@ class WatchCommand:
 
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     host: str = "127.0.0.1"
-    """Address to serve at. Only this machine can watch, unless you give an address that others reach."""
+    """Serve at this address. Only this machine can watch, unless you give an address that others reach."""
     port: int = 8787
-    """Port of the web page. 0 takes any free port."""
+    """Serve the web page at this port. 0 takes any free port."""
     foxglove_port: int = 8765
-    """Port of the server that Foxglove connects to. 0 takes any free port; -1 starts no server."""
+    """Let Foxglove connect at this port. 0 takes any free port; -1 starts no server."""
     origins: tuple[str, ...] = ORIGINS
-    """Web pages that may connect to the Foxglove server besides programs, such as https://app.foxglove.dev."""
+    """Let these web pages connect to the Foxglove server besides programs, such as https://app.foxglove.dev."""
     json: bool = False
     """Print the addresses as one JSON object on stdout."""
 

@@ -43,47 +43,48 @@ class RunConfig:
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}  # for this and all nested dataclasses
 
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
-    """Robots to train: names, or paths of robot descriptions (.toml). Each has a learner and actors of its own; all
-    share the safety service."""
+    """Train these robots. Give their names, or paths of robot descriptions (.toml). Each has a learner and actors of
+    its own; all share the safety service."""
     method: Internal[str] = "ddpc"
     model_config: Internal[ModelConfig] = field(default_factory=lambda: ModelConfig(mode=AUTO))
     accept_bound: Internal[float | None] = None  # largest accepted stated bound; None: the limit of each description
     arena: str = "default"
-    """Name of the arena."""
+    """Drive in arenas of this name."""
     actors: int = 2
-    """Actor processes for each robot kind. With --from-logs it may be 0."""
+    """Run this many actor processes for each robot kind. With --from-logs it may be 0."""
     robots_per_actor: int = 1
-    """Robots in each actor process. They share one request to the safety service."""
+    """Run this many robots in each actor process. They share one request to the safety service."""
     fleet: int = 0
-    """Robots in each actor process that share one world and avoid each other. 0 gives each robot a world of its own."""
+    """Let this many robots of each actor process share one world and avoid each other. 0 gives each a world of its
+    own."""
     steps: int = 100_000
-    """Training steps for each robot kind."""
+    """Train for this many steps of each robot kind."""
     seed: int = 0
-    """Seed of all random draws of the run."""
+    """Draw everything random in the run from this seed."""
     penalty: float = 1.0
-    """Penalty subtracted from the learned reward for a correction by the whole range of an input."""
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input."""
     deadline: float = 0.1
-    """Time that an actor waits for an answer of the safety service [s]. Then the robot brakes along its backup plan."""
+    """Let an actor wait this long for an answer of the safety service [s]. Then its robot brakes along its backup
+    plan."""
     deterministic: bool = False
     """Run one actor in lockstep without deadlines: the same seed gives the same weights, bit for bit."""
     from_logs: tuple[str, ...] = ()
-    """Logs (files or run folders) whose steps the learner takes before any robot starts. With --actors 0 it learns from
-    them alone; with --resume they replace a lost checkpoint."""
+    """Let the learner take the steps of these logs (files or run folders) before any robot starts. With --actors 0 it
+    learns from them alone; with --resume they replace a lost checkpoint."""
     replicas: int = 1
-    """Safety service processes. A robot goes on if one of several fails."""
+    """Run this many safety service processes. A robot goes on if one of several fails."""
     record: bool = True
     """Record a log. Without a log you can't analyse, replay or certify the run."""
     rotation: Rotation = field(default_factory=Rotation)
-    """Sizes at which the recorder begins the next file of the log."""
+    """Begin the next file of the log at these sizes."""
     pictures: float = 10.0
-    """Pictures a second and robot that the recorder draws into the log for Foxglove, besides one of each intervention.
-    0 draws none at all."""
+    """Draw this many pictures a second of each robot into the log for Foxglove, besides one of each intervention. 0
+    draws none at all."""
     practice: float = 0.0
-    """Share of the steps at which a robot starts to follow its backup plan to the stop, so that the log has the stops
+    """At this share of the steps, let a robot begin to follow its backup plan to the stop. The log then has the stops
     that `brakeline certify LOG` needs."""
     change: PhysicsChange = field(default_factory=PhysicsChange)
-    """A change of the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1.
-    """
+    """Change the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1."""
     adapt: bool = False
     """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
     process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
@@ -95,7 +96,7 @@ class RunConfig:
     """Log each MAVLink frame of simulated quadrotors, as bytes and as JSON. This about doubles the size of the log.
     Flights in real time always log them."""
     learner: LearnerConfig = field(default_factory=lambda: LearnerConfig(checkpoint_every=2500))
-    """The learner and its algorithm (TD3)."""
+    """Configure the learner and its algorithm (TD3)."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

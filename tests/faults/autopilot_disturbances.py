@@ -1,4 +1,4 @@
-"""Real autopilots under changed conditions: wind, weak motors, a load, noise, a GPS that jumps, cameras that fail.
+"""Fly real autopilots under changed conditions: wind, weak motors, a load, noise, a GPS that jumps, cameras that fail.
 
 Run it after `flights`, in the same folder. A* flies among obstacles behind the model set from there; `certify` makes a
 new model set from that flight's log; A* flies behind the new one. With the model set of a single flight (one-step), a

@@ -1,4 +1,4 @@
-"""A run over five hosts with faults: processes and routers die by `kill -9`, and cables are pulled.
+"""Run on five hosts with faults: processes and routers die by `kill -9`, and cables are pulled.
 
 python -m benchmarks chaos [--kills 100] [--seed 0] [--delay 0.01]
 

@@ -1,4 +1,4 @@
-"""A 50 Hz client alone, and again while an authorised actor sends junk, sessions idle, and a listener has stopped.
+"""Time a 50 Hz client alone, and again while an authorised actor sends junk, sessions idle, and a listener has stopped.
 
 python -m benchmarks crowd [--rate 5000]
 

@@ -1,4 +1,4 @@
-"""Real autopilots whose companion fails in flight: its link is cut, or its safety service or its actor is killed.
+"""Fly real autopilots whose companion fails: its link is cut, or its safety service or its actor is killed.
 
 Run it after `flights`: it needs their model sets. The policy is A*, the fastest. The faults come one after the other,
 at random times; the next one comes when the vehicle flies again. The autopilots keep their own timeouts. A judge hears

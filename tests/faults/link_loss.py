@@ -1,4 +1,4 @@
-"""A quadrotor whose link is cut, or whose vehicle server dies: how far the autopilot's braking leaves the verified set.
+"""Cut a quadrotor's link, or kill its vehicle server: measure how far braking leaves the verified set.
 
 The last setpoint stays in force until the autopilot's timeout. The worst time is just before the next setpoint, after
 the last one was sent again. The backup plan would brake meanwhile.
