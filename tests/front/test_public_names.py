@@ -12,6 +12,9 @@ import pytest
 import brakeline
 
 ROOT = Path(__file__).parents[2]
+# The names, the files and the decisions are tested here, so the kernels of another folder are not compiled: it takes
+# 17 s. `tests/safety/test_kernel_bounds.py` compiles them in a folder of its own.
+NOT_COMPILED = {"NUMBA_DISABLE_JIT": "1"}
 PARTS = ("messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "robots", "policies")
 
 
@@ -42,7 +45,8 @@ def test_a_client_imports_no_simulator_and_no_solver():
 def wheel(tmp_path_factory):
     """Unpack a wheel in a folder outside the checkout."""
     folder = tmp_path_factory.mktemp("wheel")
-    words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
+    words = [sys.executable, "-m", "pip", "wheel", *options, str(ROOT)]
     built = subprocess.run(words, check=False, capture_output=True, text=True)
     if built.returncode:
         pytest.skip(f"no wheel can be built here: {built.stderr.strip().splitlines()[-1]}")
@@ -55,7 +59,7 @@ def wheel(tmp_path_factory):
 def editable(tmp_path_factory):
     """Install the checkout in editable mode in a folder of its own."""
     site = tmp_path_factory.mktemp("editable")
-    options = ["--quiet", "--no-deps", "--target", str(site), "--editable", str(ROOT)]
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--target", str(site), "--editable", str(ROOT)]
     words = [sys.executable, "-m", "pip", "install", *options]
     made = subprocess.run(words, check=False, capture_output=True, text=True)
     if made.returncode:
@@ -87,7 +91,7 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
     # -S: first the install under test, then the packages that it needs.
     found = subprocess.run(
-        [sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean
+        [sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean | NOT_COMPILED
     )
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
@@ -103,8 +107,9 @@ def test_nothing_but_brakeline_is_installed(install, request):
 def outside(wheel: Path, code: str) -> str:
     """Return what code prints that runs with the wheel alone, outside the checkout."""
     run = f"import sys; sys.path.insert(0, {str(wheel)!r}); {code}"
-    words = [sys.executable, "-P", "-c", run]
-    return subprocess.run(words, capture_output=True, text=True, check=True, cwd=wheel.parent).stdout.strip()
+    words, environment = [sys.executable, "-P", "-c", run], os.environ | NOT_COMPILED
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=wheel.parent, env=environment)
+    return done.stdout.strip()
 
 
 def test_a_wheel_has_everything(wheel):
