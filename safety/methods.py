@@ -1,6 +1,7 @@
 """THE table of the methods that a safety service can serve: the filter and its rivals, behind one interface.
 
-A robot without a filter (method `none`) uses no service.
+A robot without a filter (method `none`) uses no service. The filter and SECAS are imported when a model is made ready:
+with them come compiled kernels and a solver, which take a second to load. Who only reads a model needs neither.
 """
 
 from __future__ import annotations
@@ -11,16 +12,16 @@ from typing import Protocol
 
 from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Decision, Request
-from brakeline.safety.model.model_config import DDPC as DDPC
+from brakeline.safety.model.model_config import DDPC, SAILR, SECAS
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.tensor_file import has_entry
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
-from brakeline.safety.rivals.sailr import SAILR, Sailr
-from brakeline.safety.rivals.secas import SECAS, Secas
+from brakeline.safety.rivals.sailr import Sailr
 
 Model = ModelSet | Pretrained
+
+IN_USE = "in_use"  # in the archive of a robot: the version that a service put to use last
 
 
 class Method(Protocol):
@@ -41,7 +42,13 @@ class Method(Protocol):
         """Return the decision. Raises BadRequest if a value of the request is not valid."""
 
 
-RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: Secas, SAILR: Sailr}
+def _secas(model: Pretrained) -> Method:
+    from brakeline.safety.rivals.secas import Secas
+
+    return Secas(model)
+
+
+RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: _secas, SAILR: Sailr}
 METHODS = (DDPC, *RIVALS)
 
 
@@ -52,6 +59,8 @@ def ready(model: Model) -> Method:
         BadModel: no method has this name, or the model does not fit its robot.
     """
     if isinstance(model, ModelSet):
+        from brakeline.safety.filter.filter import Filter
+
         return Filter(model)
     if model.method not in RIVALS:
         raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
@@ -69,3 +78,8 @@ def load(path: Path) -> Model:
         return decode(path.read_bytes())
     except (OSError, BadModel) as error:
         raise BadModel(f"{path}: {error}") from error
+
+
+def archive_path(archive: Path, robot: str, version: str) -> Path:
+    """Return the path of a version of a robot's model in an archive of models."""
+    return archive / robot / "models" / f"{version}.safetensors"

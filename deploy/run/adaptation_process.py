@@ -24,8 +24,8 @@ from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.messaging.topics import EXCHANGE, MODEL, STEP
+from brakeline.safety.methods import archive_path
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.server import archive_path
 from brakeline.safety.service.signature import ModelSigner
 
 log = logging.getLogger("brakeline.certifier")

@@ -10,10 +10,9 @@ from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import Untrusted
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.methods import Model, load
+from brakeline.safety.methods import Model, archive_path, load
 from brakeline.safety.model.model_set import ONE_STEP, ModelSet
 from brakeline.safety.service.plan_token import write_key
-from brakeline.safety.service.server import archive_path
 from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, write_signer
 
 KEYS = "keys"  # folder in the run's folder

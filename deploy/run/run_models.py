@@ -19,11 +19,10 @@ from brakeline.errors import BadModel
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.methods import Model, load
+from brakeline.safety.methods import IN_USE, Model, archive_path, load
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.server import IN_USE, archive_path
 from brakeline.safety.service.signature import SignedModel, TrustedSigners, seal_of
 
 log = logging.getLogger("brakeline.launcher")

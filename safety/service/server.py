@@ -21,7 +21,7 @@ from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Decision, check_for_filter
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.methods import Method, Model, load, ready
+from brakeline.safety.methods import IN_USE, Method, Model, archive_path, load, ready
 from brakeline.safety.model.stated_bound import check_bound
 from brakeline.safety.service.joint_request import check_fleet, group_by_fleet, reservations_for
 from brakeline.safety.service.plan_token import PlanAuthenticator
@@ -29,8 +29,6 @@ from brakeline.safety.service.signature import SignedModel, TrustedSigners
 from brakeline.safety.service.wire import batch_of, decision_reply, digest, error_reply, request_of, reservation_of
 
 log = logging.getLogger("brakeline.safety")
-
-IN_USE = "in_use"  # in the archive of a robot: the version that a service put to use last
 
 
 @dataclass
@@ -118,11 +116,6 @@ class ModelRegistry:
             self.known.add(version)
             return True
         return False
-
-
-def archive_path(archive: Path, robot: str, version: str) -> Path:
-    """Return the path of a version in the archive."""
-    return archive / robot / "models" / f"{version}.safetensors"
 
 
 @dataclass

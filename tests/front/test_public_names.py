@@ -41,6 +41,14 @@ def test_a_client_imports_no_simulator_and_no_solver():
     assert found.stdout.strip() == "[]"
 
 
+def test_a_launcher_imports_no_simulator_and_no_compiled_kernels():
+    """It starts with every run, and loads model sets only to check them."""
+    heavy = ("mujoco", "torch", "proxsuite", "numba", "scipy", "matplotlib")
+    code = f"import sys, brakeline.deploy.run.launcher; print([name for name in {heavy} if name in sys.modules])"
+    imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert imported.stdout.strip() == "[]"
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """Unpack a wheel in a folder outside the checkout."""
@@ -89,9 +97,15 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
         "import brakeline.messaging.robot as ours; print(ours.__file__)"
     )
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    clean |= NOT_COMPILED
     # -S: first the install under test, then the packages that it needs.
     found = subprocess.run(
-        [sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False, cwd=crowded, env=clean | NOT_COMPILED
+        [sys.executable, "-S", "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=crowded,
+        env=clean,
     )
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)

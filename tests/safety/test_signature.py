@@ -26,10 +26,10 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, MODEL
-from brakeline.safety.methods import decode
+from brakeline.safety.methods import archive_path, decode
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.service.server import ModelRegistry, SafetySettings, archive_path, main
+from brakeline.safety.service.server import ModelRegistry, SafetySettings, main
 from brakeline.safety.service.signature import (
     CONTEXT,
     ModelSigner,
