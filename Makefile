@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo setup test test-fast check unit bench messages docs safety-gymnasium bullet-safety-gym clean
+.PHONY: demo setup test test-fast check style types kernels unit bench messages docs safety-gymnasium bullet-safety-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -16,20 +16,29 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(STAMP)
 
-test: check unit
+# The types are checked beside the tests: in their first minute, which records data, a core is idle.
+test: style
+	$(MAKE) --no-print-directory --jobs 2 types unit
 
-# Beside it loops are compiled (Numba), once: else by all processes that the first tests start, in their own time.
-check: setup
+check: style types
+
+style: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.perception.occluded_regions as s; s.prepare()' & $(BIN)/mypy; found=$$?; wait; exit $$found
 	$(BIN)/python tests/laws/imports.py
+
+types: setup
+	nice $(BIN)/mypy
+
+# Compiles loops (Numba) once. Otherwise every process that the first tests start would compile them.
+kernels: setup
+	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.perception.occluded_regions as s; s.prepare()'
 
 # Real time in one process, real autopilots in another, whole runs in a third, then the rest at a lower priority
 # (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
-unit: setup
+unit: kernels
 	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.

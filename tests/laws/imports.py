@@ -1,6 +1,6 @@
 """The import rules of the package, as allow-lists: what is not listed here is refused.
 
-`python tests/laws/imports.py` prints every violation, one a line. `make check` runs it.
+`python tests/laws/imports.py` prints every violation, one a line. `make style` runs it.
 """
 
 from __future__ import annotations
