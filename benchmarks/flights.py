@@ -198,7 +198,7 @@ class Flights:
 
     def _certify(self, source: Path, data: Path, *words: str) -> str:
         command = ["certify", str(source), "--robot", "quadrotor-late", *words, "--use", *self._setup.accepting]
-        return told([*command, "--json"], data, BEYOND)
+        return printed_figures([*command, "--json"], data, BEYOND)
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
         """Fly a policy in an arena."""
@@ -239,7 +239,7 @@ class Flights:
             option = "--system" if vehicles == 1 else "--systems"
             where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
             command = [*words, *self._setup.accepting, *self._setup.words, *where]
-            return told(command, self.data, 60.0 * minutes + BEYOND)
+            return printed_figures(command, self.data, 60.0 * minutes + BEYOND)
 
     def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
         """Start an autopilot until the stack ends. Returns its URL and its system id."""
@@ -281,7 +281,7 @@ def switched_on(
         yield url, system
 
 
-def told(words: list[str], data: Path, seconds: float) -> str:
+def printed_figures(words: list[str], data: Path, seconds: float) -> str:
     """Return the last line that a command of ours prints; data: its folder of data sets. Raises Failed."""
     command, environment = [*PYTHON, "-m", "brakeline.deploy.cli", *words], os.environ | {"BRAKELINE_DATA": str(data)}
     done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment, timeout=seconds)

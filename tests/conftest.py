@@ -104,5 +104,5 @@ def flight_folder(data_folder: Path) -> Path:
 @pytest.fixture
 def stalled() -> Iterator[Callable[[], float]]:
     """How long [s] this machine let a thread wait beyond the 10 ms it had asked for: nobody acts in time then."""
-    with stalls(0.01) as found:
-        yield lambda: found.worst
+    with stalls(0.01) as stalled:
+        yield lambda: stalled.worst

@@ -25,15 +25,15 @@ def autopilot(kind: str, folder: Path) -> AbstractContextManager[tuple[str, int]
 
 def autopilots(folder: Path) -> list[AbstractContextManager[tuple[str, int]]]:
     """One of each kind that there is."""
-    found, missing = [], []
+    vehicles, missing = [], []
     for kind in KINDS:
         try:
-            found.append(sitl.flying(kind, _program(kind), folder))
+            vehicles.append(sitl.flying(kind, _program(kind), folder))
         except sitl.NoAutopilot as none:
             missing.append(str(none))
-    if not found:
+    if not vehicles:
         pytest.skip("; ".join(missing))
-    return found
+    return vehicles
 
 
 def _program(kind: str) -> Path:

@@ -216,9 +216,9 @@ def test_evaluate_and_analyse_share_their_keys(figures, data_folder, tmp_path):
 
 
 def test_evaluate_without_a_filter_has_no_times(figures):
-    said = figures("evaluate", "--policy", "greedy", "--method", "none", "--episodes", 2)
-    assert (said["decision_ms"], said["certificate"], said["interventions"]) == (None, None, 0)
-    assert said["containment"] == {"steps": 0, "violations": 0}
+    evaluated = figures("evaluate", "--policy", "greedy", "--method", "none", "--episodes", 2)
+    assert (evaluated["decision_ms"], evaluated["certificate"], evaluated["interventions"]) == (None, None, 0)
+    assert evaluated["containment"] == {"steps": 0, "violations": 0}
 
 
 def test_the_same_seed_gives_the_same_figures(figures, data_folder):
@@ -277,8 +277,8 @@ def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, caps
     monkeypatch.setattr(progress, "console", Console(stderr=True, force_terminal=False))
     with progress.under_way("driving", 3), progress.under_way("recording"):
         time.sleep(0.1)
-    told = capsys.readouterr().err
-    _, innermost, after = told.partition("recording")
+    output = capsys.readouterr().err
+    _, innermost, after = output.partition("recording")
     assert innermost and "driving" not in after
     with progress.under_way("driving", 3), progress.under_way("recording"):
         pass

@@ -101,12 +101,12 @@ def test_kustomize_builds_all_manifests():
 
 def test_compose_file_matches_the_schema():
     jsonschema = pytest.importorskip("jsonschema")
-    said = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-    del said["name"]  # newer than the schema
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    del compose["name"]  # newer than the schema
     schema = json.loads((ROOT / "tests" / "stored" / "compose_spec.json").read_text())
-    jsonschema.Draft201909Validator(schema).validate(said)
-    named = {volume.split(":")[0] for s in said["services"].values() for volume in s["volumes"]}
-    assert {name for name in named if not name.startswith(".")} == set(said["volumes"])
+    jsonschema.Draft201909Validator(schema).validate(compose)
+    named = {volume.split(":")[0] for s in compose["services"].values() for volume in s["volumes"]}
+    assert {name for name in named if not name.startswith(".")} == set(compose["volumes"])
 
 
 def test_systemd_verifies_the_units(tmp_path):

@@ -48,8 +48,8 @@ def loose(certified, few):
 
 def run(capsys, *words):
     status = main([str(word) for word in words])
-    said = capsys.readouterr()
-    return status, said.out, said.err
+    output = capsys.readouterr()
+    return status, output.out, output.err
 
 
 def model_of(folder):
@@ -61,8 +61,8 @@ def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, capsys):
     status, out, err = run(capsys, *CERTIFY, "--json")
     assert status == 1 and not model_of(few).exists()
     assert "not put to use" in err and "limit of ground is 1 %" in err and "--accept-bound 0." in err
-    said = json.loads(out)["residual"]
-    assert said["bound_plan"] > 0.01 and "--accept-bound" in said["not_used"]
+    figures = json.loads(out)["residual"]
+    assert figures["bound_plan"] > 0.01 and "--accept-bound" in figures["not_used"]
 
 
 def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):

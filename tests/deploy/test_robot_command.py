@@ -14,25 +14,25 @@ def run(capsys, *words):
 
 def test_a_new_description_has_no_mistake(tmp_path, capsys):
     path = tmp_path / "rover.toml"
-    code, said = run(capsys, "new", path)
-    assert code == 0 and f"robot check {path}" in said.out.replace("\n", "")
+    code, output = run(capsys, "new", path)
+    assert code == 0 and f"robot check {path}" in output.out.replace("\n", "")
     assert 'name = "rover"' in path.read_text()
-    code, said = run(capsys, "check", path)
-    assert code == 0 and "no mistake" in said.out
-    code, said = run(capsys, "new", path)
-    assert code == 1 and "exists" in said.err
+    code, output = run(capsys, "check", path)
+    assert code == 0 and "no mistake" in output.out
+    code, output = run(capsys, "new", path)
+    assert code == 1 and "exists" in output.err
 
 
 def test_check_lists_every_mistake_and_fails(tmp_path, capsys):
     path = tmp_path / "rover.toml"
     run(capsys, "new", path)
     path.write_text(path.read_text().replace("brake = 3", "brakes = 3").replace('"m/s"', '"km/h"', 1))
-    code, said = run(capsys, "check", path)
+    code, output = run(capsys, "check", path)
     assert code == 1
-    assert "plan.brakes: unknown; did you mean 'brake'?" in said.err and "state.speed.unit" in said.err
-    code, said = run(capsys, "check", path, "--json")
+    assert "plan.brakes: unknown; did you mean 'brake'?" in output.err and "state.speed.unit" in output.err
+    code, output = run(capsys, "check", path, "--json")
     assert code == 1 and {"plan.brakes", "plan.brake", "state.speed.unit"} <= {
-        f for f, _ in json.loads(said.out)["problems"]
+        f for f, _ in json.loads(output.out)["problems"]
     }
 
 
@@ -40,16 +40,16 @@ def test_check_remarks_on_a_short_sensor_range(tmp_path, capsys):
     path = tmp_path / "rover.toml"
     run(capsys, "new", path)
     path.write_text(path.read_text().replace("sight = 3.0", "sight = 0.2"))
-    _, said = run(capsys, "check", path, "--json")
-    assert any(remark.startswith("sight") for remark in json.loads(said.out)["remarks"])
+    _, output = run(capsys, "check", path, "--json")
+    assert any(remark.startswith("sight") for remark in json.loads(output.out)["remarks"])
 
 
 @pytest.mark.parametrize("robot", ["ground", "quadrotor"])
 def test_show_prints_and_draws_a_description(tmp_path, capsys, robot):
     picture = tmp_path / "robot.png"
-    code, said = run(capsys, "show", robot, "--picture", picture, "--json")
-    shown = json.loads(said.out)
+    code, output = run(capsys, "show", robot, "--picture", picture, "--json")
+    shown = json.loads(output.out)
     assert code == 0 and picture.read_bytes().startswith(b"\x89PNG")
     assert shown["name"] == robot and shown["footprint_m"] in (0.105, 0.3)
-    code, said = run(capsys, "show", robot)
-    assert "[m/s]" in said.out and "layout" in said.out
+    code, output = run(capsys, "show", robot)
+    assert "[m/s]" in output.out and "layout" in output.out

@@ -42,9 +42,9 @@ def test_a_drive_fits_its_description(name):
 
 def test_four_minutes_give_a_filter(tmp_path):
     figures = tmp_path / "figures.json"
-    said = run("table.py", "--robots", "diff", "--minutes", "4", "--quick", "--json", str(figures))
+    output = run("table.py", "--robots", "diff", "--minutes", "4", "--quick", "--json", str(figures))
     (row,) = json.loads(figures.read_text())
-    assert said.count("\n") == 3 and said.splitlines()[2].startswith("| diff | 4 min |")
+    assert output.count("\n") == 3 and output.splitlines()[2].startswith("| diff | 4 min |")
     assert row["clearance"] < 0.05 and row["straight"]["set"] < 0.02
     assert row["fresh"]["outside"] <= row["bound"] and row["fresh"]["plans"] > 1000
     for driver, episodes in (("adversary", 20), ("planner", 10)):

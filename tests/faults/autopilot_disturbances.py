@@ -65,8 +65,8 @@ def _again(flights: Flights, setup: str, what: str, name: str, upset: Upset) -> 
     """Certify the flight's log, and fly behind the new model set."""
     renewed = Flights.beside(flights, name)
     shutil.copytree(flights.data, renewed.data, dirs_exist_ok=True)
-    found = flights.certify(name, renewed.data, "--few")
-    rows: Words = {f"{setup}: {what}, certified again": certified(found)}
-    if "refused" not in found:
+    figures = flights.certify(name, renewed.data, "--few")
+    rows: Words = {f"{setup}: {what}, certified again": certified(figures)}
+    if "refused" not in figures:
         rows[f"{setup}: {what}, behind that"] = flown(partial(renewed.upset, f"{name}-again", AFTER, upset))
     return rows

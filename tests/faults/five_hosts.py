@@ -190,8 +190,8 @@ class Fleet:
         for name in self.robots:
             robot = robot_with_task(name)
             method_for(robot, DDPC, ModelConfig())
-            made = method_path(robot, DDPC, ModelConfig())
-            signer.sign(load(made)).save(self.folder / "data" / robot.name / made.name)
+            path = method_path(robot, DDPC, ModelConfig())
+            signer.sign(load(path)).save(self.folder / "data" / robot.name / path.name)
 
     def _add(self, name: str, host: int, *words: object) -> None:
         common = ("--name", name, "--keys", self.folder / "keys")

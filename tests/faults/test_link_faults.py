@@ -80,7 +80,7 @@ def test_the_last_model_set_is_of_the_longest_flight(
     """Of minutes every envelope is half as wide again (`--few`); a setup that flies a third time does without."""
     made: list[tuple[str, bool]] = []
 
-    def told(words: list[str], data: Path, seconds: float) -> str:
+    def printed_figures(words: list[str], data: Path, seconds: float) -> str:
         if words[0] == "certify":
             made.append((Path(words[1]).name, "--few" in words))
             raise Failed("no windows")
@@ -88,7 +88,7 @@ def test_the_last_model_set_is_of_the_longest_flight(
             return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
         raise Failed("no room to hover")
 
-    monkeypatch.setattr(flights, "told", told)
+    monkeypatch.setattr(flights, "printed_figures", printed_figures)
     monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
     rows = dict(flights._rows(Flights(setup, Path("sitl"), tmp_path), 1.0))
     assert made == certified

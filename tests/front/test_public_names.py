@@ -37,8 +37,8 @@ def test_a_client_imports_no_simulator_and_no_solver():
         "import sys; from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground'); "
         f"print([name for name in {heavy} if name in sys.modules])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert found.stdout.strip() == "[]"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_launcher_imports_no_simulator_and_no_compiled_kernels():
@@ -69,9 +69,9 @@ def editable(tmp_path_factory):
     site = tmp_path_factory.mktemp("editable")
     options = ["--quiet", "--no-deps", "--no-build-isolation", "--target", str(site), "--editable", str(ROOT)]
     words = [sys.executable, "-m", "pip", "install", *options]
-    made = subprocess.run(words, check=False, capture_output=True, text=True)
-    if made.returncode:
-        pytest.skip(f"nothing can be installed here: {made.stderr.strip().splitlines()[-1]}")
+    done = subprocess.run(words, check=False, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"nothing can be installed here: {done.stderr.strip().splitlines()[-1]}")
     return site
 
 
@@ -99,7 +99,7 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
     clean |= NOT_COMPILED
     # -S: first the install under test, then the packages that it needs.
-    found = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-S", "-c", code],
         capture_output=True,
         text=True,
@@ -107,8 +107,8 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
         cwd=crowded,
         env=clean,
     )
-    assert found.returncode == 0, found.stderr
-    assert Path(found.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
 
 
 @pytest.mark.parametrize("install", ["wheel", "editable"])

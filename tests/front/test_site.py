@@ -54,8 +54,8 @@ def test_the_search_finds_and_nothing_is_asked_of_others(served: str, tmp_path: 
     with Page(tmp_path) as page:
         page.open(served + "index.html?q=committed+plan")
         page.until("document.querySelectorAll('.md-search-result__item').length > 0")
-        found = page.value("document.querySelector('.md-search-result__list').textContent")
-        assert "Glossary" in found
+        shown = page.value("document.querySelector('.md-search-result__list').textContent")
+        assert "Glossary" in shown
         assert _asked_elsewhere(page, served) == []
 
 

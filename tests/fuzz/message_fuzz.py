@@ -52,7 +52,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.methods import decode
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
-from tests.fuzz.message_fuzzer import Mill
+from tests.fuzz.message_fuzzer import MessageFuzzer
 
 LOOK = 25_000  # messages between two looks at the processes' figures
 SETTLED = 0.3  # share of the messages after which tables are full
@@ -196,13 +196,13 @@ def safety() -> Party:
     return Party((DECIDE, MODEL), take, lambda: models.filters, rejected)
 
 
-def asker(robot: RobotWithTask, mill: Mill) -> Party:
+def asker(robot: RobotWithTask, fuzzer: MessageFuzzer) -> Party:
     """Read the replies to one request."""
     request = request_message(BackupPlan(robot), [0.0] * robot.state_dim, [0.0] * robot.action_dim, known_free=True)
 
     def take(sample: Sample) -> None:
         message = pb.Reply(robot=robot.name)
-        mill.fill(message, mill.random.choice(message.DESCRIPTOR.fields))
+        fuzzer.fill(message, fuzzer.random.choice(message.DESCRIPTOR.fields))
         try:
             read_reply(message, request, robot)
         except BusError:
@@ -211,7 +211,7 @@ def asker(robot: RobotWithTask, mill: Mill) -> Party:
     return Party((DECIDE,), take, lambda: None)
 
 
-def parties(folder: Path, mill: Mill) -> dict[str, Party]:
+def parties(folder: Path, fuzzer: MessageFuzzer) -> dict[str, Party]:
     robot = robot_with_task("ground")
     return {
         "launcher": launcher(folder),
@@ -220,7 +220,7 @@ def parties(folder: Path, mill: Mill) -> dict[str, Party]:
         "learner": learning(robot, folder),
         "actor": actor(robot),
         "safety": safety(),
-        "asker": asker(robot, mill),
+        "asker": asker(robot, fuzzer),
     }
 
 
@@ -238,13 +238,13 @@ def _quiet() -> Iterator[None]:
 
 def fuzz(messages: int, seed: int = 0) -> Figures:
     """Draw messages, and give each to all listeners of its topic; then read a log of the last ones."""
-    mill, begun = Mill(seed), time.monotonic()
+    fuzzer, begun = MessageFuzzer(seed), time.monotonic()
     with tempfile.TemporaryDirectory() as name, _quiet():
         folder = Path(name)
-        everybody = parties(folder, mill)
+        everybody = parties(folder, fuzzer)
         settled, later, process = 0, 0, psutil.Process()
         for number in range(messages):
-            sample = mill.sample(mill.random.choice(TOPICS))
+            sample = fuzzer.sample(fuzzer.random.choice(TOPICS))
             for party in everybody.values():
                 if sample.topic.name in party.names:
                     party.messages += 1

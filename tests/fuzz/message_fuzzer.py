@@ -24,7 +24,7 @@ STRANGE = ("a/b", "../../etc", "\x1b[2J\n", "<script>", "\n", "é" * 40, "a" * 1
 LIMITS = {1: (-(2**31), 2**31 - 1), 2: (-(2**63), 2**63 - 1), 3: (0, 2**32 - 1), 4: (0, 2**64 - 1)}
 
 
-class Mill:
+class MessageFuzzer:
     """Draws messages."""
 
     def __init__(self, seed: int) -> None:

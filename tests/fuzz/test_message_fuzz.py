@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from brakeline.messaging.topics import TOPICS
 from tests.fuzz.message_fuzz import Party, fuzz, parties
-from tests.fuzz.message_fuzzer import Mill
+from tests.fuzz.message_fuzzer import MessageFuzzer
 
 
 def test_no_message_ends_a_process_and_a_report_of_them_can_be_read() -> None:
@@ -22,7 +22,7 @@ def test_no_message_ends_a_process_and_a_report_of_them_can_be_read() -> None:
 
 @pytest.fixture(scope="module")
 def everybody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Party]]:
-    everybody = parties(tmp_path_factory.mktemp("fuzz"), Mill(0))
+    everybody = parties(tmp_path_factory.mktemp("fuzz"), MessageFuzzer(0))
     yield everybody
     for party in everybody.values():
         party.close()
@@ -31,11 +31,11 @@ def everybody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pa
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(topic=st.sampled_from(TOPICS), seed=st.integers(0, 2**32), cut=st.binary(max_size=8))
 def test_whatever_is_sent_is_handled_or_passed_over(
-    everybody: dict[str, Party], mill: Mill, topic, seed: int, cut: bytes
+    everybody: dict[str, Party], fuzzer: MessageFuzzer, topic, seed: int, cut: bytes
 ) -> None:
     """Hypothesis finds the smallest message that ends a process."""
-    mill.random.seed(seed)
-    sample = mill.sample(topic)
+    fuzzer.random.seed(seed)
+    sample = fuzzer.sample(topic)
     for other in (sample, type(sample)(topic, sample.key, sample.payload + cut, sample.received)):
         for party in everybody.values():
             if topic.name in party.names:
@@ -44,5 +44,5 @@ def test_whatever_is_sent_is_handled_or_passed_over(
 
 
 @pytest.fixture(scope="module")
-def mill() -> Mill:
-    return Mill(1)
+def fuzzer() -> MessageFuzzer:
+    return MessageFuzzer(1)

@@ -53,8 +53,8 @@ def pickling(source: str) -> Iterator[str]:
 def test_no_module_pickles():
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py")) if ".venv" not in path.parts]
     assert len(paths) > 400, "the whole tree is searched"
-    found = [f"{path.relative_to(ROOT)}: {use}" for path in paths for use in pickling(path.read_text())]
-    assert not found, "\n".join(found)
+    uses = [f"{path.relative_to(ROOT)}: {use}" for path in paths for use in pickling(path.read_text())]
+    assert not uses, "\n".join(uses)
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def test_ledger_over_restarts():
 def expected_transitions(arrived: list[ActorStep], n: int) -> list[Transition]:
     """By definition: from every step as far as n, its episode and the unbroken sequence reach."""
     by_name = {(m.episode, m.step): m for m in arrived}
-    found = []
+    drawn = []
     for m in arrived:
         window = [m]
         while len(window) < n and not (window[-1].terminated or window[-1].truncated):
@@ -107,8 +107,8 @@ def expected_transitions(arrived: list[ActorStep], n: int) -> list[Transition]:
             window.append(after)
         reward = sum(GAMMA**j * w.reward for j, w in enumerate(window))
         discount = 0.0 if window[-1].terminated else GAMMA ** len(window)
-        found.append(Transition(m.observation, m.action, reward, discount, window[-1].next_observation))
-    return found
+        drawn.append(Transition(m.observation, m.action, reward, discount, window[-1].next_observation))
+    return drawn
 
 
 def comparable(transitions: list[Transition]) -> list[tuple]:
@@ -170,10 +170,10 @@ def test_replay_holds_the_newest_also_when_restored(capacity, count):
     restored.sample(np.random.default_rng(0), again)
     assert all((a == b).all() for a, b in zip(batch.arrays, again.arrays, strict=True))
     assert len(replay) == min(capacity, count)
-    kept = set(range(max(0, count - capacity), count))
-    assert set(batch.reward.flatten().tolist()) <= kept
-    if len(kept) < 12:
-        assert set(batch.reward.flatten().tolist()) == kept
+    stored = set(range(max(0, count - capacity), count))
+    assert set(batch.reward.flatten().tolist()) <= stored
+    if len(stored) < 12:
+        assert set(batch.reward.flatten().tolist()) == stored
     assert (batch.observation[0, :, :1] == batch.reward[0]).all() and (batch.action[0] == -batch.reward[0]).all()
 
 
@@ -240,7 +240,7 @@ AFTER = [
 def test_a_cut_ends_the_episode_for_the_learner_with_the_lowest_reward(stored, terminated, steps, expected):
     windows = NStepWindows(3, GAMMA, stored)
     transitions = [t for k in range(steps) for t in windows.push("a", cut_move(k, k == 2, terminated and k == 2))]
-    found = [
+    sampled = [
         (
             *map(int, t.observation),
             *map(float, t.action),
@@ -250,7 +250,7 @@ def test_a_cut_ends_the_episode_for_the_learner_with_the_lowest_reward(stored, t
         )
         for t in transitions
     ]
-    assert found == expected
+    assert sampled == expected
 
 
 def test_a_cut_is_read_from_the_message():

@@ -189,8 +189,8 @@ def percentiles(values: list[float]) -> dict[str, float] | None:
     if not values:
         return None
     p50, p90, p99 = np.percentile(values, (50, 90, 99), method="inverted_cdf")
-    found = {"count": len(values), "mean": np.mean(values), "std": np.std(values), "min": min(values)}
-    return {name: float(value) for name, value in found.items()} | {
+    figures = {"count": len(values), "mean": np.mean(values), "std": np.std(values), "min": min(values)}
+    return {name: float(value) for name, value in figures.items()} | {
         "p50": float(p50), "p90": float(p90), "p99": float(p99), "max": max(values)
     }  # fmt: skip
 

@@ -22,8 +22,8 @@ def step(robot: str, actor: str, number: int, reward: float, last: bool = False)
     )
 
 
-def health(name: str, last: bool = False, **told: Any) -> pb.Health:
-    return pb.Health(process=name, last=last, **told)
+def health(name: str, last: bool = False, **fields: Any) -> pb.Health:
+    return pb.Health(process=name, last=last, **fields)
 
 
 @pytest.fixture

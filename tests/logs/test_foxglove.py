@@ -178,9 +178,9 @@ def test_the_quadrotors_rays_are_a_cloud_of_the_points_that_were_hit() -> None:
     assert isinstance(cloud, PointCloud) and cloud.point_stride == 12 and len(cloud.data) == 12
     assert struct.unpack("<3f", cloud.data) == pytest.approx(rays.directions[7] * 0.25 * rays.range, abs=1e-6)
     state = [1.0, 2.0, 3.0] + [0.0] * 6
-    made = pb.Decision(tube_center=[1.0, 2.0, 3.0] * 12, tube_half_width=[0.1] * 36)
-    asked = pb.Exchange(request=pb.Request(state=state), reply=pb.Reply(decision=made))
-    shown = foxglove_scene.decision(QUADROTOR, pb.Step(actor="a", state=state), asked, 5).entities[0]
+    decision = pb.Decision(tube_center=[1.0, 2.0, 3.0] * 12, tube_half_width=[0.1] * 36)
+    exchange = pb.Exchange(request=pb.Request(state=state), reply=pb.Reply(decision=decision))
+    shown = foxglove_scene.decision(QUADROTOR, pb.Step(actor="a", state=state), exchange, 5).entities[0]
     assert len(shown.cubes) == 12 and shown.cubes[3].pose.position.z == 3.0 and shown.spheres
     body = foxglove_scene.frames(QUADROTOR, "a", (0.0, 0.0), state, 5).transforms[1]
     assert (body.translation.z, body.rotation.w) == (3.0, 1.0)
@@ -267,7 +267,7 @@ def test_the_layout_speaks_of_topics_and_fields_that_there_are(whole: Studio) ->
         topic, *fields = path.split(".")
         descriptor = kinds[topic.split("/")[0]].DESCRIPTOR
         for field in fields:
-            found = descriptor.fields_by_name[field]
-            descriptor = found.message_type
+            described = descriptor.fields_by_name[field]
+            descriptor = described.message_type
     placed = json.dumps(layout["layout"])
     assert all(f'"{name}"' in placed for name in panels)

@@ -54,11 +54,11 @@ def test_a_truncated_file_is_repaired_and_the_damage_is_reported(tmp_path: Path)
         path = folder / "run.mcap"
         path.write_bytes(data[: int(place * len(data))])
         expected = sum(1 for _ in open_log(path))
-        found = recover(path)
-        assert found.messages == expected == sum(1 for _ in open_log(path)) and open_log(path).cuts == []
+        recovered = recover(path)
+        assert recovered.messages == expected == sum(1 for _ in open_log(path)) and open_log(path).cuts == []
         assert whole(path) == every[: len(whole(path))]
-        assert found.kept is not None and found.kept.read_bytes() == data[: int(place * len(data))]
-        assert "damaged file is" in str(found) and (found.lost > 0 or "summary" in found.cuts[0])
+        assert recovered.kept is not None and recovered.kept.read_bytes() == data[: int(place * len(data))]
+        assert "damaged file is" in str(recovered) and (recovered.lost > 0 or "summary" in recovered.cuts[0])
         again = recover(path)
         assert again.kept is None and "nothing to do" in str(again)
         assert sorted(item.name for item in folder.iterdir()) == ["run.mcap", "run.mcap.damaged"]

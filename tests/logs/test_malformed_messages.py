@@ -58,8 +58,8 @@ def test_the_recorder_stores_malformed_messages_and_goes_on(hostile: Sample, say
     recording = record(path, [hostile, good])
     assert recording.recorded.total() == 2
     log = open_log(path)
-    kept = [payload for _, _, _, payload in log.rows()]
-    assert hostile.payload in kept and good.payload in kept and not log.cuts
+    payloads = [payload for _, _, _, payload in log.rows()]
+    assert hostile.payload in payloads and good.payload in payloads and not log.cuts
     decoded = open_log(path)
     assert [record.message.text for record in decoded if record.topic == "log"][-1] == "after it"
     assert decoded.malformed >= (hostile.payload == b"\xff\xff")
@@ -108,10 +108,10 @@ def test_an_analysis_counts_malformed_messages_and_goes_on(say: Say, tmp_path: P
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0], truncated=True)
     infinite = pb.Step(robot="ground", actor="a", state=[math.inf] * 5)
     record(tmp_path / "run.mcap", [*HOSTILE, *MALFORMED, sample(STEP, infinite), say("step/ground/b", step)])
-    found = analyse_runs(tmp_path, AnalysisOptions(pictures=True))
-    figures = found.figures()
+    analysed = analyse_runs(tmp_path, AnalysisOptions(pictures=True))
+    figures = analysed.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
-    found.by_label()
+    analysed.by_label()
 
 
 def chunk_of(size: int, compression: str, frame: bytes) -> bytes:

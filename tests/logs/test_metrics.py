@@ -207,6 +207,6 @@ def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
 
 def test_times_that_are_none_warn_nobody() -> None:
     decisions = DecisionStats()
-    said = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
-    decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=said)))
+    decision = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
+    decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=decision)))
     assert merge_decisions([decisions]).figures()["latency_ms"]["allowed"]["network"] is None

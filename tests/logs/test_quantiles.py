@@ -26,8 +26,8 @@ def filled(values: list[float]) -> QuantileSketch:
 @given(VALUES, st.floats(0.0, 100.0))
 def test_the_relative_error_of_a_percentile_is_at_most_the_resolution(values: list[float], percent: float) -> None:
     exact = float(np.percentile(values, percent, method="inverted_cdf"))
-    said = merged([filled(values)]).percentile(percent)
-    assert math.isclose(said, exact, rel_tol=RESOLUTION, abs_tol=1e-12)
+    estimate = merged([filled(values)]).percentile(percent)
+    assert math.isclose(estimate, exact, rel_tol=RESOLUTION, abs_tol=1e-12)
 
 
 @given(VALUES, VALUES)
@@ -39,12 +39,12 @@ def test_merged_sketches_equal_one_sketch_of_all_values(one: list[float], two: l
 
 @given(VALUES)
 def test_mean_and_deviation_are_numpys(values: list[float]) -> None:
-    found = summary(filled(values))
-    assert found is not None
+    estimate = summary(filled(values))
+    assert estimate is not None
     largest = max(map(abs, values))
-    assert found["mean"] == pytest.approx(np.mean(values), rel=1e-9, abs=1e-9 * largest)
-    assert found["std"] == pytest.approx(np.std(values), rel=1e-6, abs=1e-6 * largest)
-    assert (found["min"], found["max"], found["count"]) == (min(values), max(values), len(values))
+    assert estimate["mean"] == pytest.approx(np.mean(values), rel=1e-9, abs=1e-9 * largest)
+    assert estimate["std"] == pytest.approx(np.std(values), rel=1e-6, abs=1e-6 * largest)
+    assert (estimate["min"], estimate["max"], estimate["count"]) == (min(values), max(values), len(values))
 
 
 def test_reading_the_figures_does_not_change_them() -> None:
@@ -60,8 +60,8 @@ def test_reading_the_figures_does_not_change_them() -> None:
 
 
 def test_nan_and_infinity_are_counted_apart() -> None:
-    found = merged([filled([1.0, math.inf, -math.inf, math.nan, 0.0])])
-    assert (found.count, found.not_finite, found.low, found.high) == (2, 3, 0.0, 1.0)
+    sketch = merged([filled([1.0, math.inf, -math.inf, math.nan, 0.0])])
+    assert (sketch.count, sketch.not_finite, sketch.low, sketch.high) == (2, 3, 0.0, 1.0)
     assert summary(QuantileSketch()) is None and spread() is None
     with pytest.raises(ValueError, match="no value"):
         QuantileSketch().percentile(50)

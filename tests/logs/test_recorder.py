@@ -130,10 +130,10 @@ def test_recording_survives_a_full_disk_and_resumes(
         assert saved * 1000 + inbox.bytes + inbox.dropped["log/a"] * 1000 >= number * 1000, "none is lost silently"
     assert recording.failure == ""
     recording.finish()
-    kept = [record.message for record in read(tmp_path)]
-    assert len(kept) == recording.recorded.total() == 300 - inbox.dropped.total()
+    recorded = [record.message for record in read(tmp_path)]
+    assert len(recorded) == recording.recorded.total() == 300 - inbox.dropped.total()
     assert 0 < inbox.dropped.total() < 250
-    sequences = [message.header.sequence for message in kept]
+    sequences = [message.header.sequence for message in recorded]
     assert sequences == sorted(set(sequences))
     assert sequences[-9:] == list(range(292, 301))
     assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["run.mcap", "run_0001.mcap"]

@@ -28,9 +28,9 @@ class Cells(HTMLParser):
         self.values: dict[str, Any] = {}
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        found = dict(attributes)
-        if "data-figure" in found:
-            self.values[str(found["data-figure"])] = json.loads(str(found["data-value"]))
+        named = dict(attributes)
+        if "data-figure" in named:
+            self.values[str(named["data-figure"])] = json.loads(str(named["data-value"]))
 
 
 def looked_up(figures: dict[str, Any], name: str) -> Any:
@@ -151,8 +151,8 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
 
     def facts() -> dict[str, str]:
         pairs = "[...document.querySelectorAll('#episode-facts dd')].map(d => [d.dataset.fact, d.textContent])"
-        found: dict[str, str] = page.value(f"Object.fromEntries({pairs})")
-        return found
+        orders: dict[str, str] = page.value(f"Object.fromEntries({pairs})")
+        return orders
 
     for place in (0, len(every) - 1, 3):
         choose = f"s.value = {place}; s.dispatchEvent(new Event('change'))"
@@ -168,8 +168,8 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
     page.value("document.querySelector('#picker button[aria-label=\"next episode\"]').click()")
     assert facts()["episode"] == str(every[4]["episode"])
     page.value("document.querySelectorAll('#near .card button')[2].click()")
-    found = [(robot, order) for robot in data for order in data[robot]["near"]]
-    missed = [next(e for e in data[robot]["episodes"] if e["order"] == order) for robot, order in found]
+    orders = [(robot, order) for robot in data for order in data[robot]["near"]]
+    missed = [next(e for e in data[robot]["episodes"] if e["order"] == order) for robot, order in orders]
     near = sorted(missed, key=lambda episode: episode["closest"])[2]
     assert (facts()["actor"], facts()["episode"]) == (near["actor"], str(near["episode"]))
     page.value("document.querySelector('#picker .bar button:not([aria-label])').click()")
@@ -207,8 +207,8 @@ def test_runs_are_laid_over_each_other_and_never_joined(
     edges = page.value(f"{lines}.map(line => Number(line.getAttribute('points').split(' ').at(-1).split(',')[0]))")
     steps = [run["robots"]["ground"]["steps"] for run in runs]
     assert sorted(range(3), key=lambda k: edges[k]) == sorted(range(3), key=lambda k: steps[k]), "each from its own 0"
-    said = page.value("[...document.querySelectorAll('.tile [data-figure=goals]')].map(t => Number(t.dataset.value))")
-    assert said == [run["goals"] for run in runs], "nothing is pooled"
+    shown = page.value("[...document.querySelectorAll('.tile [data-figure=goals]')].map(t => Number(t.dataset.value))")
+    assert shown == [run["goals"] for run in runs], "nothing is pooled"
     page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
     assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "c"]
     page.value("document.querySelector('#learning-controls input[data-run=b]').click()")

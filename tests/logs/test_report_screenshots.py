@@ -41,13 +41,13 @@ def sections(page: Page) -> tuple[np.ndarray, np.ndarray]:
         "[...document.querySelectorAll('section')].map(s => s.getBoundingClientRect())"
         ".filter(r => r.height > 0).map(r => [r.x + scrollX, r.y + scrollY, r.width, r.height])"
     )
-    found = []
+    tiles = []
     for x, y, width, height in places:
         clip = {"x": x, "y": y, "width": width, "height": height, "scale": 0.5}
         shot = page.call("Page.captureScreenshot", format="png", clip=clip, captureBeyondViewport=True)["data"]
         image = Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB")
-        found.append(np.asarray(image.resize((EDGE, EDGE), Image.Resampling.BOX), dtype=float))
-    return np.array(found), np.array([place[3] for place in places])
+        tiles.append(np.asarray(image.resize((EDGE, EDGE), Image.Resampling.BOX), dtype=float))
+    return np.array(tiles), np.array([place[3] for place in places])
 
 
 def apart(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

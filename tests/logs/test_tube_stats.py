@@ -134,9 +134,9 @@ def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_w
     exchanges = [asked(k, pb.ALLOWED) for k in range(4)]
     for exchange, score, widening in zip(exchanges, (0.5, 1.5, 3.0, float("nan")), (0.0, 1.0, 3.3, 3.3), strict=True):
         exchange.reply.decision.score, exchange.request.widening = score, widening
-    found = figures([of(*exchanges)])
-    assert (found["scored"], found["beyond"], found["beyond_widened"], found["widening"]) == (4, 3, 2, 3.3)
-    shown = printed(show(closed_loop([]) | {"plans": found}))
+    plans = figures([of(*exchanges)])
+    assert (plans["scored"], plans["beyond"], plans["beyond_widened"], plans["widening"]) == (4, 3, 2, 3.3)
+    shown = printed(show(closed_loop([]) | {"plans": plans}))
     assert "3 (75.0%); 2 (50.0%) as widened, by up to 3.3 times" in shown
 
 

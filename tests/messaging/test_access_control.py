@@ -271,10 +271,10 @@ def test_who_looks_on_knows_who_lives(secure: System) -> None:
 @pytest.mark.parametrize("role", sorted({*ROLES} - {"router"}))
 def test_a_role_is_granted_what_the_table_says_and_no_more(role: str) -> None:
     granted = grants(f"{role}-7", "brakeline")
-    said = {key for flow, messages, key in granted if flow == "ingress" and "put" in messages}
+    keys = {key for flow, messages, key in granted if flow == "ingress" and "put" in messages}
     own = {topic for topic in TOPICS if role in topic.publishers and topic.delivery is not Delivery.QUERY}
-    assert {key.split("/")[1] for key in said} == {topic.key.split("/")[0] for topic in own}
-    for key in said:
+    assert {key.split("/")[1] for key in keys} == {topic.key.split("/")[0] for topic in own}
+    for key in keys:
         root = key.split("/")[1]
         if root not in ("weights", "flow", "metrics", "logged"):
             assert key.split("/")[-1] in (f"{role}-7", f"{role}-7.$*"), "under its own name"

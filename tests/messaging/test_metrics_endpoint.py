@@ -63,10 +63,10 @@ def test_a_process_is_scraped_and_asked_whether_it_is_ready():
         process.announce()
         assert get(port, "/ready") == get(port, "/live") == "yes\n"
         until(lambda: scraped(port).get(("brakeline_published_total", "health"), (0,))[0] >= 1, "a Health")
-        found = scraped(port)
-        assert found["brakeline_decisions_total", ""] == (7.0, "safety-0", "safety")
-        assert found["brakeline_decide_seconds", ""][0] == pytest.approx(2.5e-3)
-        assert found["brakeline_connected", ""][0] == 1.0 and found["brakeline_passed_over_total", ""][0] == 0.0
+        metrics = scraped(port)
+        assert metrics["brakeline_decisions_total", ""] == (7.0, "safety-0", "safety")
+        assert metrics["brakeline_decide_seconds", ""][0] == pytest.approx(2.5e-3)
+        assert metrics["brakeline_connected", ""][0] == 1.0 and metrics["brakeline_passed_over_total", ""][0] == 0.0
         with pytest.raises(urllib.error.HTTPError, match="404"):
             get(port, "/keys")
     with pytest.raises(urllib.error.URLError):

@@ -46,9 +46,9 @@ def test_forward_pass_is_the_formula_and_stays_within_the_bounds():
 def test_an_action_outlives_the_next_call():
     policy = decode(FILE)
     first = policy(observation(0))
-    kept = first.copy()
+    copied = first.copy()
     policy(observation(1))
-    assert (first == kept).all()
+    assert (first == copied).all()
 
 
 def test_exploration():

@@ -62,7 +62,7 @@ def test_an_echo_of_the_signal_changes_nothing_and_a_second_one_kills(join: Join
     assert child.poll() is None, "it ends in order"
     child.terminate()
     assert child.wait(5.0) == 128 + signal.SIGTERM
-    assert not any(said.last for said in health)
+    assert not any(message.last for message in health)
 
 
 def test_a_process_that_fails_is_not_silent(join: Join, spawn: Spawn, endpoint: str) -> None:

@@ -120,9 +120,9 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
         asker = stack.enter_context(Bus(BusSettings(connect=(other,)), "actor-0"))
         until(lambda: answers(asker) is not None and min(heard.values()) > 0)
         before = sum(heard.values())
-        said = {asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") for _ in range(50)}
-        assert len(said) == 1 and sum(heard.values()) - before == 50, "each question is answered once"
-        first = said.pop().decode()
+        replied = {asker.ask(DECIDE, b"?", timeout=10.0, robot="ground") for _ in range(50)}
+        assert len(replied) == 1 and sum(heard.values()) - before == 50, "each question is answered once"
+        first = replied.pop().decode()
         second = "ab".replace(first, "")
         slow.add(first)
         time.sleep(HELD)

@@ -39,8 +39,8 @@ def cast(obstacles, at, ways, far=FAR):
 
 def hall(rng, count=5):
     """A floor, and boxes, upright cylinders and balls that are no narrower than `WIDTH`, none of them at the sensor."""
-    found = [Obstacle("box", (0.0, 0.0, -2.0), (40.0, 40.0, 1.0))]
-    while len(found) < count:
+    obstacles = [Obstacle("box", (0.0, 0.0, -2.0), (40.0, 40.0, 1.0))]
+    while len(obstacles) < count:
         at, kind = tuple(rng.uniform(-4.0, 4.0, 3)), rng.integers(3)
         if kind == 0:
             candidate = Obstacle("box", at, tuple(rng.uniform(WIDTH, 2.0, 3)), rng.uniform(-3.0, 3.0))
@@ -49,8 +49,8 @@ def hall(rng, count=5):
         else:
             candidate = Obstacle("sphere", at, (rng.uniform(0.87 * WIDTH, 1.0),))
         if Shapes.of([candidate], 3).distance(np.zeros(3))[0] > 0.3:
-            found.append(candidate)
-    return found
+            obstacles.append(candidate)
+    return obstacles
 
 
 def taken(rng, obstacles, noise=0.0, at=(0.0, 0.0, 0.0), **more):

@@ -41,15 +41,15 @@ CAR = {
 
 def changed(*path_and_value):
     *path, last, value = path_and_value
-    said = copy.deepcopy(CAR)
-    place = said
+    description = copy.deepcopy(CAR)
+    place = description
     for part in path:
         place = place[part]
     if value is ...:
         del place[last]
     else:
         place[last] = value
-    return said
+    return description
 
 
 @pytest.mark.parametrize("robot", [robot_named(name) for name in ROBOTS], ids=ROBOTS)
@@ -115,17 +115,17 @@ def test_what_a_description_says_is_what_the_robot_has():
 def test_a_mistake_is_told_by_its_field(said, field, word):
     with pytest.raises(BadDescription) as caught:
         robot_from_description(said, "my.toml")
-    told = [text for place, text in caught.value.problems if place == field or place.startswith(f"{field}.")]
-    assert any(word in text for text in told), caught.value.problems
+    messages = [text for place, text in caught.value.problems if place == field or place.startswith(f"{field}.")]
+    assert any(word in text for text in messages), caught.value.problems
     assert field in str(caught.value) and "my.toml" in str(caught.value)
 
 
 def test_all_mistakes_are_told_at_once():
-    said = changed("period", -1.0)
-    said["state"]["x"]["unit"] = 3
-    del said["plan"]
+    description = changed("period", -1.0)
+    description["state"]["x"]["unit"] = 3
+    del description["plan"]
     with pytest.raises(BadDescription) as caught:
-        robot_from_description(said)
+        robot_from_description(description)
     assert {"period", "state.x.unit", "plan"} <= {field for field, _ in caught.value.problems}
 
 
@@ -144,9 +144,9 @@ PLACES = [
 
 @given(st.sampled_from(PLACES), VALUES)
 def test_whatever_stands_in_a_field_makes_a_sound_robot_or_is_told(place, value):
-    said = changed(*place, value)
+    description = changed(*place, value)
     try:
-        robot = robot_from_description(said)
+        robot = robot_from_description(description)
     except BadDescription as error:
         assert error.problems
         return
@@ -181,10 +181,10 @@ def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
 
 
 def test_nobody_takes_the_name_of_a_robot_that_comes_with_the_program():
-    said = copy.deepcopy(GROUND.description)
-    said["sight"] = 0.1
+    description = copy.deepcopy(GROUND.description)
+    description["sight"] = 0.1
     with pytest.raises(UnknownRobot, match="choose another"):
-        refuse_shipped_name(robot_from_description(said))
+        refuse_shipped_name(robot_from_description(description))
     assert refuse_shipped_name(GROUND) is GROUND
     assert robot_named("ground").description == GROUND.description
 
@@ -200,10 +200,10 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
 
 
 def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():
-    said = changed("input", "speed", "stop", {"speed": -1.0})
-    said["stopped"] = 0.05
-    del said["input"]["speed"]["slew"]
-    robot: Robot = robot_from_description(said)
+    description = changed("input", "speed", "stop", {"speed": -1.0})
+    description["stopped"] = 0.05
+    del description["input"]["speed"]["slew"]
+    robot: Robot = robot_from_description(description)
     state = np.array([9.0, 9.0, 1.0, 0.3, 0.1])
     assert robot.stop_by_feedback(np.array([0.0, 0.2]), state, np.zeros(2)) == pytest.approx([-0.3, 0.2])
     assert robot.stop_by_feedback(np.zeros(2), np.array([0, 0, 0, 9.0, 0]), np.zeros(2))[0] == -0.5, "within bounds"

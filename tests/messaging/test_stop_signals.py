@@ -28,8 +28,8 @@ def child(wait: str) -> "subprocess.Popen[str]":
 
 
 def ended(process: "subprocess.Popen[str]") -> None:
-    said, _ = process.communicate(timeout=20.0)
-    assert (process.returncode, said) == (0, "ended\n")
+    output, _ = process.communicate(timeout=20.0)
+    assert (process.returncode, output) == (0, "ended\n")
 
 
 def test_a_volley_that_comes_while_it_waits_again_and_again() -> None:

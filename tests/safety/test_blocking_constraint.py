@@ -51,9 +51,9 @@ def test_the_room_is_the_margin_of_the_proposals_tube(ready):
 
 def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
     def by(filter=ready, movers=None, obstacles=(), action=(0.25, 0.0), state=(0, 0, 0, 0.25, 0)):
-        found = filter.decide(request(state, action, obstacles, movers=movers)).blocked_by
-        assert found is not None
-        return found.by
+        blocked_by = filter.decide(request(state, action, obstacles, movers=movers)).blocked_by
+        assert blocked_by is not None
+        return blocked_by.by
 
     assert by(obstacles=[Obstacle("wall", (0.16, 0.0), (), np.pi), cylinder(-1.0, 0.0)]) == "wall"
     assert by(obstacles=[cylinder(-1.0, 0.0), Obstacle("box", (0.3, 0.0), (0.3, 0.3))]) == "box"

@@ -154,37 +154,37 @@ def test_splitting_keeps_trajectories_whole(data):
 
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_windows_are_plans_within_one_trajectory(small, k):
-    found = windows(changed(small, before=np.array([0.2, 0.1])), k)
+    columns = windows(changed(small, before=np.array([0.2, 0.1])), k)
     expected = []
     for number, t in enumerate(small.trajectories):
         starts = range(len(t.inputs) - k + 1)  # of one free input, then zero
         expected += [(number, start) for start in starts if not t.inputs[start + 1 : start + k].any()]
-    assert [tuple(s) for s in found.start] == expected
+    assert [tuple(s) for s in columns.start] == expected
     for row, (number, start) in enumerate(expected):
         t = small.trajectories[number]
         first = [0.2, 0.1] if number == 0 else [0.0, 0.0]
         before = t.inputs[start - 1] if start else first
-        assert np.array_equal(found.z[row], [*t.states[start, 3:], *before, *t.inputs[start]])
-        assert np.array_equal(found.y[row, 3:], t.states[start + k, 3:])
+        assert np.array_equal(columns.z[row], [*t.states[start, 3:], *before, *t.inputs[start]])
+        assert np.array_equal(columns.y[row, 3:], t.states[start + k, 3:])
 
 
 def test_chord_deviation_and_stopping_distance_by_brute_force(small):
-    found = windows(small, 3)
-    for row in range(0, len(found), 7):
-        number, start = found.start[row]
+    columns = windows(small, 3)
+    for row in range(0, len(columns), 7):
+        number, start = columns.start[row]
         t = small.trajectories[number]
         path = np.vstack([np.zeros(2), t.paths[start + 2]])
         along = path[0] + np.linspace(0, 1, 4001)[:, None] * (path[-1] - path[0])
         brute = np.linalg.norm(path[:, None] - along[None], axis=2).min(1).max()
-        assert found.chord_deviation[row] == pytest.approx(brute, abs=1e-5)
+        assert columns.chord_deviation[row] == pytest.approx(brute, abs=1e-5)
         at, position, heading, farthest = start + 3, np.zeros(2), 0.0, np.nan
         while at < len(t.inputs) and not t.inputs[at].any():
             points = position + rotate(t.paths[at], heading)
             farthest = np.nanmax([farthest, np.linalg.norm(points, axis=1).max()])
             position, heading, at = points[-1], heading + t.turned[at], at + 1
-        assert found.stopping_distance[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
-    assert np.isnan(found.stopping_distance).any()
-    assert not np.isnan(found.stopping_distance).all()
+        assert columns.stopping_distance[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
+    assert np.isnan(columns.stopping_distance).any()
+    assert not np.isnan(columns.stopping_distance).all()
 
 
 STATE = arrays(float, 5, elements=st.floats(-3, 3))
@@ -193,7 +193,7 @@ STATE = arrays(float, 5, elements=st.floats(-3, 3))
 @settings(max_examples=100)
 @given(STATE, STATE, st.floats(-10, 10), st.floats(-10, 10), st.floats(-4, 4))
 def test_displacement_does_not_depend_on_the_pose_in_the_world(start, end, dx, dy, turn):
-    seen = displacement(GROUND, start, end)
+    measured = displacement(GROUND, start, end)
 
     def moved(state):
         out = state.copy()
@@ -202,9 +202,9 @@ def test_displacement_does_not_depend_on_the_pose_in_the_world(start, end, dx, d
         return out
 
     again = displacement(GROUND, moved(start), moved(end))
-    again[2] = (again[2] - seen[2] + np.pi) % (2 * np.pi) - np.pi + seen[2]
-    assert np.allclose(seen, again, atol=1e-9)
-    assert -np.pi <= seen[2] < np.pi
+    again[2] = (again[2] - measured[2] + np.pi) % (2 * np.pi) - np.pi + measured[2]
+    assert np.allclose(measured, again, atol=1e-9)
+    assert -np.pi <= measured[2] < np.pi
 
 
 def test_windows_apart_do_not_overlap(small):

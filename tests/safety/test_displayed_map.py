@@ -47,8 +47,8 @@ def test_space_drawn_as_free_is_free_and_hits_lie_on_surfaces(seed):
 
 
 def test_a_request_without_scan_and_obstacles_has_an_empty_map():
-    about = map_for_display(GROUND, pb.Request(state=[0.0] * 5))
-    assert all(told == [] for told in about.flat().values())
+    local_map = map_for_display(GROUND, pb.Request(state=[0.0] * 5))
+    assert all(values == [] for values in local_map.flat().values())
 
 
 def test_the_discs_contain_every_position_of_a_mover():
@@ -77,12 +77,12 @@ def test_the_flat_map_of_a_flying_mover_has_the_radius_last():
 
 def test_the_reserved_boxes_are_the_new_ones_or_the_rest_of_the_old_ones():
     old, new = (pb.Reservation(center=[x, 0.0], half_width=[0.1, 0.2], radius=[0.15]) for x in (1.0, 2.0))
-    asked = pb.Exchange(request=pb.Request(reservation=old))
-    assert reserved_boxes(GROUND, asked).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
-    asked.reply.decision.reservation.CopyFrom(new)
-    assert reserved_boxes(GROUND, asked)[0, 0] == 2.0
-    asked.reply.decision.reservation.radius.append(1.0)
-    assert len(reserved_boxes(GROUND, asked)) == 0, "the sizes do not match"
+    exchange = pb.Exchange(request=pb.Request(reservation=old))
+    assert reserved_boxes(GROUND, exchange).tolist() == [[1.0, 0.0, 0.1, 0.2, 0.15]]
+    exchange.reply.decision.reservation.CopyFrom(new)
+    assert reserved_boxes(GROUND, exchange)[0, 0] == 2.0
+    exchange.reply.decision.reservation.radius.append(1.0)
+    assert len(reserved_boxes(GROUND, exchange)) == 0, "the sizes do not match"
 
 
 def test_a_tracked_surface_is_drawn_where_it_may_go():

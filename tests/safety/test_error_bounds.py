@@ -74,8 +74,8 @@ def test_published_model_set_of_the_double_integrator():
     truth = PUBLISHED["tzpc_double_integrator"]
     z = np.vstack([truth["X0"], truth["U"]]).T
     y, generators = np.array(truth["X1"]).T, np.array(truth["W_gen"])
-    made = matrix_zonotope(z, y, generators, np.ones((2, len(z))), np.zeros((2, 3)), np.ones(2))
-    low, high = matrix_hull(made)
+    bound = matrix_zonotope(z, y, generators, np.ones((2, len(z))), np.zeros((2, 3)), np.ones(2))
+    low, high = matrix_hull(bound)
     assert np.allclose(low, truth["M_sigma_lo"], atol=1e-8)
     assert np.allclose(high, truth["M_sigma_hi"], atol=1e-8)
 
@@ -117,8 +117,8 @@ def test_no_noise_sequence_leaves_the_tube(system, name):
 
 def test_noise_sequences_leave_a_tube_of_half_the_noise():
     system = lti5()
-    made = certificates(system)["set-membership"]
-    narrow = ErrorBound(made.C, made.W, 0.0 * made.M, made.kappa, 0.5 * made.w, made.generators)
+    bound = certificates(system)["set-membership"]
+    narrow = ErrorBound(bound.C, bound.W, 0.0 * bound.M, bound.kappa, 0.5 * bound.w, bound.generators)
     rng = np.random.default_rng(7)
     plan = np.full((HORIZON, 1), 8.0)
     states = system.rollouts(rng, np.zeros(5), plan, 1000, worst=True)
@@ -129,11 +129,11 @@ def test_noise_sequences_leave_a_tube_of_half_the_noise():
 def test_the_true_matrices_are_in_both_sets():
     for system in (lti5(), lti5(v_half=0.0005), double_integrator()):
         truth = np.hstack([system.A, system.B])
-        for made in certificates(system).values():
+        for bound in certificates(system).values():
             rng = np.random.default_rng(3)
             z = rng.normal(size=(200, truth.shape[1]))
-            off = np.abs(z @ (truth - made.C).T)
-            assert (off <= np.abs(z @ made.W.T) @ made.M.T + 1e-9).all()
+            off = np.abs(z @ (truth - bound.C).T)
+            assert (off <= np.abs(z @ bound.W.T) @ bound.M.T + 1e-9).all()
 
 
 def test_the_bound_on_the_measurement_noise_holds_for_the_true_matrix():
@@ -156,7 +156,7 @@ def test_the_factored_form_is_the_matrix_zonotope_multiplied_out():
     y, G = np.array(truth["X1"]).T, np.array(truth["W_gen"])
     rng = np.random.default_rng(0)
     sizes = rng.uniform(0.5, 2.0, (2, len(z)))
-    made = matrix_zonotope(z, y, G, sizes, np.zeros((2, 3)), np.zeros(2))
+    bound = matrix_zonotope(z, y, G, sizes, np.zeros((2, 3)), np.zeros(2))
     pseudo = np.linalg.pinv(z.T)
     matrices = []
     for j in range(2):
@@ -168,17 +168,17 @@ def test_the_factored_form_is_the_matrix_zonotope_multiplied_out():
     for _ in range(20):
         at, direction = rng.normal(size=3), rng.normal(size=2)
         explicit = sum(abs(direction @ matrix @ at) for matrix in matrices)
-        factored = np.abs(direction @ made.generators) @ made.magnitudes(at)
+        factored = np.abs(direction @ bound.generators) @ bound.magnitudes(at)
         assert factored == pytest.approx(explicit, rel=1e-10)
 
 
 @pytest.mark.parametrize("system", [lti5(), double_integrator()], ids=["lti5", "double-integrator"])
 def test_set_membership_is_never_wider_along_whitened_axes(system):
     z, _ = system.data(0)
-    made = certificates(system)
+    bounds = certificates(system)
     for i in range(z.shape[1]):
         at = np.linalg.solve(whitening(z), np.eye(z.shape[1])[i])
-        inner, outer = made["set-membership"].magnitudes(at), made["matrix-zonotope"].magnitudes(at)
+        inner, outer = bounds["set-membership"].magnitudes(at), bounds["matrix-zonotope"].magnitudes(at)
         assert (inner <= outer + 1e-6).all()
 
 
@@ -242,7 +242,7 @@ def test_data_that_support_no_bound_are_refused(fit):
 def test_the_outer_form_is_never_narrower(seed, rows):
     rng = np.random.default_rng(seed)
     nz, g = 4, 3
-    made = ErrorBound(
+    bound = ErrorBound(
         rng.normal(size=(2, nz)),
         rng.normal(size=(rows, nz)),
         rng.uniform(size=(g, rows)),
@@ -251,10 +251,10 @@ def test_the_outer_form_is_never_narrower(seed, rows):
         rng.normal(size=(2, g)),
     )
     basis = rng.normal(size=(nz, nz)) + 3.0 * np.eye(nz)
-    outer = made.outer(basis)
+    outer = bound.outer(basis)
     assert len(outer.W) <= max(nz, 4)
     z = rng.normal(size=(50, nz))
-    assert (outer.magnitudes(z) >= made.magnitudes(z) - 1e-9).all()
+    assert (outer.magnitudes(z) >= bound.magnitudes(z) - 1e-9).all()
 
 
 def test_the_envelope_bounds_every_sample_and_is_the_smallest():
@@ -290,5 +290,5 @@ def test_the_residual_certificate_bounds_its_samples():
     rng = np.random.default_rng(2)
     z = rng.normal(size=(500, 3))
     y = z @ rng.normal(size=(3, 2)) + 0.01 * np.sin(5.0 * z[:, :2]) * np.abs(z[:, :1])
-    made = residual(z, y, least_squares(z, y))
-    assert (np.abs(y - z @ made.C.T) <= made.half_widths(z)).all()
+    bound = residual(z, y, least_squares(z, y))
+    assert (np.abs(y - z @ bound.C.T) <= bound.half_widths(z)).all()

@@ -50,12 +50,12 @@ def test_two_robots_that_drive_at_each_other_do_not_meet(fleet):
         for robot, answer in zip(robots, answers, strict=True):
             robot.step(answer.action)
         moved = max(moved, robots[0].state[0] + 0.25)
-        one, other = (kept.reservation for kept in fleet.backup_plans)
+        one, other = (backup_plan.reservation for backup_plan in fleet.backup_plans)
         assert one.distance(other) > 0.0
         assert least_distance(robots) > 2.0 * GROUND.footprint
     assert moved > 0.02, "they stood all the time"
     fleet.reset()
-    assert all(kept.reservation is None and not kept.plan.any() for kept in fleet.backup_plans)
+    assert all(backup_plan.reservation is None and not backup_plan.plan.any() for backup_plan in fleet.backup_plans)
 
 
 def test_without_a_decision_for_one_robot_no_robot_has_one(fleet):
@@ -63,27 +63,28 @@ def test_without_a_decision_for_one_robot_no_robot_has_one(fleet):
     answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
     for robot, answer in zip(robots, answers, strict=True):
         robot.step(answer.action)
-    before = [(kept.plan.copy(), kept.input_in_force, kept.reservation) for kept in fleet.backup_plans]
+    before = [(backup.plan.copy(), backup.input_in_force, backup.reservation) for backup in fleet.backup_plans]
     with pytest.raises(SafetyError) as caught:
         decided(fleet, robots, [[0.2, 0.3], [0.0]])
     assert caught.value.field == "action"
-    for kept, (plan, held, reservation) in zip(fleet.backup_plans, before, strict=True):
-        assert np.array_equal(kept.plan, plan) and kept.input_in_force is held and kept.reservation is reservation
+    for backup, (plan, in_force, reservation) in zip(fleet.backup_plans, before, strict=True):
+        assert np.array_equal(backup.plan, plan)
+        assert backup.input_in_force is in_force and backup.reservation is reservation
     inputs = fleet.fallback()
-    assert all(np.array_equal(given, plan[0]) for given, (plan, *_) in zip(inputs, before, strict=True))
-    for robot, given in zip(robots, inputs, strict=True):
-        robot.step(given)
+    assert all(np.array_equal(executed, plan[0]) for executed, (plan, *_) in zip(inputs, before, strict=True))
+    for robot, executed in zip(robots, inputs, strict=True):
+        robot.step(executed)
     assert [a.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
 
 
 def test_the_first_robot_changes_each_period(fleet, monkeypatch):
-    asked = []
-    monkeypatch.setattr(fleet.bus, "ask", lambda key, payload, *_, **__: asked.append(payload) or b"")
+    queries = []
+    monkeypatch.setattr(fleet.bus, "ask", lambda key, payload, *_, **__: queries.append(payload) or b"")
     for _ in range(3):
         with pytest.raises(SafetyError):
             fleet.decide([np.zeros(5), np.ones(5)], [[0.1, 0.0]] * 2, [[], []])
         fleet.fallback()
-    requests = [pb.RequestBatch.FromString(payload).requests for payload in asked]
+    requests = [pb.RequestBatch.FromString(payload).requests for payload in queries]
     assert [[(r.step, r.actor, tuple(r.fleet)) for r in batch] for batch in requests] == [
         [(i, name, NAMES) for name in NAMES] for i in range(3)
     ]
@@ -93,15 +94,16 @@ def test_a_fleet_needs_known_free_space(fleet):
     robots = facing(np.random.default_rng(2))
     decided(fleet, robots, [[0.0, 0.1]] * 2)
     fleet.reset()
-    asked = [r.measure() for r in robots], [[0.0, 0.1]] * 2
+    questions = [r.measure() for r in robots], [[0.0, 0.1]] * 2
     with pytest.raises(SafetyError, match="known_free") as caught:
-        fleet.decide(*asked)
+        fleet.decide(*questions)
     assert caught.value.field == "obstacles"
     fleet.fallback()
-    assert [answer.kind for answer in fleet.decide(*asked, known_free=True)] == ["allowed", "allowed"]
+    assert [answer.kind for answer in fleet.decide(*questions, known_free=True)] == ["allowed", "allowed"]
     fleet.reset()
-    blind = [Scan(np.full(360, 0.13), np.linspace(-np.pi, np.pi, 360, endpoint=False), tuple(s[:3])) for s in asked[0]]
-    assert {answer.kind for answer in fleet.decide(*asked, scans=blind)} == {"failsafe"}
+    states, angles = questions[0], np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    blind = [Scan(np.full(360, 0.13), angles, tuple(state[:3])) for state in states]
+    assert {answer.kind for answer in fleet.decide(*questions, scans=blind)} == {"failsafe"}
 
 
 def test_a_malformed_fleet_is_refused(fleet):

@@ -118,8 +118,8 @@ def test_tubes_from_free_driving_hold_plans_that_were_never_driven(which):
 
 def test_the_validation_report_is_about_windows_of_the_same_kind():
     fitted, held_out = free_data(5), free_data(6, count=40)
-    said = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, held_out)
-    assert said.windows > 300 and said.bound_step < 0.05 and said.bound_plan < 0.1
+    report = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, held_out)
+    assert report.windows > 300 and report.bound_step < 0.05 and report.bound_plan < 0.1
     shaken = free_data(6, noise=10.0, count=40)
     worse = validate(fit_model_set(fitted, ModelConfig(windows=FREE)), fitted, shaken)
     assert worse.step_violations > 0.3 * worse.windows

@@ -99,11 +99,12 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     env = SafetyWrapper.load(Toy(CAR, discs()), tmp_path / "model.safetensors", penalty=1.0, accept_bound=1.0, **HOW)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.array([-1.0, 0.0]))
-    told = info["diagnostics"]
-    assert told["kind"] == info["safety"].kind == "allowed" and told["verified"] and told["margin"] > 0.0
-    assert np.array_equal(told["executed"], [0.0, 0.0]) and np.array_equal(told["proposed"], [0.0, 0.0])
+    diagnostics = info["diagnostics"]
+    assert diagnostics["kind"] == info["safety"].kind == "allowed"
+    assert diagnostics["verified"] and diagnostics["margin"] > 0.0
+    assert np.array_equal(diagnostics["executed"], [0.0, 0.0]) and np.array_equal(diagnostics["proposed"], [0.0, 0.0])
     assert reward == -info["penalty"] == 0.0
-    assert ModelSet.load(tmp_path / "model.safetensors").version == told["model"]
+    assert ModelSet.load(tmp_path / "model.safetensors").version == diagnostics["model"]
 
 
 class Silent(SafetyClient):

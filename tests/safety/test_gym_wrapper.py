@@ -75,8 +75,8 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     _, reward, _, _, info = env.step(np.array([wrong, 0.1]))
     assert not env.unwrapped.executed[0].any()
     assert np.isfinite(reward)
-    told = info["diagnostics"]
-    assert (told["kind"], told["verified"], told["reason"]) == ("failsafe", True, NOT_FINITE)
+    diagnostics = info["diagnostics"]
+    assert (diagnostics["kind"], diagnostics["verified"], diagnostics["reason"]) == ("failsafe", True, NOT_FINITE)
 
 
 def test_every_episode_starts_standing(ready):

@@ -76,8 +76,8 @@ def test_half_spaces_that_lead_out_have_the_obstacle_behind_them_and_are_the_sam
             assert (normals == planes[0]).all() and (offsets == planes[1]).all()
         elif np.isfinite(offsets).all():  # except in the middle, where no way out is known
             assert (offsets < 0.0).all()  # it is not free yet
-            kept = BODY + np.abs(normals[0, 0]) @ measured
-            assert ((drawn - start) @ normals[0, 0] >= offsets[0, 0] + kept - 1e-7).all()
+            clearance = BODY + np.abs(normals[0, 0]) @ measured
+            assert ((drawn - start) @ normals[0, 0] >= offsets[0, 0] + clearance - 1e-7).all()
 
 
 def test_an_obstacle_with_nan_leaves_nothing_free():

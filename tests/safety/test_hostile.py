@@ -59,8 +59,8 @@ def _root(square: Fraction | int) -> Fraction:
 @given(scenes())
 def test_the_distance_to_an_obstacle_is_exact(scene: tuple[Obstacle, list[float]]) -> None:
     obstacle, point = scene
-    found = float(Shapes.of([obstacle], len(point)).distance(np.array(point))[0])
-    assert abs(found - exact(obstacle, point)) <= NEAR
+    distance = float(Shapes.of([obstacle], len(point)).distance(np.array(point))[0])
+    assert abs(distance - exact(obstacle, point)) <= NEAR
 
 
 @pytest.mark.parametrize("far", [2e4, 1e5, 1e154, 1e300, float("inf"), float("nan")])

@@ -237,8 +237,8 @@ def test_any_number_of_joints():
     ],
 )
 def test_what_only_a_robot_with_a_position_can_hit_is_refused(said, field):
-    kept = BackupPlan(joints(2))
-    request = Request(np.zeros(4), np.zeros(2), kept.input_in_force, kept.plan, Shapes.of([], 0))
+    backup_plan = BackupPlan(joints(2))
+    request = Request(np.zeros(4), np.zeros(2), backup_plan.input_in_force, backup_plan.plan, Shapes.of([], 0))
     assert ready().decide(request).kind == ALLOWED, "known_free is implied"
     with pytest.raises(BadRequest, match="has no position") as caught:
         ready().decide(replace(request, **said))

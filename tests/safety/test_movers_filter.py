@@ -137,11 +137,11 @@ def contacts(ready, policy, seed, sees=True, steps=300):
     touching = False
     for k in range(steps):
         state = robot.measure()
-        seen = watch.measure(k * GROUND.period)
-        places = np.array([o.position for o in seen]) - state[:2]
+        measured = watch.measure(k * GROUND.period)
+        places = np.array([o.position for o in measured]) - state[:2]
         nearest = places[np.argmin(np.linalg.norm(places, axis=1))]
         bearing = (np.arctan2(nearest[1], nearest[0]) - state[2] + np.pi) % (2 * np.pi) - np.pi
-        u = safety.decide(state, policy(k, rng, bearing), [*ROOM, *(seen if sees else ())]).action
+        u = safety.decide(state, policy(k, rng, bearing), [*ROOM, *(measured if sees else ())]).action
         start = robot.state.copy()
         path, _ = robot.step(u)
         for i, at in enumerate(start[:2] + rotate(path, start[2])):

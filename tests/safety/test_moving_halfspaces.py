@@ -167,11 +167,11 @@ def test_a_mover_within_its_bounds_is_consistent_with_its_last_sighting(data, se
 def test_a_mover_that_breaks_its_bound_is_inconsistent_with_its_last_sighting():
     before = Sighting((0.0, 0.0), (1.0, 0.0), 0.2)
 
-    def kept(x, velocity=(1.0, 0.0)):
+    def consistent(x, velocity=(1.0, 0.0)):
         return Motion(velocity, 0.01, 0.01, acceleration=1.0, before=before).is_consistent((x, 0.0))
 
-    assert kept(0.2) and kept(0.24) and not kept(0.25) and not kept(0.15)
-    assert kept(0.2, (1.2, 0.05)) and not kept(0.2, (1.25, 0.0))
+    assert consistent(0.2) and consistent(0.24) and not consistent(0.25) and not consistent(0.15)
+    assert consistent(0.2, (1.2, 0.05)) and not consistent(0.2, (1.25, 0.0))
 
 
 @pytest.mark.parametrize(

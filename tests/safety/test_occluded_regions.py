@@ -81,8 +81,8 @@ def test_every_point_within_reach_is_beyond_some_half_space(seed, dropped):
     if np.isneginf(offsets).all():  # so much is not seen that even the start may be occupied
         return
     for k in range(6):
-        kept = normals[:, k].any(axis=1)
-        beyond = near @ normals[kept, k].T >= offsets[kept, k] - 1e-6
+        used = normals[:, k].any(axis=1)
+        beyond = near @ normals[used, k].T >= offsets[used, k] - 1e-6
         outside = beyond[:, : -len(FACES)].any(axis=1) | (np.abs(near) >= 2.0).any(axis=1)
         assert outside.all()
 
@@ -143,8 +143,8 @@ def test_half_spaces_keep_the_body_off_and_recede_with_time_from_what_may_move()
     still, moving = (taken(rng, wall, speed=s, age=0.1) for s in (0.0, 0.5))
     ahead = planes(still, nominal)[1][0]
     assert 0.8 < ahead[0] <= 1.0
-    kept = planes(still, nominal, None, BODY, np.full(3, 0.01))[1][0]
-    assert (ahead - kept >= BODY + 0.01 - 0.02).all()
+    shrunk = planes(still, nominal, None, BODY, np.full(3, 0.01))[1][0]
+    assert (ahead - shrunk >= BODY + 0.01 - 0.02).all()
     lost = ahead - planes(moving, nominal)[1][0]
     assert np.allclose(lost, 0.5 * (0.1 + 0.2 * np.arange(1, 4)), atol=0.02)
 

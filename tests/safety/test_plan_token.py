@@ -103,11 +103,11 @@ def test_each_period_has_its_token_until_the_robot_stands(robot: Robot) -> None:
         for _ in range(robot.horizon + 2):
             predicted = backup_plan.predicted
             state = np.zeros(robot.state_dim) if predicted is None else predicted.center
-            asked = request_message(backup_plan, state, plan[0], known_free=True, actor="a")
-            asked = pb.Request.FromString(asked.SerializeToString())
-            assert authenticator.is_authentic(asked, robot)
+            message = request_message(backup_plan, state, plan[0], known_free=True, actor="a")
+            message = pb.Request.FromString(message.SerializeToString())
+            assert authenticator.is_authentic(message, robot)
             moving = bool(np.any(backup_plan.plan) or np.any(backup_plan.input_in_force))
-            assert bool(asked.model) == moving and len(asked.plan_token) == SIZE
+            assert bool(message.model) == moving and len(message.plan_token) == SIZE
             backup_plan.fallback()
 
 

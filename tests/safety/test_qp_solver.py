@@ -85,12 +85,12 @@ def test_the_active_rows_alone_give_the_solution_of_all_rows(parts):
 
 
 def test_the_guessed_active_set_saves_rounds_and_changes_no_solution(parts, monkeypatch):
-    found = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
+    crowded_programs = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
     rounds = []
     for steps in (qp_solver.STEPS, 0):
         parts.clear()
         monkeypatch.setattr(qp_solver, "STEPS", steps)
-        for program in found:
+        for program in crowded_programs:
             assert value(program, solve(program).x) == pytest.approx(value(program, by_daqp(program)[0]), abs=1e-5)
         rounds.append(len(parts))
     assert rounds[0] < 0.9 * rounds[1]

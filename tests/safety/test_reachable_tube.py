@@ -25,7 +25,7 @@ def rotated(vectors, angle):
 def rollouts():
     """Rollouts of plans: (z, displacements (3, 2), chord deviations (3,), stopping distance)."""
     rng = np.random.default_rng(99)
-    found = []
+    rollouts = []
     low, high = GROUND.low(), GROUND.high()
     for _ in range(1500):
         robot = Unicycle(rng.uniform(-3, 3, 3), rng)
@@ -48,8 +48,8 @@ def rollouts():
             robot.step(np.zeros(2))
             way = max(way, np.linalg.norm(robot.state[:2] - stopped))
         z = np.concatenate([start[3:], before, u])
-        found.append((z, np.array(ends), np.array(chord_deviations), way))
-    return found
+        rollouts.append((z, np.array(ends), np.array(chord_deviations), way))
+    return rollouts
 
 
 def violations(tube, rollouts):

@@ -76,8 +76,8 @@ def test_a_request_that_passes_the_fast_check_passes_field_by_field(robot, seed,
                 changed.ravel()[at % changed.size] = odd
         return changed
 
-    asked = with_(sound, field, put)
-    assert lets_pass(robot, asked) or not ordinary(asked)
+    modified = with_(sound, field, put)
+    assert lets_pass(robot, modified) or not ordinary(modified)
 
 
 @pytest.mark.parametrize("field", [field for field in FIELDS[:-1] if field != "observation"])
@@ -94,10 +94,10 @@ def test_the_filter_refuses_an_observation_that_is_not_a_vector_of_bounded_size(
     robot = robot_named("ground")
     sound = usual(robot, 1, True)
     for size in (0, 1, MOST_OBSERVED):
-        asked = replace(sound, observation=np.zeros(size, np.float32))
-        assert FastRequestCheck(robot)(asked) and lets_pass(robot, asked)
-    asked = replace(sound, observation=observed)
-    assert not FastRequestCheck(robot)(asked) and not lets_pass(robot, asked)
+        changed = replace(sound, observation=np.zeros(size, np.float32))
+        assert FastRequestCheck(robot)(changed) and lets_pass(robot, changed)
+    changed = replace(sound, observation=observed)
+    assert not FastRequestCheck(robot)(changed) and not lets_pass(robot, changed)
 
 
 def test_the_type_and_layout_of_arrays_do_not_change_the_decision(ready):

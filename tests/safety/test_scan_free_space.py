@@ -33,16 +33,16 @@ def cast(obstacles, at, angles, far=FAR):
 
 def scene(rng, count=6):
     """Boxes with edges of `WIDTH` or more and discs of √½ of it or more in radius, none of them at the sensor."""
-    found = []
-    while len(found) < count:
+    distances = []
+    while len(distances) < count:
         at = tuple(rng.uniform(-1.5, 1.5, 2))
         if rng.random() < 0.5:
             candidate = Obstacle("box", at, tuple(rng.uniform(WIDTH, 0.5, 2)), rng.uniform(-3, 3))
         else:
             candidate = Obstacle("cylinder", at, (rng.uniform(WIDTH / math.sqrt(2), 0.3),))
         if Shapes.of([candidate], 2).distance(np.zeros(2))[0] > 0.12:
-            found.append(candidate)
-    return found
+            distances.append(candidate)
+    return distances
 
 
 def taken(rng, obstacles, drop=0.0, noise=0.0, pose=(0.0, 0.0, 0.0), **more):

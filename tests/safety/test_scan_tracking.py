@@ -95,9 +95,9 @@ def outside(rng, kind, scans=9, count=24):
     sensor, drives = rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2, 2)
     still = []
     while kind is comes_out and len(still) < 2:  # only these paths need something to hide behind
-        one = Obstacle("cylinder", tuple((sensor + rng.uniform(-1.3, 1.3, 2)).tolist()), (rng.uniform(0.1, 0.35),))
-        if Shapes.of([*still, one], 2).distance(sensor).min() > 0.3:
-            still.append(one)
+        obstacle = Obstacle("cylinder", tuple((sensor + rng.uniform(-1.3, 1.3, 2)).tolist()), (rng.uniform(0.1, 0.35),))
+        if Shapes.of([*still, obstacle], 2).distance(sensor).min() > 0.3:
+            still.append(obstacle)
     at = kind(rng, sensor, still)
     walls = Shapes.of([*ROOM, *still], 2)
     memory, looked, worst = FanMemory(GROUND.footprint), 0, -math.inf
@@ -187,11 +187,11 @@ def test_no_group_is_tracked_across_a_missing_scan_or_with_doubted_beams(missing
     rng, follower, now = np.random.default_rng(0), ScanTracker(), 0.0
     for k in range(5):
         scan = taken([*ROOM, disc(np.array([1.0, -0.5 + 0.8 * now]))], np.zeros(2), rng, doubt=doubt)
-        said = follower.follow(scan).tracks
+        tracks = follower.follow(scan).tracks
         passed = DT * (1 + missing * (k == 3))
         now += passed
         follower.later(passed)
-    assert bool((np.abs(said.motions[:, :2]).max(axis=1) > 0.4).any()) is followed
+    assert bool((np.abs(tracks.motions[:, :2]).max(axis=1) > 0.4).any()) is followed
 
 
 def followed(world, scans=4, seed=0):

@@ -253,8 +253,8 @@ def test_a_plan_that_violates_the_slew_limit_is_refused():
     zero = np.zeros(QUADROTOR.state_dim)
 
     def reply(plan, robot="quadrotor"):
-        said = pb.Decision(kind=pb.ALLOWED, plan=plan.ravel(), predicted_center=zero, predicted_half_width=zero)
-        return pb.Reply(decision=said, robot=robot)
+        decision = pb.Decision(kind=pb.ALLOWED, plan=plan.ravel(), predicted_center=zero, predicted_half_width=zero)
+        return pb.Reply(decision=decision, robot=robot)
 
     plan = np.zeros((QUADROTOR.horizon, QUADROTOR.action_dim))
     plan[:3, 0] = 0.7, 0.7, 0.1

@@ -27,12 +27,12 @@ OBSERVED = (26, 50)
 
 @pytest.mark.parametrize("observed", [0, *OBSERVED])
 def test_the_filter_decides_the_same_whichever_tasks_are_loaded(ready, observed):
-    asked = replace(request(obstacles=[cylinder(0.5, 0.0)]), observation=np.ones(observed, np.float32))
-    before = ready.decide(asked)
+    question = replace(request(obstacles=[cylinder(0.5, 0.0)]), observation=np.ones(observed, np.float32))
+    before = ready.decide(question)
     for name in (*NAMES, *NAMES[:1]):
         environment(robot_with_task(name), "default", 0)
-        assert same(ready.decide(asked), before)
-        assert same(Filter(ready.model).decide(asked), before)
+        assert same(ready.decide(question), before)
+        assert same(Filter(ready.model).decide(question), before)
 
 
 def test_two_environments_observe_each_by_its_own_task():
@@ -53,12 +53,12 @@ def test_two_rivals_read_each_the_observation_of_their_own_task():
     rivals: list[Method] = [made_ready(sailr(robot_with_task(name))) for name in NAMES]
     for rival, own in zip(rivals, OBSERVED, strict=True):
         for observed in OBSERVED:
-            asked = replace(request(), observation=np.zeros(observed, np.float32))
+            question = replace(request(), observation=np.zeros(observed, np.float32))
             if observed == own:
-                assert rival.decide(asked).kind == "allowed"
+                assert rival.decide(question).kind == "allowed"
             else:
                 with pytest.raises(BadRequest, match="observation has shape"):
-                    rival.decide(asked)
+                    rival.decide(question)
 
 
 def test_rivals_of_two_tasks_lie_in_two_files():

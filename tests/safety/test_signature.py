@@ -292,14 +292,14 @@ def test_a_service_accepts_only_signed_models_over_the_bus(
                 signed = ModelSigner.load(keys).sign(model)
                 publisher.put(pb.Model(file=evil.encode(), claim=signed.claim, signature=signed.signature, **rest))
                 signed = ModelSigner.load(keys).sign(newer)
-                said = {"claim": signed.claim, "signature": signed.signature}
-                publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **said))
+                fields = {"claim": signed.claim, "signature": signed.signature}
+                publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **fields))
                 until(lambda: notes.get("model ground") == newer.version)
         finally:
             service.terminate()
             service.wait(20.0)
-    kept = {path.stem for path in archive_path(archive, "ground", "*").parent.glob("*.safetensors")}
-    assert kept == {model.version, newer.version}, "the archive holds no refused model"
+    archived = {path.stem for path in archive_path(archive, "ground", "*").parent.glob("*.safetensors")}
+    assert archived == {model.version, newer.version}, "the archive holds no refused model"
     assert newest_model(archive, "ground", TrustedSigners.load(keys)) == archive_path(archive, "ground", newer.version)
 
 

@@ -16,12 +16,12 @@ ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.flo
 @given(ARRAYS, WORDS)
 def test_a_packed_file_is_unpacked_unchanged_and_equal_content_gives_equal_bytes(tensors, about):
     payload = pack(tensors, "entry", about)
-    found, said = unpack(payload, "entry")
-    assert said == about and found.keys() == tensors.keys()
-    assert all(found[name].tobytes() == tensors[name].tobytes() for name in tensors)
+    loaded, loaded_about = unpack(payload, "entry")
+    assert loaded_about == about and loaded.keys() == tensors.keys()
+    assert all(loaded[name].tobytes() == tensors[name].tobytes() for name in tensors)
     turned = dict(reversed(list(about.items())))
     assert pack(dict(reversed(list(tensors.items()))), "entry", turned) == payload
-    assert content(tensors) == content(found)
+    assert content(tensors) == content(loaded)
 
 
 def test_other_bytes_are_refused_with_a_reason():

@@ -143,10 +143,10 @@ def test_the_ground_robot_turns_in_place_too(ready):
 
 
 def test_the_predictors_in_place_hold_on_fresh_data(turner, driving):
-    found = validate(turner, driving, record(1, trajectories=120))
-    assert found.in_place_windows > 500
-    assert found.bound_in_place == upper_bound(found.in_place_violations, found.in_place_windows)
-    assert found.in_place_violations <= 0.01 * found.in_place_windows and found.bound_in_place < 0.03
+    report = validate(turner, driving, record(1, trajectories=120))
+    assert report.in_place_windows > 500
+    assert report.bound_in_place == upper_bound(report.in_place_violations, report.in_place_windows)
+    assert report.in_place_violations <= 0.01 * report.in_place_windows and report.bound_in_place < 0.03
     narrow = replace(
         turner.in_place, steps=tuple(replace(s, kappa=0.6 * s.kappa, w=0.6 * s.w) for s in turner.in_place.steps)
     )
@@ -207,9 +207,9 @@ def test_a_model_set_without_predictors_in_place_decides_by_one_tube(turner):
     assert again.in_place is None and again.version == before.version != turner.version
     new = ModelSet.decode(turner.encode())
     assert new.version == turner.version and np.array_equal(new.in_place.box, turner.in_place.box)
-    one = Filter(again)
-    assert one.in_place is None and one.clearance_margin > 5.0 * Filter(new).clearance_margin
-    assert {decision.kind for decision in turn(one, pillars(0.03, 4), FAST)[0]} != {ALLOWED}
+    loaded = Filter(again)
+    assert loaded.in_place is None and loaded.clearance_margin > 5.0 * Filter(new).clearance_margin
+    assert {decision.kind for decision in turn(loaded, pillars(0.03, 4), FAST)[0]} != {ALLOWED}
 
 
 def pushing(k, rng):

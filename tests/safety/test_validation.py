@@ -26,29 +26,28 @@ def test_known_values_of_the_bound():
 
 @pytest.mark.parametrize("which", ALL, ids="-".join)
 def test_a_model_set_holds_on_data_it_has_not_seen(models, data, held_out, which):
-    found = validate(models[which], data, held_out)
-    assert (found.certificate, found.mode) == which
-    assert found.version == models[which].version
-    assert found.windows > 500
-    assert found.violations <= 0.01 * found.windows
-    assert found.step_violations <= found.violations
-    assert found.bound_step <= found.bound_plan < 0.05
-    assert found.bound_step <= found.bound_episode <= 1.0
-    assert (
-        found.outside_episode == pytest.approx(300 * found.bound_step) and found.outside_episode > found.bound_episode
-    )
-    assert found.outside_hour == pytest.approx(18_000 * found.bound_step), "a period lasts 0.2 s"
-    assert 0 < found.half_width_rest < found.half_width_full
-    assert found.samples == len(windows(data, 3))
-    assert set(found.figures()) > {"samples", "rank", "condition", "bound_step", "bound_plan"}
+    report = validate(models[which], data, held_out)
+    assert (report.certificate, report.mode) == which
+    assert report.version == models[which].version
+    assert report.windows > 500
+    assert report.violations <= 0.01 * report.windows
+    assert report.step_violations <= report.violations
+    assert report.bound_step <= report.bound_plan < 0.05
+    assert report.bound_step <= report.bound_episode <= 1.0
+    assert report.outside_episode == pytest.approx(300 * report.bound_step)
+    assert report.outside_episode > report.bound_episode
+    assert report.outside_hour == pytest.approx(18_000 * report.bound_step), "a period lasts 0.2 s"
+    assert 0 < report.half_width_rest < report.half_width_full
+    assert report.samples == len(windows(data, 3))
+    assert set(report.figures()) > {"samples", "rank", "condition", "bound_step", "bound_plan"}
 
 
 def test_a_narrowed_model_shows_its_violations(model, data, held_out):
     honest = validate(model, data, held_out)
     narrow = replace(model, steps=tuple(replace(s, kappa=0.5 * s.kappa, w=0.5 * s.w) for s in model.steps))
-    found = validate(narrow, data, held_out)
-    assert found.violations > 0.2 * found.windows
-    assert found.bound_plan > 20 * honest.bound_plan
+    report = validate(narrow, data, held_out)
+    assert report.violations > 0.2 * report.windows
+    assert report.bound_plan > 20 * honest.bound_plan
     for part in ("chord_deviations", "stopping_distance"):
         thin = getattr(model, part)
         gone = replace(model, **{part: replace(thin, kappa=0.0 * thin.kappa, w=0.0 * thin.w)})

@@ -78,11 +78,11 @@ def test_at_the_start_only_a_ring_around_the_body_is_free():
 def test_without_a_new_scan_the_last_one_ages():
     memory, rng = FanMemory(0.105), np.random.default_rng(0)
     assert not len(memory.fill(None, 0.2).ranges), "before the first scan, nothing is free"
-    seen = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
+    filled = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
     memory.later(0.2)  # a period without a call of `fill`
     again = memory.fill(None, 0.2)
-    assert np.array_equal(again.ranges, seen.ranges) and again.age == pytest.approx(seen.age + 0.4)
-    assert memory.fill(None, 0.2).age == pytest.approx(seen.age + 0.6)
+    assert np.array_equal(again.ranges, filled.ranges) and again.age == pytest.approx(filled.age + 0.4)
+    assert memory.fill(None, 0.2).age == pytest.approx(filled.age + 0.6)
     for _ in range(10):
         memory.fill(None, 0.2)
     blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))

@@ -88,9 +88,9 @@ def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_sco
         answer = client.decide(robot.measure(), action, [], known_free=True)
         robot.step(answer.action)
     plan.widening.judge(2.0)
-    asked = request_of(request_message(plan, robot.measure(), np.zeros(2), known_free=True), ROBOT)
-    assert asked.widening == pytest.approx(2.0 * RESERVE)
-    assert (asked.past.states == plan.past.states).all() and (asked.past.inputs == plan.past.inputs).all()
+    question = request_of(request_message(plan, robot.measure(), np.zeros(2), known_free=True), ROBOT)
+    assert question.widening == pytest.approx(2.0 * RESERVE)
+    assert (question.past.states == plan.past.states).all() and (question.past.inputs == plan.past.inputs).all()
     sent = decision_reply(answer, 0.0).decision
     assert decision_of(sent, ROBOT).score == answer.score and decision_of(sent, ROBOT).judges
     plan.accept(answer.plan, "another", answer.predicted, True, judges=True, score=5.0)

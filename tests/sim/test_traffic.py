@@ -63,9 +63,9 @@ def test_the_measured_motion_bounds_the_true_motion():
     sensor = CrowdSensor(crowd, np.random.default_rng(0))
     for k in range(200):
         time = 0.2 * k
-        seen = sensor.measure(time)
+        measured = sensor.measure(time)
         truth = crowd.at(time)
-        for obstacle, place, pace in zip(seen, *truth, strict=True):
+        for obstacle, place, pace in zip(measured, *truth, strict=True):
             motion = obstacle.motion
             assert np.linalg.norm(np.array(obstacle.position) - place) <= motion.position_error
             assert np.linalg.norm(np.array(motion.velocity) - pace) <= motion.velocity_error
@@ -73,7 +73,7 @@ def test_the_measured_motion_bounds_the_true_motion():
             assert motion.is_consistent(obstacle.position)
             for later in (0.1, 0.6):
                 ahead = np.array(obstacle.position) + later * np.array(motion.velocity)
-                i = [o is obstacle for o in seen].index(True)
+                i = [o is obstacle for o in measured].index(True)
                 assert np.linalg.norm(crowd.at(time + later)[0][i] - ahead) <= motion.radius(later) + 1e-9
 
 

@@ -100,7 +100,7 @@ def main() -> None:
     raw = ROS2Publisher(RAW, kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
     store = raw.session_mgr.store
     vector, twist = store.types["geometry_msgs/msg/Vector3"], store.types["geometry_msgs/msg/Twist"]
-    told = time.monotonic()
+    reported = time.monotonic()
     number = 0
     while True:
         number += 1
@@ -116,11 +116,12 @@ def main() -> None:
             raw.publish(header=head, twist=twist(linear=linear, angular=angular))
         else:
             raw.publish(linear=linear, angular=angular)
-        if time.monotonic() - told > 0.5:
-            told = time.monotonic()
+        if time.monotonic() - reported > 0.5:
+            reported = time.monotonic()
             with driver.lock:
-                said = {"raw": number, "scans": driver.scans, "commands": driver.heard, "delays": driver.delays[-200:]}
-            print(json.dumps(said), flush=True)
+                figures = {"raw": number, "scans": driver.scans, "commands": driver.heard}
+                figures["delays"] = driver.delays[-200:]
+            print(json.dumps(figures), flush=True)
         time.sleep(PAUSE)
     del scans, commands
 

@@ -76,12 +76,12 @@ class Run:
 
     def children(self) -> dict[str, psutil.Process]:
         """Return the living processes of the run by name, without the launcher."""
-        found = {}
+        processes = {}
         for process in psutil.process_iter(["cmdline"]):
             words = process.info["cmdline"] or []
             if "brakeline.deploy.run.run_process" in words and str(self.folder) in words:
-                found[words[-1]] = process
-        return found
+                processes[words[-1]] = process
+        return processes
 
     def watch(self) -> Metrics:
         """Return the figures of all messages on the bus from now on."""

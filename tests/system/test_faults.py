@@ -52,9 +52,9 @@ def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_fold
     lost = {key: topic["missing"] for key, topic in analysed["topics"].items() if topic["missing"]}
     assert lost, "what nobody recorded shows as gaps"
     assert analysed["steps"] + sum(n for key, n in lost.items() if key.startswith("step/")) >= figures["steps"]
-    told = [record.message.text for record in records if record.key == "log/launcher"]
+    texts = [record.message.text for record in records if record.key == "log/launcher"]
     for name in ("learner", "safety-0", "actor-1"):
-        assert any(f"{name} was killed by SIGKILL" in text for text in told), told
+        assert any(f"{name} was killed by SIGKILL" in text for text in texts), texts
     _braked_as_committed(records)
 
 
@@ -140,9 +140,9 @@ def _is_asked(there: tuple[object, ...], folder: Path) -> None:
     """`status` and `query` of a run in progress, for people and as JSON."""
     status = brakeline("status", *there)
     assert status.returncode == 0 and "safety-1" in status.stdout and "learning ground" in status.stdout
-    told = json.loads(brakeline("status", *there, "--json").stdout)
-    assert {"launcher", "recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"} <= set(told["alive"])
-    assert told["processes"]["safety-0"]["model ground"] and told["learners"]["ground"]["steps"] > 0
+    shown = json.loads(brakeline("status", *there, "--json").stdout)
+    assert {"launcher", "recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"} <= set(shown["alive"])
+    assert shown["processes"]["safety-0"]["model ground"] and shown["learners"]["ground"]["steps"] > 0
     near = ("query", "ground", *there, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
     answer = json.loads(brakeline(*near, "--json").stdout)
     assert answer.keys() >= {"decision", "plan", "tube", "margin", "time_ms", "model"}
@@ -152,8 +152,8 @@ def _is_asked(there: tuple[object, ...], folder: Path) -> None:
     for far, said in ((3.5, ("allowed",)), (0.0, ("adjusted", "failsafe"))):  # all free about it; nothing seen
         scan = {"ranges": [far] * 360, "angles": np.radians(range(360)).tolist(), "pose": [0.0, 0.0, 0.0]}
         (folder / "scan.json").write_text(json.dumps(scan))
-        seen = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
-        assert json.loads(seen.stdout)["decision"] in said
+        query = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
+        assert json.loads(query.stdout)["decision"] in said
     wrong = brakeline("query", "ground", *there, "--state", 1, 2)
     assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
 

@@ -72,9 +72,9 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
     for record in records:
         if record.topic == "frames":
             for frame in record.message.frames:
-                found = decode_frame(frame.raw, frame.outgoing)
-                if frame.outgoing and found is not None:
-                    yield frame.wall_time * 1e-9, found.message
+                decoded = decode_frame(frame.raw, frame.outgoing)
+                if frame.outgoing and decoded is not None:
+                    yield frame.wall_time * 1e-9, decoded.message
 
 
 @pytest.mark.parametrize(("policy", "perception", "periods"), [("adversary", "scan", 40), ("astar", "map", 70)])
@@ -161,8 +161,8 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
     assert _speed(second["LOCAL_POSITION_NED"]) < 0.3
     assert third["HEARTBEAT"].custom_mode == PX4_POSITION, "without one the autopilot braked by itself, and held"
     assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
-    said = (run.folder / "logs" / "actor-0.log").read_text()
-    assert "braking along the committed plan" in said and "it hovers at" in said
+    lines = (run.folder / "logs" / "actor-0.log").read_text()
+    assert "braking along the committed plan" in lines and "it hovers at" in lines
 
 
 def vehicle_server(run: Run) -> psutil.Process:

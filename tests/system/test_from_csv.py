@@ -33,9 +33,9 @@ def certified(tmp_path_factory):
         imported = brakeline("import", log, "--robot", FILE, "--json")
         assert imported.returncode == 0, imported.stderr
         words = ("--use", *WORDS, "--certificates", "residual", "--mode", "direct", "--json")
-        made = brakeline("certify", "--robot", FILE, *words)
-        assert made.returncode == 0, made.stderr
-        yield folder, json.loads(imported.stdout), json.loads(made.stdout)
+        certify = brakeline("certify", "--robot", FILE, *words)
+        assert certify.returncode == 0, certify.stderr
+        yield folder, json.loads(imported.stdout), json.loads(certify.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +58,8 @@ def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):
 
             def answered():
                 assert service.poll() is None, (tmp_path / "safety.err").read_text()
-                asked = brakeline("query", FILE, "--action", 0.6, 0, *words)
-                return json.loads(asked.stdout) if asked.returncode == 0 else None
+                query = brakeline("query", FILE, "--action", 0.6, 0, *words)
+                return json.loads(query.stdout) if query.returncode == 0 else None
 
             answer = until(answered, "an answer")
         finally:
@@ -84,7 +84,7 @@ def episode(ready, seed):
             discs.append((at, radius))
     centers, radii = np.array([at for at, _ in discs]), np.array([radius for _, radius in discs])
     shapes, _ = split_moving([Obstacle("cylinder", tuple(at), (radius,)) for at, radius in discs], 2)
-    plant, kept = Porter(rng, (0.0, 0.0, rng.uniform(-3, 3))), BackupPlan(robot)
+    plant, backup_plan = Porter(rng, (0.0, 0.0, rng.uniform(-3, 3))), BackupPlan(robot)
     least, outside, way = np.inf, 0, 0.0
     for _ in range(STEPS):
         state = plant.measured()
@@ -94,11 +94,12 @@ def episode(ready, seed):
         turn = (turn + np.pi) % (2 * np.pi) - np.pi
         wanted = np.array([0.6 if abs(turn) < 0.8 or rng.random() < 0.3 else 0.0, np.clip(5.0 * turn, -1.5, 1.5)])
         wanted = rng.uniform(robot.low(), robot.high()) if rng.random() < 0.1 else wanted
-        before = kept.input_in_force
-        asked = Request(state, wanted, before, kept.plan, shapes, model=kept.model, predicted=kept.predicted)
-        said = ready.decide(asked)
-        outside += not said.contained
-        u = kept.accept(said.plan, said.model, said.predicted, said.verified)
+        before = backup_plan.input_in_force
+        verified = {"model": backup_plan.model, "predicted": backup_plan.predicted}
+        question = Request(state, wanted, before, backup_plan.plan, shapes, **verified)
+        decision = ready.decide(question)
+        outside += not decision.contained
+        u = backup_plan.accept(decision.plan, decision.model, decision.predicted, decision.verified)
         path = plant.step(u, robot.period)
         least = min(least, (np.linalg.norm(path[:, None] - centers, axis=2) - radii).min() - body)
         way += float(np.linalg.norm(path[-1] - path[0]))
@@ -106,8 +107,8 @@ def episode(ready, seed):
 
 
 def adversary(ready, made, episodes):
-    told = [episode(ready, seed) for seed in range(episodes)]
-    least, steps, outside, way = (np.array(column) for column in zip(*told, strict=True))
+    results = [episode(ready, seed) for seed in range(episodes)]
+    least, steps, outside, way = (np.array(column) for column in zip(*results, strict=True))
     print(
         f"{(least <= 0.0).sum()} collisions in {episodes} episodes, nearest {least.min():.3f} m; {outside.sum()} of "
         f"{steps.sum()} steps outside, certificate: {made['residual']['bound_step']:.2%}; way {way.mean():.2f} m"

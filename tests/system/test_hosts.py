@@ -31,9 +31,9 @@ ACTOR = "actor-ground-0"
 @pytest.fixture
 def hosts():
     try:
-        with Hosts(5, CLOCKS) as made:
-            made.join(1, 2)
-            yield made
+        with Hosts(5, CLOCKS) as joined:
+            joined.join(1, 2)
+            yield joined
     except NoHosts as error:
         pytest.skip(f"no network namespaces here: {error}")
 

@@ -16,8 +16,8 @@ from tests.waiting import until
 
 def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, tmp_path, monkeypatch):
     keys, parts, endpoint = tmp_path / "keys", tmp_path / "parts", free_endpoint("tls")
-    made = brakeline("keys", keys, "safety", "client", "viewer", "actor-0", "certify", "--hand-out", parts)
-    assert made.returncode == 0, made.stderr
+    done = brakeline("keys", keys, "safety", "client", "viewer", "actor-0", "certify", "--hand-out", parts)
+    assert done.returncode == 0, done.stderr
     names = {"ca.pem", "safety.pem", "safety.key", "names", "vouchers.key", "signers"}
     assert {path.name for path in (parts / "safety").iterdir()} == names
     assert {path.name for path in (parts / "actor-0").iterdir()} == {"ca.pem", "actor-0.pem", "actor-0.key"}

@@ -30,9 +30,9 @@ def system() -> Iterator[Any]:
         configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
         with Mavsdk(configuration) as sdk:
             sdk.add_any_connection(f"udpin://127.0.0.1:{port}")
-            found = sdk.first_autopilot(60.0)
-            assert found is not None
-            yield found
+            vehicle = sdk.first_autopilot(60.0)
+            assert vehicle is not None
+            yield vehicle
         configuration.destroy()
 
 

@@ -23,17 +23,17 @@ needs_node = pytest.mark.skipif(
 
 def total(message: Message) -> float:
     """The sum of all numbers in a message that JavaScript has as numbers: not those of 64 bits, which it has not."""
-    found = 0.0
+    figure = 0.0
     for field, value in message.ListFields():
         entry = field.message_type
         if entry is not None and entry.GetOptions().map_entry:
             of = entry.fields_by_name["value"]
-            found += sum(_number(of, one) for one in value.values())
+            figure += sum(_number(of, one) for one in value.values())
         elif field.is_repeated:
-            found += sum(_number(field, one) for one in value)
+            figure += sum(_number(field, one) for one in value)
         else:
-            found += _number(field, value)
-    return found
+            figure += _number(field, value)
+    return figure
 
 
 def _number(field: Any, value: Any) -> float:

@@ -136,5 +136,5 @@ def test_all_fly_a_minute_behind_one_filter_and_hover_when_their_actors_die(tmp_
     for name, flight in flights.items():
         assert flight["answers in time share"] >= 0.9 - lost.share, (name, flight, lost)
         assert flight["true clearance least m"] < 20.0, f"{name}: its own simulator tells the truth"
-        said = (run.folder / "logs" / f"{name}.log").read_text()
-        assert "braking along the committed plan" in said and "it hovers at" in said, name
+        lines = (run.folder / "logs" / f"{name}.log").read_text()
+        assert "braking along the committed plan" in lines and "it hovers at" in lines, name

@@ -102,9 +102,9 @@ def rammed(folder: Path, arena: str, seed: int, seconds: float, *node: object) -
     """Return the last output of robot, filter and driver after `seconds` of simulated time."""
     bridge = ("--arena", arena, "--seed", seed, "--seconds", seconds)
     with Bench(folder, *SIMULATED, *bridge, node=("--sim-time", *node)) as bench:
-        said = bench.end(PATIENCE + 2.0 * seconds)
-    assert said[0], bench.errors("bridge")
-    return said
+        figures = bench.end(PATIENCE + 2.0 * seconds)
+    assert figures[0], bench.errors("bridge")
+    return figures
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_it_is_seen_in_the_graph_and_stops_when_it_is_killed(late_folder: Path, 
         until(lambda: bench.said("driver").get("delays"), f"a raw command goes through: {bench.errors('filter')}")
         graph = bench.start("graph", sys.executable, "-c", GRAPH, bench.port)
         assert graph.wait(PATIENCE) == 0, bench.errors("graph")
-        said = bench.said("graph")
+        listed = bench.said("graph")
         kinds = {
             "/cmd_vel": "geometry_msgs/msg/Twist",
             "/cmd_vel_raw": "geometry_msgs/msg/Twist",
@@ -168,8 +168,8 @@ def test_it_is_seen_in_the_graph_and_stops_when_it_is_killed(late_folder: Path, 
             "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
             "/brakeline/markers": "visualization_msgs/msg/MarkerArray",
         }
-        assert {topic: kind for topic, [kind] in said["topics"].items() if topic in kinds} == kinds
-        assert said["publishers"] == [["brakeline", "::,10:,:,:,,"]]
+        assert {topic: kind for topic, [kind] in listed["topics"].items() if topic in kinds} == kinds
+        assert listed["publishers"] == [["brakeline", "::,10:,:,:,,"]]
         bench.filter.kill()
         time.sleep(5.0)  # a period without a command lasts a second there
         bench.robot.send_signal(signal.SIGINT)

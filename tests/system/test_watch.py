@@ -98,8 +98,8 @@ def test_foxglove_is_served_live_with_the_arena_for_a_late_viewer(watched: dict[
         wanted |= {"step/ground/actor-0", "exchange/ground/actor-0"}
         while not wanted <= channels.keys():
             message = socket.recv(timeout=20.0)
-            if isinstance(message, str) and (told := json.loads(message))["op"] == "advertise":
-                channels |= {channel["topic"]: channel for channel in told["channels"]}
+            if isinstance(message, str) and (announced := json.loads(message))["op"] == "advertise":
+                channels |= {channel["topic"]: channel for channel in announced["channels"]}
         assert channels["foxglove/arena/ground/actor-0"]["schemaName"] == "foxglove.SceneUpdate"
         topics = sorted(wanted)
         ids = [{"id": number, "channelId": channels[topic]["id"]} for number, topic in enumerate(topics)]

@@ -61,8 +61,8 @@ def joystick(rng, seconds, stops=True):
         if not stops:
             at[0] = max(at[0], 0.05)
         if k % 5 == 0:  # a joystick speaks at 10 Hz
-            said = at.copy()
-        inputs.append(said)
+            measured = at.copy()
+        inputs.append(measured)
     return np.array(inputs)
 
 

@@ -75,9 +75,9 @@ def test_it_is_where_it_is_by_its_own_truth(flown):
     """East, north and up in metres, to what an estimate is off by in a minute; the ways are ten times as long."""
     read, time, truth = flown
     for axis, true in zip(AXES, truth, strict=False):
-        seen = np.interp(time, *read[axis])
+        position = np.interp(time, *read[axis])
         assert np.ptp(true) > 5.0 or axis == "z"
-        assert np.std(seen - true) < 0.6, axis
+        assert np.std(position - true) < 0.6, axis
 
 
 def test_velocity_and_acceleration_are_those_of_the_truth(flown):
@@ -87,8 +87,8 @@ def test_velocity_and_acceleration_are_those_of_the_truth(flown):
     for axis, true in zip(AXES, truth, strict=False):
         velocity = (true[step:] - true[:-step]) / (time[step:] - time[:-step])
         middle = 0.5 * (time[step:] + time[:-step])
-        seen = mean_over(read[f"v{axis}"], middle, 0.8)
-        assert np.polyfit(velocity, seen, 1)[0] == pytest.approx(1.0, abs=0.15), axis
+        averaged = mean_over(read[f"v{axis}"], middle, 0.8)
+        assert np.polyfit(velocity, averaged, 1)[0] == pytest.approx(1.0, abs=0.15), axis
         changed = (velocity[step:] - velocity[:-step]) / (middle[step:] - middle[:-step])
         felt = mean_over(read[f"a{axis}"], 0.5 * (middle[step:] + middle[:-step]), 1.2)
         assert np.corrcoef(changed, felt)[0, 1] > 0.8, axis
@@ -106,15 +106,16 @@ def test_it_does_what_it_was_told(flown):
     """Some tenths of a second later, in m/s: a gain of about one (PX4 is slow), and no other axis does it."""
     read, _, _ = flown
     for axis in AXES:
-        given, told = read[f"v{axis} setpoint"]
+        setpoint_times, setpoints = read[f"v{axis} setpoint"]
         best = {}
         for other in AXES:
             time, velocity = read[f"v{other}"]
             fits = []
             for late in np.arange(0.0, 1.2, 0.1):
-                kept = (time - late > given[0]) & (time - late < given[-1])
-                held = told[np.searchsorted(given, time[kept] - late, "right") - 1]
-                fits.append((float(np.corrcoef(held, velocity[kept])[0, 1]), np.polyfit(held, velocity[kept], 1)[0]))
+                during = (time - late > setpoint_times[0]) & (time - late < setpoint_times[-1])
+                in_force = setpoints[np.searchsorted(setpoint_times, time[during] - late, "right") - 1]
+                correlation = float(np.corrcoef(in_force, velocity[during])[0, 1])
+                fits.append((correlation, np.polyfit(in_force, velocity[during], 1)[0]))
             best[other] = max(fits)
         correlation, gain = best[axis]
         assert correlation > 0.85 and 0.5 < gain < 1.4, (axis, best)
@@ -123,24 +124,24 @@ def test_it_does_what_it_was_told(flown):
 
 @pytest.mark.parametrize("name", LOGS)
 def test_a_log_as_it_is_becomes_data(name):
-    made = import_sources([FLOWN / name], QUADROTOR)
-    assert made.report.periods > 60 and made.report.samples >= 2
-    assert all(0.0 <= late < 0.7 for late in made.report.delays.values())
+    imported = import_sources([FLOWN / name], QUADROTOR)
+    assert imported.report.periods > 60 and imported.report.samples >= 2
+    assert all(0.0 <= late < 0.7 for late in imported.report.delays.values())
 
 
 def test_some_seconds_of_flight_are_said_to_be_too_few():
-    told = coverage(import_sources([FLOWN / "copter.tlog"], QUADROTOR).data)
-    assert f"only {told.windows} windows of a plan's length, but about 286 are needed: record more" in told.missing
+    report = coverage(import_sources([FLOWN / "copter.tlog"], QUADROTOR).data)
+    assert f"only {report.windows} windows of a plan's length, but about 286 are needed: record more" in report.missing
 
 
 def test_a_late_link_does_not_shake_what_a_vehicle_told(tmp_path):
     """It moves at 5 m/s; messages come up to 0.2 s late, and now and then in a burst after a second without any."""
     rng, vehicle, out = np.random.default_rng(0), dialect.MAVLink(None, srcSystem=1, srcComponent=1), bytearray()
     for k in range(1500):
-        told = 0.02 * k
-        came = max(told + rng.exponential(0.03) % 0.2, 8.0 if 7.0 < told < 8.0 else 0.0)
-        m = dialect.MAVLink_local_position_ned_message(round(1e3 * told), 0.0, 5.0 * told, *[0.0] * 4)
-        out += struct.pack(">Q", round(1e6 * (1000.0 + came))) + m.pack(vehicle)
+        sent = 0.02 * k
+        received = max(sent + rng.exponential(0.03) % 0.2, 8.0 if 7.0 < sent < 8.0 else 0.0)
+        message = dialect.MAVLink_local_position_ned_message(round(1e3 * sent), 0.0, 5.0 * sent, *[0.0] * 4)
+        out += struct.pack(">Q", round(1e6 * (1000.0 + received))) + message.pack(vehicle)
     path = tmp_path / "late.tlog"
     path.write_bytes(out)
     (table,) = tables_of(path)

@@ -47,10 +47,10 @@ def test_what_holds_already_stays_as_it_is(data):
 def test_what_comes_later_is_outside_no_more_often_than_is_stated(data, widened):
     """Drawn like the plans that it was widened by."""
     model, statement = widened
-    found = [validate(model, data, record(trajectories=6, periods=150, seed=seed)) for seed in range(20, 26)]
-    outside, plans = sum(one.violations for one in found), sum(one.windows for one in found)
+    reports = [validate(model, data, record(trajectories=6, periods=150, seed=seed)) for seed in range(20, 26)]
+    outside, plans = sum(one.violations for one in reports), sum(one.windows for one in reports)
     assert plans > 300 and outside / plans < statement.bound_plan
-    assert np.isclose(max(one.excess for one in found) > 1.0, outside > 0)
+    assert np.isclose(max(one.excess for one in reports) > 1.0, outside > 0)
 
 
 @pytest.fixture(scope="module")
@@ -71,18 +71,18 @@ def test_without_violations_more_of_the_same_will_do(held, data):
 def test_with_more_violations_than_the_limit_more_of_the_same_does_not_help(held, data):
     left = ViolationGroup("position ahead", FAST, 20, 200, 3.0), ViolationGroup("heading", STANDING, 13, 100, 1.2)
     bad = replace(held, windows=600, violations=33, bound_plan=upper_bound(33, 600), leaving=left)
-    said = "\n".join(recording_advice(bad, data))
-    assert "at most 8.1 % of plans" in said
-    assert "33 of 600 held-out plans" in said and "0 more minutes like these reach" not in said
-    assert "20 by position ahead while fast (of 200 plans there" in said and "13 by heading while standing" in said
-    assert "do not help: the share of 5.5% is above the limit of 1 %" in said
-    assert "lower the bounds of speed" in said and "record standing" in said and "--until-held" in said
+    advice = "\n".join(recording_advice(bad, data))
+    assert "at most 8.1 % of plans" in advice
+    assert "33 of 600 held-out plans" in advice and "0 more minutes like these reach" not in advice
+    assert "20 by position ahead while fast (of 200 plans there" in advice and "13 by heading while standing" in advice
+    assert "do not help: the share of 5.5% is above the limit of 1 %" in advice
+    assert "lower the bounds of speed" in advice and "record standing" in advice and "--until-held" in advice
 
 
 def test_with_few_violations_more_of_the_same_helps_on_a_condition(held, data):
     few = replace(held, windows=600, violations=3, bound_plan=upper_bound(3, 600))
-    said = "\n".join(recording_advice(few, data))
-    assert few.bound_plan > 0.01 and "only if no larger share than 0.5% of them leaves" in said
+    advice = "\n".join(recording_advice(few, data))
+    assert few.bound_plan > 0.01 and "only if no larger share than 0.5% of them leaves" in advice
 
 
 def test_a_statement_within_the_robots_own_limit_asks_for_nothing(held, data):

@@ -65,22 +65,22 @@ class Sluggish:
 
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
     vehicle = Sluggish()
-    found = FirstFlight(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
-    assert found.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
-    assert found.model is not None and found.model.robot == LATE
-    assert found.report is not None and found.report.violations <= 0.25 * found.report.windows
-    assert found.model.model_config.mode == ONE_STEP and 11.0 * 60.0 <= found.seconds < 13.0 * 60.0
-    assert any("more minutes like these" in line for line in found.missing)
-    assert not any("of its own estimate is" in line for line in found.missing)
-    found.data.save(tmp_path / "flown.safetensors")
-    assert Dataset.load(tmp_path / "flown.safetensors").digest() == found.data.digest()
-    assert len(windows(found.data, QUADROTOR.horizon, PLAN)) > 20, "it brakes as the filter plans to"
+    recording = FirstFlight(vehicle, LATE, BOX, 0).fly(11.0, {"autopilot": "none"})
+    assert recording.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
+    assert recording.model is not None and recording.model.robot == LATE
+    assert recording.report is not None and recording.report.violations <= 0.25 * recording.report.windows
+    assert recording.model.model_config.mode == ONE_STEP and 11.0 * 60.0 <= recording.seconds < 13.0 * 60.0
+    assert any("more minutes like these" in line for line in recording.missing)
+    assert not any("of its own estimate is" in line for line in recording.missing)
+    recording.data.save(tmp_path / "flown.safetensors")
+    assert Dataset.load(tmp_path / "flown.safetensors").digest() == recording.data.digest()
+    assert len(windows(recording.data, QUADROTOR.horizon, PLAN)) > 20, "it brakes as the filter plans to"
 
 
 def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
     """The velocity follows the input of its own period, not of the next."""
-    found = FirstFlight(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
-    for t in found.data.trajectories:
+    recording = FirstFlight(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
+    for t in recording.data.trajectories:
         assert t.states[1:, 3:6] == pytest.approx(t.inputs, abs=0.1)
 
 
@@ -94,10 +94,10 @@ def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
 )
 def test_what_ends_a_flight_or_makes_its_sets_wide_is_named(fault, minutes, line) -> None:
     vehicle = Sluggish(**fault)
-    found = FirstFlight(vehicle, LATE, BOX, 0).fly(minutes, {})
-    assert any(line in text for text in found.missing)
-    assert found.seconds < 120.0 or "box" not in line
-    assert (found.level == 0.0 and vehicle.fastest < 1.5) or "fickle" not in fault
+    recording = FirstFlight(vehicle, LATE, BOX, 0).fly(minutes, {})
+    assert any(line in text for text in recording.missing)
+    assert recording.seconds < 120.0 or "box" not in line
+    assert (recording.level == 0.0 and vehicle.fastest < 1.5) or "fickle" not in fault
 
 
 def test_the_rule_turns_back_before_the_wall_and_lets_go_of_the_rest() -> None:

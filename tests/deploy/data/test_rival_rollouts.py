@@ -20,14 +20,15 @@ def test_transitions_are_whole_scaled_and_the_same_again():
 
 
 def test_costs_are_of_braking_to_the_end():
-    found = costs(GROUND, SailrConfig(samples=3000, seed=1))
-    assert found.collisions > 0 and found.collided.sum() == found.collisions
-    for cost in (found.braked_cost, found.step_cost):
+    recorded = costs(GROUND, SailrConfig(samples=3000, seed=1))
+    assert recorded.collisions > 0 and recorded.collided.sum() == recorded.collisions
+    for cost in (recorded.braked_cost, recorded.step_cost):
         assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()
-    assert len(found.driven) >= 3000 and found.driven.shape[1] == 28 and (np.abs(found.driven[:, 26:]) <= 1.0).all()
-    quiet = found.braked_cost[found.braked_cost < 0.5]
+    driven = recorded.driven
+    assert len(driven) >= 3000 and driven.shape[1] == 28 and (np.abs(driven[:, 26:]) <= 1.0).all()
+    quiet = recorded.braked_cost[recorded.braked_cost < 0.5]
     assert quiet.max() < 0.1, "a stop that touched nothing is nearly free, whatever it came near"
-    assert len(found.braked) == len(found.braked_cost) > 500
+    assert len(recorded.braked) == len(recorded.braked_cost) > 500
 
 
 @pytest.mark.parametrize("config_class", [SecasConfig, SailrConfig])

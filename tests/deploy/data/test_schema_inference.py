@@ -51,17 +51,17 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
 def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
     time, values = driven
     names = ("x", "y", "a", "b", "c", "d", "e")
-    found = infer_schema([table(time, values, names)])
-    assert [(c.name, c.role, c.unit, c.follows) for c in found.states[2:]] == [
+    schema = infer_schema([table(time, values, names)])
+    assert [(c.name, c.role, c.unit, c.follows) for c in schema.states[2:]] == [
         ("a", "heading", "rad", ""),
         ("b", "other", "m/s", "d"),
         ("c", "other", "rad/s", "e"),
     ]
-    assert [(c.name, c.unit) for c in found.inputs] == [("d", "m/s"), ("e", "rad/s")]
+    assert [(c.name, c.unit) for c in schema.inputs] == [("d", "m/s"), ("e", "rad/s")]
     shuffled = np.random.default_rng(0).permuted(values[:, 2])
-    found = infer_schema([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
-    assert all(c.role != "heading" for c in found.states)
-    assert any("no column is clearly the heading" in note for note in found.notes)
+    schema = infer_schema([table(time, np.column_stack([values[:, :2], shuffled, values[:, 3:]]), names)])
+    assert all(c.role != "heading" for c in schema.states)
+    assert any("no column is clearly the heading" in note for note in schema.notes)
 
 
 def test_a_delay_is_told_and_makes_the_plan_longer(driven, tmp_path):
@@ -89,9 +89,9 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
         rows.append([*(np.array([*pose, speed, turn]) + noise), speed, turn])
         pose += step * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), turn])
     names = ("x", "y", "yaw", "speed", "turn", "command speed", "command turn")
-    found = infer_schema(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
-    ahead, turning = found.inputs
-    assert (ahead.name, turning.name) == ("speed", "turn") and [c.follows for c in found.states[3:]] == [
+    schema = infer_schema(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
+    ahead, turning = schema.inputs
+    assert (ahead.name, turning.name) == ("speed", "turn") and [c.follows for c in schema.states[3:]] == [
         "speed",
         "turn",
     ]

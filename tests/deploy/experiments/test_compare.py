@@ -68,14 +68,15 @@ def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, metho
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_cell_says_what_its_logs_say(cells, method):
-    cell, found = cells[method], None
+    cell, figures = cells[method], None
     for name, evaluation in [("training", cell["training"]), *cell["evaluations"].items()]:
-        found = analyse(cell["folder"] / f"{name}.mcap")
+        figures = analyse(cell["folder"] / f"{name}.mcap")
         episodes = evaluation["episodes"]
-        assert found["episodes"] == len(episodes["goal"]) and found["goals"] == sum(episodes["goal"])
-        assert sum(episodes["steps"]) <= found["steps"]
-        assert found["mean_reward"] == pytest.approx(np.mean(episodes["reward"]), abs=1e-3)
-        assert found["seed"] == TINY.seed and found["method"] == (method if name == "training" else name.split("-")[1])
+        assert figures["episodes"] == len(episodes["goal"]) and figures["goals"] == sum(episodes["goal"])
+        assert sum(episodes["steps"]) <= figures["steps"]
+        assert figures["mean_reward"] == pytest.approx(np.mean(episodes["reward"]), abs=1e-3)
+        assert figures["seed"] == TINY.seed
+        assert figures["method"] == (method if name == "training" else name.split("-")[1])
     assert cell["training"]["steps"] == TINY.steps and cell["training"]["updates"] == TINY.steps - TINY.td3.warmup
     assert json.loads(json.dumps(cell["study"])) == configuration(replace(TINY, method=method))
     assert MLP.load(cell["folder"] / "policy.safetensors", GROUND).sizes == (26, 16, 16, 2)
@@ -122,15 +123,15 @@ def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cel
 
 
 def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
-    found = table(cells.values())
-    text = markdown(found)
+    rows = table(cells.values())
+    text = markdown(rows)
     for name in ("| ours | SAILR | SECAS | TD3 |", "*paper*", "## training", "## default", "## deployment", "*80.4*"):
         assert name in text
-    json.dumps(plain(found))
-    once = without_times(plain(found))
+    json.dumps(plain(rows))
+    once = without_times(plain(rows))
     assert "decision [ms]" not in json.dumps(once) and "goal rate" in json.dumps(once)
     learning_curves(list(cells.values()), tmp_path / "curves.png")
-    seeds_as_points(found, tmp_path / "seeds.png")
+    seeds_as_points(rows, tmp_path / "seeds.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000 < (tmp_path / "seeds.png").stat().st_size
     with pytest.raises(ValueError, match="not the same seeds"):
         table([*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"seed": 9}}])
@@ -153,17 +154,17 @@ def test_intervals_cover_what_they_should():
     for number in range(30):
         rng = np.random.default_rng(number)
         seeds = 0.5 + 0.1 * rng.normal(size=8)
-        found = mean([(rng.random(100) < p).astype(float) for p in np.clip(seeds, 0, 1)], seed=number)
-        inside += found.low <= 0.5 <= found.high
-        lengths.append(found.high - found.low)
-        assert found.low <= found.value <= found.high and len(found.seeds) == 8
+        estimate = mean([(rng.random(100) < p).astype(float) for p in np.clip(seeds, 0, 1)], seed=number)
+        inside += estimate.low <= 0.5 <= estimate.high
+        lengths.append(estimate.high - estimate.low)
+        assert estimate.low <= estimate.value <= estimate.high and len(estimate.seeds) == 8
     assert inside >= 24
     assert 0.08 < np.mean(lengths) < 0.25, "the spread of the seeds is in it, not the coins' alone"
 
 
 def test_a_ratio_is_of_sums_and_of_seeds_alike():
-    found = ratio([[1.0, 2.0], [30.0]], [[1.0, 1.0], [10.0]])
-    assert found.seeds == (1.5, 3.0) and found.value == pytest.approx(2.25)
+    estimate = ratio([[1.0, 2.0], [30.0]], [[1.0, 1.0], [10.0]])
+    assert estimate.seeds == (1.5, 3.0) and estimate.value == pytest.approx(2.25)
     certain = mean([np.ones(5), np.ones(5)])
     assert (certain.low, certain.value, certain.high) == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="at least one episode"):

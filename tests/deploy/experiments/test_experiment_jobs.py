@@ -37,21 +37,21 @@ class Errand:
 
 
 def test_what_is_there_is_not_run_again(tmp_path):
-    jobs, told = [Errand(n) for n in (1, 2, 3)], []
+    jobs, reports = [Errand(n) for n in (1, 2, 3)], []
     write(tmp_path / "results", jobs[1], {"study": configuration(jobs[1]), "square": -1})
-    say = lambda name, text: told.append((name, text))  # noqa: E731
-    found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=1, say=say)
-    assert [result["square"] for result in found] == [1, -1, 9]
-    assert told == [("errand-1", "half way"), ("errand-3", "half way")]
-    assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", workers=2) == found
+    say = lambda name, text: reports.append((name, text))  # noqa: E731
+    results = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=1, say=say)
+    assert [result["square"] for result in results] == [1, -1, 9]
+    assert reports == [("errand-1", "half way"), ("errand-3", "half way")]
+    assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", workers=2) == results
     assert not (tmp_path / "elsewhere").exists(), "the results alone suffice, on any machine"
     assert read(tmp_path / "results", Errand(4)) is None
 
 
 def test_side_by_side_they_give_the_same(tmp_path):
     jobs = [Errand(n) for n in range(5)]
-    found = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
-    assert [result["square"] for result in found] == [0, 1, 4, 9, 16]
+    results = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
+    assert [result["square"] for result in results] == [0, 1, 4, 9, 16]
     assert len(list((tmp_path / "results" / "ground").iterdir())) == 5
 
 

@@ -66,8 +66,8 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypa
     with Display(console, 1000) as display:
         for _ in range(100):
             display(view)
-        said = console.file.getvalue()  # type: ignore[attr-defined]
-        assert said.startswith("starting recorder, safety-0,") and said.count("\n") == 1, "what it does, at once"
+        shown = console.file.getvalue()  # type: ignore[attr-defined]
+        assert shown.startswith("starting recorder, safety-0,") and shown.count("\n") == 1, "what it does, at once"
         monkeypatch.setattr("brakeline.deploy.run.display.SPACING", 0.0)
         display(view)
         monkeypatch.undo()

@@ -29,9 +29,9 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
     log, data = tmp_path / "excited.mcap", tmp_path / "data.safetensors"
     words = ["excite", CAR, "--keep", *map(str, KEEP), "--minutes", "2", "--drive", str(log), "--json"]
     assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
+    figures = json.loads(capsys.readouterr().out)
     steps = [record.message for record in read(log) if record.topic == "step"]
-    assert len(steps) == said["periods"] == 600 and said["runs"] == 2 and said["collisions"] == 0
+    assert len(steps) == figures["periods"] == 600 and figures["runs"] == 2 and figures["collisions"] == 0
     robot = robot_with_task(CAR)
     truth = np.array([step.true_state for step in steps])
     for disc in robot.body:

@@ -60,17 +60,17 @@ def test_a_recorder_stores_bytes_and_json(tmp_path: Path) -> None:
     frames = [frame for message in stored for frame in message.frames]
     with (tmp_path / "run.mcap").open("rb") as file:
         rows = [(channel, message) for _, channel, message in make_reader(file).iter_messages()]
-    told = [(c.topic, json.loads(m.data), m.publish_time) for c, m in rows if c.message_encoding == ENCODING]
-    assert len(told) == len(frames) and {c.schema_id for c, _ in rows if c.message_encoding == ENCODING} == {0}
+    entries = [(c.topic, json.loads(m.data), m.publish_time) for c, m in rows if c.message_encoding == ENCODING]
+    assert len(entries) == len(frames) and {c.schema_id for c, _ in rows if c.message_encoding == ENCODING} == {0}
     for frame in frames:  # MAVLink 2: sequence, system, component are bytes 4 to 6
         assert any(
-            said["header"] == {"sequence": frame.raw[4], "system_id": frame.raw[5], "component_id": frame.raw[6]}
+            content["header"] == {"sequence": frame.raw[4], "system_id": frame.raw[5], "component_id": frame.raw[6]}
             and time == frame.wall_time
-            for _, said, time in told
+            for _, content, time in entries
         )
-    setpoint = next(said for key, said, _ in told if key == "mavlink/245/191/SET_POSITION_TARGET_LOCAL_NED")
+    setpoint = next(content for key, content, _ in entries if key == "mavlink/245/191/SET_POSITION_TARGET_LOCAL_NED")
     assert setpoint["message"]["type"] == "SET_POSITION_TARGET_LOCAL_NED"
-    assert any(said["message"]["vy"] == 0.5 for key, said, _ in told if key.endswith("TARGET_LOCAL_NED"))
+    assert any(content["message"]["vy"] == 0.5 for key, content, _ in entries if key.endswith("TARGET_LOCAL_NED"))
 
     with (tmp_path / "a.tlog").open("wb") as file:
         assert to_tlog(tmp_path, file) == len(frames)

@@ -26,9 +26,9 @@ def test_the_frames_are_what_was_decided(film):
 
 def test_without_a_filter_there_is_no_tube(data_folder):
     driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", method="none"))
-    found = record(driver, policy, question, 1)
-    assert found.frames[0].kind == "no filter" and len(found.frames[0].view.centers) == 0
-    assert found.end in ("goal", "collision", "out of time")
+    recorded = record(driver, policy, question, 1)
+    assert recorded.frames[0].kind == "no filter" and len(recorded.frames[0].view.centers) == 0
+    assert recorded.end in ("goal", "collision", "out of time")
 
 
 def test_a_picture_shows_the_way_in_the_decisions_colours(film, tmp_path):

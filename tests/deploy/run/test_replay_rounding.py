@@ -88,6 +88,6 @@ def test_with_another_alignment_of_arrays_no_decision_differs(log: Path, offset:
             object.__setattr__(other, name, moved(getattr(other, name), offset))
         reply, again = decision_reply(ready.decide(one), 0.0), decision_reply(elsewhere.decide(other), 0.0)
         kinds.add(pb.Kind.Name(reply.decision.kind))
-        found = differences(reply, again, GROUND.action_dim)
-        assert all(difference.rounding for difference in found.values()), found
+        different = differences(reply, again, GROUND.action_dim)
+        assert all(difference.rounding for difference in different.values()), different
     assert kinds >= {"ALLOWED", "ADJUSTED"}

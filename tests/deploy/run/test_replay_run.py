@@ -90,9 +90,9 @@ def test_requests_older_than_known_free_keep_their_meaning(data_folder: Path, tm
         request.known_free = False
 
     drive(tmp_path / "run.mcap", 10, before)
-    found = replay(tmp_path)
-    assert (found.requests, found.identical) == (10, 10)
-    assert found.kinds["error", "error"] == 2 and found.kinds.total() == 10
+    replayed = replay(tmp_path)
+    assert (replayed.requests, replayed.identical) == (10, 10)
+    assert replayed.kinds["error", "error"] == 2 and replayed.kinds.total() == 10
 
 
 def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

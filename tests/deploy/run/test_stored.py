@@ -33,9 +33,9 @@ def test_stored_requests_are_decided_as_before(robot, count, allowed_now, monkey
 
 
 def test_the_active_rows_alone_lose_no_decision():
-    found = replay(STORED / "ground-before-files.mcap").figures()
-    assert found["kinds"] == {"adjusted": {"adjusted": 171}, "allowed": {"allowed": 229}}
-    assert found["fields"]["plan"]["largest"] < 1e-5
+    figures = replay(STORED / "ground-before-files.mcap").figures()
+    assert figures["kinds"] == {"adjusted": {"adjusted": 171}, "allowed": {"allowed": 229}}
+    assert figures["fields"]["plan"]["largest"] < 1e-5
     kinds = replay(STORED / "quadrotor-before-files.mcap").figures()["kinds"]
     assert kinds["adjusted"] == {"adjusted": 126} and kinds["allowed"] == {"allowed": 102}
     assert kinds["failsafe"]["adjusted"] > 0 and sum(kinds["failsafe"].values()) == 22
