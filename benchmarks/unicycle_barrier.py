@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision, braking_plan, clip_input
+from brakeline.safety.filter.braking import braking_decision, braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 
@@ -49,7 +49,7 @@ class UnicycleBarrier:
         """Return the input that is closest to the proposal and meets the barrier's rows; brake if there is none."""
         started = perf_counter_ns()
         robot, tuning = self.robot, self.tuning
-        proposal = clip_input(robot, request.action, request.input_in_force)
+        proposal = robot.clip_input(request.action, request.input_in_force)
         heading = float(request.state[2])
         ahead = np.array([math.cos(heading), math.sin(heading)])
         aside = np.array([-ahead[1], ahead[0]])
@@ -69,7 +69,7 @@ class UnicycleBarrier:
             if not solution.found or solution.residual > TOLERANCE:
                 total = (perf_counter_ns() - started) * 1e-6
                 return braking_decision(robot, request, self.version, "no input meets the barrier", total)
-            action = clip_input(robot, solution.x * scale, request.input_in_force)
+            action = robot.clip_input(solution.x * scale, request.input_in_force)
         nothing = np.zeros((0, robot.position_dim))
         return Decision(
             kind=ALLOWED if action is proposal else ADJUSTED,

@@ -19,8 +19,8 @@ from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
-from brakeline.safety.methods import DDPC, METHODS, Model
-from brakeline.safety.model.model_config import AUTO, DIRECT
+from brakeline.safety.methods import METHODS, Model
+from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, check_bound
 from brakeline.safety.rivals.pretrained import Pretrained

@@ -32,7 +32,8 @@ from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.figure_tables import analyse
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.methods import DDPC, Model
+from brakeline.safety.methods import Model
+from brakeline.safety.model.model_config import DDPC
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import SAILR

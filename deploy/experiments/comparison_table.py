@@ -17,7 +17,7 @@ from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, ratio
 from brakeline.deploy.experiments.comparison_cells import METHODS, NONE
 from brakeline.deploy.experiments.trials import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
-from brakeline.safety.methods import DDPC
+from brakeline.safety.model.model_config import DDPC
 
 Result = dict[str, Any]
 Row = dict[str, Any]

@@ -15,8 +15,8 @@ from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.methods import DDPC, Model
-from brakeline.safety.model.model_config import check_reservations
+from brakeline.safety.methods import Model
+from brakeline.safety.model.model_config import DDPC, check_reservations
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
 from brakeline.sim.scripted_policies import Policy

@@ -16,7 +16,8 @@ from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.methods import DDPC, Model, load
+from brakeline.safety.methods import Model, load
+from brakeline.safety.model.model_config import DDPC
 
 log = logging.getLogger("brakeline.recorder")
 

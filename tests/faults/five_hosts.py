@@ -25,8 +25,8 @@ from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_with_task
 from brakeline.messaging.topics import RECORDED
-from brakeline.safety.methods import DDPC, load
-from brakeline.safety.model.model_config import ModelConfig
+from brakeline.safety.methods import load
+from brakeline.safety.model.model_config import DDPC, ModelConfig
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import ModelSigner, write_signer
 from tests.faults.network_hosts import Hosts
