@@ -101,7 +101,7 @@ def test_one_flight_gives_the_only_model_set_if_its_bound_is_small(
 ) -> None:
     said: list[list[str]] = []
 
-    def told(words: list[str], data: Path, seconds: float) -> str:
+    def printed_figures(words: list[str], data: Path, seconds: float) -> str:
         said.append(words)
         if words[0] == "certify":
             return json.dumps({"residual": {"one-step": {"bound_plan": 0.02}}})
@@ -109,7 +109,7 @@ def test_one_flight_gives_the_only_model_set_if_its_bound_is_small(
             return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
         raise Failed("no room to hover")
 
-    monkeypatch.setattr(flights, "told", told)
+    monkeypatch.setattr(flights, "printed_figures", printed_figures)
     monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
     rows = dict(flights._rows(Flights(flights.OUTDOORS_ONCE, Path("sitl"), tmp_path), 1.0))
     assert rows["certified by it"] == {"bound_plan": 0.02} and "second flight" not in rows
