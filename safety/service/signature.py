@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,8 @@ from brakeline.safety.methods import Model, decode
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import Array, ModelSet
 from brakeline.safety.model.windows import windows
+
+log = logging.getLogger("brakeline.safety")
 
 CONTEXT = b"brakeline model 1\n"  # signed with each claim, so that a signature is valid for nothing else
 KEY, LAST, SIGNERS = "signer.key", "signer.last", "signers"
@@ -81,7 +84,7 @@ class ModelSigner:
 
     def __init__(self, key: Ed25519PrivateKey, last: Path) -> None:
         """last: the file with the number of the last signature."""
-        self._key, self._last = key, last
+        self._key, self._last, self._number = key, last, 0
 
     @classmethod
     def load(cls, folder: Path) -> Self:
@@ -102,7 +105,7 @@ class ModelSigner:
             data: the data set that the model set was made from. Without it, the claim states the model set's domain.
 
         Raises:
-            Untrusted: the model set's domain is larger than the data's, or the number of the signature cannot be noted.
+            Untrusted: the model set's domain is larger than the data's, or the note of the last number is damaged.
         """
         file = model.encode()
         domain = None
@@ -121,14 +124,19 @@ class ModelSigner:
         return SignedModel(file, words, self._key.sign(CONTEXT + words))
 
     def _next_number(self) -> int:
-        """Return the number of the next signature, and note it. Raises Untrusted."""
+        """Return the number of the next signature, and note it. Raises Untrusted if the note before is damaged."""
         try:
-            last = int(self._last.read_text()) if self._last.exists() else 0
-            number = max(time.time_ns(), last + 1)
-            write_atomically(self._last, str(number).encode())
+            noted = int(self._last.read_text()) if self._last.exists() else 0
         except (OSError, ValueError) as error:
-            raise Untrusted(f"{self._last}: the number of the signature cannot be noted: {error}") from error
-        return number
+            raise Untrusted(
+                f"{self._last}: damaged: {error}. Delete it if the clock of this computer is right"
+            ) from error
+        self._number = max(time.time_ns(), noted + 1, self._number + 1)
+        try:
+            write_atomically(self._last, str(self._number).encode())
+        except OSError as error:  # a folder that cannot be written: the clock orders the signatures
+            log.warning("the number of a signature was not noted: %s", error)
+        return self._number
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A service accepts only models that a trusted signer signed for their robot."""
 
+import errno
 import hashlib
 import itertools
 import json
@@ -154,6 +155,21 @@ def test_the_times_of_files_and_a_clock_set_back_bring_no_older_model_into_use(
     again = signer.sign(older)  # on purpose
     registry.install(older, again, trust.number(again))
     assert registry.filters["ground"].version == older.version
+
+
+def test_a_key_in_a_folder_that_cannot_be_written_still_signs_in_order(model, keys, monkeypatch, caplog) -> None:
+    signer, trust = ModelSigner.load(keys), TrustedSigners.load(keys)
+
+    def read_only(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("brakeline.safety.service.signature.write_atomically", read_only)
+    monkeypatch.setattr(time, "time_ns", lambda: 10**18)
+    first, second = (trust.number(signer.sign(model)) for _ in range(2))
+    assert second > first and "Read-only file system" in caplog.text
+    (keys / "signer.last").write_text("x")
+    with pytest.raises(Untrusted, match=r"signer\.last: damaged"):
+        signer.sign(model)
 
 
 def test_without_keys_a_restart_uses_the_model_that_a_service_used_last(
