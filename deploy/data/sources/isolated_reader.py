@@ -198,11 +198,11 @@ def _save(out: IO[bytes], arrays: dict[str, Any]) -> None:
 def set_limits(seconds: float, size: int) -> None:
     """Limit this process: its further computing time in s, and its memory in bytes. It leaves no core file."""
     used = sum(os.times()[:2])
-    end = int(used + seconds) + 1
-    resource.setrlimit(resource.RLIMIT_CPU, (end, end + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for limit in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
-        resource.setrlimit(limit, (size, resource.getrlimit(limit)[1]))
+    limits = {resource.RLIMIT_CPU: int(used + seconds) + 1, resource.RLIMIT_CORE: 0}
+    limits |= {resource.RLIMIT_AS: size, resource.RLIMIT_FSIZE: size}
+    for kind, limit in limits.items():
+        most = resource.getrlimit(kind)[1]  # of the user, who may have set less
+        resource.setrlimit(kind, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 
 
 def main(words: list[str]) -> None:

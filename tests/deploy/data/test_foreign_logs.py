@@ -3,6 +3,7 @@
 import os
 import shutil
 import struct
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from brakeline.deploy.data.importer import OWN, reader_of, tables_of
 from brakeline.deploy.data.sources import isolated_reader
 from brakeline.deploy.data.sources.isolated_reader import ReadLimits, read_here, read_isolated
 from brakeline.deploy.data.sources.source_table import notes_of
+from brakeline.deploy.interpreter import PYTHON
 from brakeline.errors import LogError, NoSource
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
@@ -240,6 +242,17 @@ def test_tables_come_back_as_they_were_read(bags):
         assert one.name == other.name and one.rank == other.rank and one.notes == other.notes
         assert list(one.columns) == list(other.columns) and np.array_equal(one.time, other.time)
         assert all(np.array_equal(one.columns[name], other.columns[name], equal_nan=True) for name in one.columns)
+
+
+def test_a_lower_limit_of_the_user_holds():
+    program = (
+        "import resource, sys\nfrom pathlib import Path\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30,) * 2)\n"
+        "from brakeline.deploy.data.sources.isolated_reader import USUAL_LIMITS, read_isolated\n"
+        "print(len(read_isolated('tlog_file:read', Path(sys.argv[1]), USUAL_LIMITS)))"
+    )
+    log = Path(__file__).parent / "flown" / "copter.tlog"
+    assert int(subprocess.check_output([*PYTHON, "-c", program, str(log)])) > 2
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
