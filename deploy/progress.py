@@ -14,6 +14,7 @@ from rich.progress import TimeRemainingColumn as Remaining
 
 FIRST = 2.0  # s until the first line; shorter work prints none
 AGAIN = 10.0  # s between two lines
+PERCENT = 100  # items of one piece of work, of which only the share that is done is known
 UNDER_WAY: list[threading.Event] = []  # nested work that prints lines; only the innermost prints
 T = TypeVar("T")
 
@@ -24,6 +25,24 @@ class Advance(Protocol):
     """Report that `by` more items are done, and optionally what is being done now."""
 
     def __call__(self, by: int = 1, what: str | None = None) -> None: ...
+
+
+class WorkProgress:
+    """Advance by the share of a piece of work that is done, in `PERCENT` items, so that a bar shows the time left."""
+
+    def __init__(self, advance: Advance) -> None:
+        self._advance, self._done = advance, 0
+
+    def begin(self, what: str) -> None:
+        """Begin a piece of work."""
+        self._done = 0
+        self._advance(0, what)
+
+    def __call__(self, share: float) -> None:
+        """Advance to a share of the piece; it never goes back."""
+        done = max(int(PERCENT * share), self._done)
+        self._advance(done - self._done)
+        self._done = done
 
 
 @contextmanager

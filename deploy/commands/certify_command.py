@@ -17,7 +17,7 @@ from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.simulated_recording import data_for
-from brakeline.deploy.progress import under_way
+from brakeline.deploy.progress import PERCENT, WorkProgress, under_way
 from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
 from brakeline.messaging import brakeline_pb2 as pb
@@ -82,13 +82,16 @@ class CertifyCommand:
         results: dict[str, Any] = {}
         notes: list[str] = []
         forms = self._forms(data.robot)
-        with under_way("certifying", len(forms)) as advance:
+        with under_way("certifying", PERCENT * len(forms)) as advance:
+            progress = WorkProgress(advance)
             for kind, mode in forms:
-                advance(0, f"certifying {kind}, {mode}")
+                progress.begin(f"certifying {kind}, {mode}")
                 try:
                     config = ModelConfig(kind, mode, outside=self.outside)
                     config = config.of_minutes() if self.few else config
-                    model, report, unsupported = certify_supported(data, config, self.windows, self.until_held)
+                    model, report, unsupported = certify_supported(
+                        data, config, self.windows, self.until_held, progress
+                    )
                 except Unsupported as error:
                     figures = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
@@ -100,7 +103,7 @@ class CertifyCommand:
                     figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
                     figures |= self._put_to_use(model, data)
                 results.setdefault(kind, {})[mode] = figures
-                advance()
+                progress(1.0)
         if self.json:
             # The figures of a certificate are those of the direct mode; those of each mode stand beside them.
             flat = {kind: row.get("direct", next(iter(row.values()))) | row for kind, row in results.items()}

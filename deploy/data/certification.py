@@ -11,7 +11,7 @@ from brakeline.errors import BadData, ErrorBoundError, Unsupported
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
-from brakeline.safety.model.one_step_fitting import fit_one_step
+from brakeline.safety.model.one_step_fitting import Progress, fit_one_step, unheard
 from brakeline.safety.model.validation import (
     Array,
     ValidationReport,
@@ -29,7 +29,9 @@ AUTO = "auto"
 PLAN_HINT = " (in a plan window the robot brakes as the filter does: a chosen input, then the description's stop rules)"
 
 
-def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) -> tuple[ModelSet, ValidationReport]:
+def certify(
+    data: Dataset, model_config: ModelConfig, until_held: bool = False, progress: Progress = unheard
+) -> tuple[ModelSet, ValidationReport]:
     """Fit a model set and validate it on driving that it was not fitted to.
 
     Mode one-step predicts every window without its fold (cross-conformal calibration, docs/method.md §13). The other
@@ -45,6 +47,7 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         data: the recorded trajectories.
         model_config: error bound, mode, windows and first inflation.
         until_held: widen the envelopes by any factor, until no held-out plan leaves its set.
+        progress: called with the share of the work that is done; by mode one-step only.
 
     Returns:
         The model set, with the main figures of its validation in `about`, and the validation report.
@@ -53,7 +56,7 @@ def certify(data: Dataset, model_config: ModelConfig, until_held: bool = False) 
         BadData, ErrorBoundError: the data do not support a model set; the message gives the reason.
     """
     if model_config.mode == ONE_STEP:
-        model, calibration = fit_one_step(data, model_config)
+        model, calibration = fit_one_step(data, model_config, progress)
         report = validate_one_step(model, calibration)
         return _stated(model, report, data), report
     data = data.steady()
@@ -83,7 +86,11 @@ def _stated(model: ModelSet, report: ValidationReport, data: Dataset) -> ModelSe
 
 
 def certify_supported(
-    data: Dataset, model_config: ModelConfig, windows: str = AUTO, until_held: bool = False
+    data: Dataset,
+    model_config: ModelConfig,
+    windows: str = AUTO,
+    until_held: bool = False,
+    progress: Progress = unheard,
 ) -> tuple[ModelSet, ValidationReport, dict[str, str]]:
     """Certify with plan windows if the data hold enough of them, else with free windows.
 
@@ -92,6 +99,7 @@ def certify_supported(
         model_config: its kind of windows is replaced.
         windows: `plan` or `free` to try one kind only.
         until_held: see `certify`.
+        progress: see `certify`.
 
     Returns:
         The model set, its validation report, and for each kind that failed the reason.
@@ -103,7 +111,7 @@ def certify_supported(
     free_only = model_config.mode == ONE_STEP  # it needs no plans, and plans are driving like any other
     for kind in (FREE,) if free_only else (PLAN, FREE) if windows == AUTO else (windows,):
         try:
-            model, report = certify(data, replace(model_config, windows=kind), until_held)
+            model, report = certify(data, replace(model_config, windows=kind), until_held, progress)
         except (BadData, ErrorBoundError) as error:
             reasons[kind] = str(error) + (PLAN_HINT if kind == PLAN else "")
         else:

@@ -7,6 +7,7 @@ cut into folds, and a predictor that did not see a fold predicts the windows in 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -28,6 +29,9 @@ from brakeline.safety.model.windows import displacement, predicted_outputs, way_
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+Progress = Callable[[float], None]  # called with the share of the work that is done
+CHOSEN, WEIGHED, SCORED = 0.5, 0.7, 0.95  # shares of the work that are done after each part
 
 FOLDS = 5
 DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
@@ -170,7 +174,11 @@ class _Regression:
         return found
 
 
-def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regression]:
+def unheard(share: float) -> None:
+    """Ignore the progress."""
+
+
+def choose(robot: Robot, s: Samples, progress: Progress = unheard) -> tuple[Candidate, list[Candidate], _Regression]:
     """Choose degree, lags, saturating features and ridge by the out-of-fold error.
 
     Returns:
@@ -179,7 +187,9 @@ def choose(robot: Robot, s: Samples) -> tuple[Candidate, list[Candidate], _Regre
     found: list[tuple[Candidate, _Regression]] = []
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
     few_windows = replace(s, z=s.z[some], after=s.after[some], fold=s.fold[some])
-    for degree, lags, saturating in product(DEGREES, LAGS, (False, True)):
+    families = [*product(DEGREES, LAGS, (False, True))]
+    for number, (degree, lags, saturating) in enumerate(families):
+        progress(CHOSEN * number / len(families))
         features = features_for(robot, s.v, degree, lags, saturating)
         count = len(features.terms)
         few = degree > 1 and len(s.v) < FEWEST_PERIODS_A_FEATURE * count
@@ -229,10 +239,13 @@ class Calibration:
     condition: float
 
 
-def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Calibration]:
+def fit_one_step(
+    data: Dataset, model_config: ModelConfig, progress: Progress = unheard
+) -> tuple[ModelSet, Calibration]:
     """Fit a model set of mode one-step to recorded driving of any kind.
 
     The score of a window is the largest ratio of an error to a shape. Predictor and shape come from the other folds.
+    `progress` is called with the share of the work that is done.
 
     Raises:
         BadData: there is too little driving, or too few stops; the message says what to record.
@@ -242,9 +255,10 @@ def fit_one_step(data: Dataset, model_config: ModelConfig) -> tuple[ModelSet, Ca
     if robot.feedback:
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
     s = samples_of(data)
-    chosen, candidates, regression = choose(robot, s)
+    chosen, candidates, regression = choose(robot, s, progress)
+    progress(CHOSEN)
     weight = _weight(robot, s, regression, chosen.ridge, model_config.outside)
-    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight)
+    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, progress)
     kinds = driving_kinds(robot, s.z, s.start)
     factor, first = (_factor(each, kinds, model_config.outside) for each in (scores, others))
     if not robot.position_dim:  # the limited coordinates are scored with the plan
@@ -335,7 +349,7 @@ def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float, out
 
 
 def _scores(
-    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float
+    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float, progress: Progress
 ) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
 
@@ -346,6 +360,7 @@ def _scores(
     d, scores = robot.position_dim, np.zeros((3, len(s.z)))
     used = [*range(d), *extra_coordinates(robot), -1]
     for i in range(len(regression.gram)):
+        progress(WEIGHED + (SCORED - WEIGHED) * i / len(regression.gram))
         held = s.fold == i
         one_step = regression.fit(ridge, i, weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]

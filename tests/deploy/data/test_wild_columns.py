@@ -1,5 +1,6 @@
 """Files of columns as other people write them: one drive in any dialect, unit and kind of stamps is one data set."""
 
+import io
 import json
 import math
 import re
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
+from brakeline.deploy import progress
 from brakeline.deploy.cli import main
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.dataset import Dataset
@@ -317,3 +320,13 @@ def test_what_cannot_be_read_is_refused_with_the_cause(tmp_path, capsys, text, s
     path.write_text(text)
     assert said in refused(capsys, ["import", path, "--robot", FILE])
     assert said in refused(capsys, ["robot", "new", Path(tmp_path) / "my.toml", "--from", path])
+
+
+def test_certify_shows_the_share_that_is_done_and_the_time_left(tmp_path, monkeypatch):
+    path, out = tmp_path / "drive.safetensors", io.StringIO()
+    imported(write_csv(tmp_path / "drive.csv", *drive(seconds=150.0))).save(path)
+    monkeypatch.setattr(progress, "console", Console(file=out, force_terminal=True, width=100))
+    main(["certify", str(path), "--robot", str(FILE), "--few"])
+    shown = [int(count) for count in re.findall(r"(\d+)/100", out.getvalue())]
+    assert shown == sorted(shown) and len({*shown} - {0, 100}) >= 3, shown
+    assert re.search(r"\d:\d\d:\d\d", out.getvalue())
