@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
+from brakeline.deploy.data.message_columns import with_message_fields
 from brakeline.deploy.data.resample import HOLD, ImportedData, ImportReport, resample
 from brakeline.deploy.data.run_dataset import from_log
 from brakeline.deploy.data.sources.isolated_reader import read_isolated
@@ -58,7 +59,10 @@ def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
 def with_time(tables: list[Table], path: Path, options: LogOptions) -> list[Table]:
     """Return tables with their time, their source and the ranks that the user chose. Raises NoSource."""
     column, unit = options.fields.get(TIME, ""), options.units.get(TIME, "")
-    tables = [replace(t if t.name else stamped(in_header_units(t), column, unit), source=path.name) for t in tables]
+    tables = [
+        replace(t if t.name else with_message_fields(stamped(in_header_units(t), column, unit)), source=path.name)
+        for t in tables
+    ]
     return options.ranked(tables)
 
 

@@ -5,6 +5,7 @@ The result has every numeric column; `deploy/data/stamps.py` finds the time amon
 
 from __future__ import annotations
 
+import csv as quoted
 import io
 import math
 import re
@@ -105,7 +106,8 @@ def _dialect(path: Path) -> _Dialect:
     width = Counter(len(_cells(line, separator)) for line in sample[1:] or sample).most_common(1)[0][0]
     decimal = "," if separator != "," and _decimal_commas(sample, separator) else "."
     names = _cells(rows[0][1], separator)
-    if all(NUMBER.fullmatch(cell) or cell.lower() in MISSING for cell in names):
+    numbers = sum(bool(NUMBER.fullmatch(cell)) for cell in names)
+    if numbers >= 0.5 * len(names) or all(NUMBER.fullmatch(cell) or cell.lower() in MISSING for cell in names):
         names = _commented_names(comments, rows[0][0], separator, width)
         if not names:
             names = [f"column {i + 1}" for i in range(width)]
@@ -157,7 +159,12 @@ def _separator(sample: list[str]) -> str:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    cells = line.split() if separator == " " else line.split(separator)
+    if separator == " ":
+        cells = line.split()
+    elif '"' in line:
+        cells = next(quoted.reader([line], delimiter=separator, skipinitialspace=True))
+    else:
+        cells = line.split(separator)
     return [cell.strip().strip('"').strip() for cell in cells]
 
 

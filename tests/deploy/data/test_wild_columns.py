@@ -330,3 +330,22 @@ def test_certify_shows_the_share_that_is_done_and_the_time_left(tmp_path, monkey
     shown = [int(count) for count in re.findall(r"(\d+)/100", out.getvalue())]
     assert shown == sorted(shown) and len({*shown} - {0, 100}) >= 3, shown
     assert re.search(r"\d:\d\d:\d\d", out.getvalue())
+
+
+def test_the_fields_of_exported_messages_are_the_coordinates(driven, plain, tmp_path, capsys):
+    """As `rostopic echo -p` writes them: a comment as header, text, a quaternion, stamps in ns."""
+    time, values = driven
+    pose, twist = "field.pose.pose.", "field.twist.twist."
+    names = ["%time", "field.header.frame_id", f"{pose}position.x", f"{pose}position.y"]
+    names += [f"{pose}orientation.{part}" for part in "xyzw"] + [f"{twist}linear.x", f"{twist}angular.z", *COLUMNS[5:]]
+    lines = [",".join(names)]
+    for t, (x, y, heading, *speeds) in zip(time, values, strict=True):
+        turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
+        numbers = ",".join(map(repr, map(float, (x, y, *turned, *speeds))))
+        lines.append(f"{EPOCH * 10**9 + round(1e9 * t)},odom,{numbers}")
+    path = tmp_path / "odom.csv"
+    path.write_text("\n".join(lines) + "\n")
+    # The description calls the speeds v and w, and its inputs as the messages call the speeds.
+    path.write_text(path.read_text().replace(",speed,turn rate\n", ",cmd v,cmd w\n", 1))
+    places = ("--map", "v=speed", "w=turn rate", "speed=cmd v", "turn rate=cmd w")
+    same(plain, imported(path, *places), 1e-5)
