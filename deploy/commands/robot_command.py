@@ -130,19 +130,23 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
     from brakeline.deploy.data.description_template import fill_template
     from brakeline.deploy.data.embedded_description import read_embedded_description
     from brakeline.deploy.data.importer import own_log, tables_of
-    from brakeline.deploy.data.schema_inference import infer_schema
+    from brakeline.deploy.data.schema_inference import infer_schema, without_inputs
 
     if own_log(sources[0]):
         return read_embedded_description(sources[0], name), ()
     names = ", ".join(source.name for source in sources)
     schema = infer_schema(*(tables_of(source, options) for source in sources), options=options)
-    text = fill_template(template, schema, names)
-    try:
-        robot_from_description(tomllib.loads(text), name)
-    except (BadDescription, tomllib.TOMLDecodeError) as error:
-        problems = "\n  ".join((*schema.notes, str(error)))
-        raise NoSource(
-            f"{names}: no description without mistakes follows from it. Drive so that every input takes several values "
-            f"and the robot moves and turns, or name columns with --map:\n  {problems}"
-        ) from error
-    return text, schema.notes
+    problems = ""
+    for one in (schema, without_inputs(schema)):
+        text = fill_template(template, one, names)
+        try:
+            robot_from_description(tomllib.loads(text), name)
+        except (BadDescription, tomllib.TOMLDecodeError) as error:
+            problems = str(error)
+        else:
+            return text, one.notes
+    reasons = "\n  ".join((*schema.notes, problems))
+    raise NoSource(
+        f"{names}: no description without mistakes follows from it. Drive so that every input takes several values and "
+        f"the robot moves and turns, or name columns with --map:\n  {reasons}"
+    )

@@ -58,6 +58,7 @@ HELD = 0.5  # share of rows that repeat the row before: only inputs, which are h
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
 MOST_UNKNOWN = 3  # columns of a file that nothing is known of; more are left out
 CHOSEN_PERIOD = 0.1  # s, where the log shows no beat
+GUESS = "a guess: the inputs of the log show no beat; take the period of your controller"
 LONGEST_PLAN = 40  # periods: if a stop takes more, a period is several beats
 NAMED = 12  # columns that a note names
 
@@ -139,6 +140,15 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
     return InferredSchema(float(f"{log.period:.3g}"), why, tuple(states), tuple(inputs), tuple(dict.fromkeys(notes)))
 
 
+def without_inputs(schema: InferredSchema) -> InferredSchema:
+    """Return a schema whose inputs are left out, because no description follows from them."""
+    names = ", ".join(one.name for one in schema.inputs)
+    note = f"no inputs of a robot: {names}; name the inputs with --map 'command NAME=COLUMN'"
+    states = tuple(replace(one, follows="") for one in schema.states)
+    notes = (*schema.notes, note)
+    return replace(schema, period=CHOSEN_PERIOD, why=GUESS, states=states, inputs=(), notes=notes)
+
+
 def _read(sources: Sequence[Sequence[Table]], options: LogOptions) -> tuple[AlignedLog, list[str]]:
     """Return the columns of all logs on one time, and notes on what was chosen and left out."""
     logs, notes = list[AlignedLog](), list[str]()
@@ -163,7 +173,7 @@ def _period(log: AlignedLog) -> tuple[float, str]:
     if log.inputs and log.input_step >= log.step:
         return log.input_step, "the time between two messages of the inputs, which hardly change"
     period = log.step * max(math.ceil(CHOSEN_PERIOD / log.step - 1e-6), 1)
-    return period, "a guess: the inputs of the log show no beat; take the period of your controller"
+    return period, GUESS
 
 
 def stop_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> int:

@@ -178,8 +178,7 @@ def _commented_names(comments: list[tuple[int, str]], before: int, separator: st
     """Return the names in the last comment above the rows that has a name for each column; else none."""
     for i, line in reversed(comments):
         text = COMMENT.sub("", line, count=1).strip()
-        for one in dict.fromkeys((separator, ",", " ")):
-            names = _cells(text, one)
+        for names in (*(_cells(text, one) for one in (separator, ",")), re.split(r"\t+|\s{2,}", text), text.split()):
             if i < before and len(names) == width and not any(NUMBER.fullmatch(name) for name in names):
                 return names
     return []
@@ -219,7 +218,7 @@ def _numbers(column: arrow.ChunkedArray, decimal: str, lines: np.ndarray) -> tup
     if not bad:
         return values, ""
     if len(bad) > max(DAMAGED * len(cells), NAMED) or len(bad) == len(cells):
-        return None, f"line {lines[bad[0]]}: it holds text ({cells[bad[0]]!r}): the column is left out"
+        return None, f"line {lines[bad[0]]}: it holds text ({cells[bad[0]][:20]!r}): the column is left out"
     return values, f"{_listed([int(lines[i]) for i in bad])}: no number ({cells[bad[0]]!r}): the cell is left out"
 
 
