@@ -20,7 +20,7 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 
 START_TIMEOUT = 60.0  # s
 
@@ -33,7 +33,7 @@ def serve(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
     models.install(situations.model())
     authenticator = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
     with Bus(settings, name) as bus:
-        bus.serve(DECIDE, batch_handler(models, ServiceCounts(), authenticator))
+        bus.serve(DECIDE, BatchHandler(models, ServiceCounts(), authenticator))
         ready.set()
         stop.wait()
 
@@ -101,11 +101,11 @@ def keys_for(folder: Path, *names: str) -> Path:
     return folder
 
 
-def with_plan_tokens(requests: list[pb.Request], keys: Path) -> list[pb.Request]:
-    """Add the plan tokens that services with these keys accept."""
+def with_plan_tokens(requests: list[pb.Request], keys: Path, asker: str = "client") -> list[pb.Request]:
+    """Add the plan tokens that services with these keys accept from the process `asker`."""
     authenticator = PlanAuthenticator.of(keys)
     for request in requests:
-        request.plan_token = authenticator.plan_token(request, robot_named(request.robot))
+        request.plan_token = authenticator.plan_token(request, robot_named(request.robot), asker)
     return requests
 
 

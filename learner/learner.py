@@ -29,10 +29,13 @@ from brakeline.learner.td3 import TD3
 from brakeline.learner.transition_reader import LATEST, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
+from brakeline.messaging.bus.identity import identity_of, speaks_for
 from brakeline.messaging.flow_limits import AHEAD
 from brakeline.messaging.task import RobotWithTask
 
 MOST_ACTORS = 2048
+MOST_ACTORS_OF_ONE = 256  # of one identity: so many robots of a process, or actors of a feeder's logs
+FEEDER = "feeder"  # role that joins for the actors of logs
 
 
 class Part(Protocol):
@@ -70,6 +73,7 @@ class Learner:
         ahead = 0.0 if config.lockstep else config.ahead
         self._limiter = RateLimiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
         self._limits: dict[str, int] = {}
+        self._present: set[str] = set()  # actors that joined by themselves, for which no feeder may speak
         self._episode_ended = True  # whether the last step ended its episode
         self._saved_at = 0  # number of steps at the last checkpoint
         self.surplus = 0  # steps after the last one of the run
@@ -80,8 +84,11 @@ class Learner:
         self._ages: list[int] = []  # versions that each step was behind, since the last metrics
         self.publish()
 
-    def insert(self, step: pb.Step) -> bool:
+    def insert(self, step: pb.Step, logged: bool = False) -> bool:
         """Insert a step. Return False if it is a duplicate, or comes after the end of the run.
+
+        Args:
+            logged: a feeder publishes it, not the actor itself.
 
         Raises:
             BadStep: a size or value is wrong, or the actor may not publish this step. The step is only counted.
@@ -91,6 +98,8 @@ class Learner:
             place = self._ledger.places.get(step.actor)
             if place is None:
                 raise BadStep("actor", f"{step.actor} never joined")
+            if logged and step.actor in self._present:
+                raise BadStep("actor", f"a feeder publishes for {step.actor}, which has joined by itself")
             if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
                 raise BadStep("index", f"{step.index}, but {step.actor} is at {place.last_index}")
         except BadStep:
@@ -108,15 +117,24 @@ class Learner:
         self._ages.append(self._version - step.weights_version)
         return True
 
-    def join(self, join: pb.Join) -> pb.JoinReply:
-        """Accept an actor, or give the reason for the refusal in `error`."""
+    def join(self, join: pb.Join, asker: str = "") -> pb.JoinReply:
+        """Accept an actor, or give the reason for the refusal in `error`.
+
+        Args:
+            asker: name of the process that asks; empty: do not compare it with the actor's.
+        """
         layout, known = self.robot.learning_layout(), join.actor in self._limits
-        first = next(iter(self._limits), "")
+        first, owner = next(iter(self._limits), ""), identity_of(join.actor)
+        full = not known and sum(identity_of(name) == owner for name in self._limits) >= MOST_ACTORS_OF_ONE
+        most = self._most_published(join.actor)
         refusals = (
             (join.robot != self.robot.name, "robot", f"{join.robot!r}, not {self.robot.name!r}"),
             (join.layout != layout, "layout", f"{join.layout!r}, but {self.robot.name} has {layout!r} here"),
             (not join.actor, "actor", "empty"),
+            (not self._may_join(asker, join.actor), "actor", f"{join.actor!r}, but {asker!r} asks"),
             (max(join.index, join.episode) >= LATEST, "index", f"{join.index} steps, episode {join.episode}"),
+            (join.index > most, "index", f"{join.index} steps, but {join.actor} may have published {most} at most"),
+            (full, "actor", f"{join.actor!r} is one more of {owner} than {MOST_ACTORS_OF_ONE}"),
             (not known and len(self._limits) == MOST_ACTORS, "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"),
             (
                 self.config.lockstep and bool(self._limits.keys() - {join.actor}),
@@ -127,9 +145,24 @@ class Learner:
         for refused, field, why in refusals:
             if refused:
                 return pb.JoinReply(error=pb.Error(type="Refused", field=field, message=why))
+        if asker and not asker.startswith(FEEDER):
+            self._present.add(join.actor)
         episode = self._ledger.join(join.actor, join.index, join.episode)
         self._limits[join.actor] = join.index
         return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode)
+
+    def _may_join(self, asker: str, actor: str) -> bool:
+        """Return whether a process may join for an actor: for itself or its robot; a feeder for all that are absent."""
+        if asker.startswith(FEEDER):
+            return actor not in self._present
+        return not asker or speaks_for(asker, actor)
+
+    def _most_published(self, actor: str) -> int:
+        """Return how many steps an actor can have published since its start, by the permissions of this run."""
+        permitted = self._limits.get(actor)
+        if permitted is None:  # it may have its permission from an earlier learner
+            return LATEST if actor not in self._ledger.places else self.config.steps + AHEAD
+        return permitted + AHEAD
 
     def work(self, most: int) -> int:
         """Make at most `most` of the updates that are due. Return how many it made."""

@@ -22,7 +22,10 @@ from brakeline.learner.learner_config import LearnerConfig
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus.inbox import Inbox
+from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.task import robot_with_task
 from brakeline.messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
 
@@ -87,8 +90,8 @@ class LearnerLoop:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._process, self._learner, self._settings, self._clock = process, learner, settings, clock
-        self._steps: deque[Sample] = deque()
-        self._joins: deque[tuple[bytes, Future[bytes]]] = deque()
+        self._steps = Inbox()
+        self._joins: deque[tuple[bytes, str, Future[bytes]]] = deque()
         self._wake = Event()
         self._last_flow: object = None
         self._flow_at = self._metrics_at = self._retry_at = -1e9
@@ -103,12 +106,12 @@ class LearnerLoop:
     # In the threads of the bus:
 
     def _receive(self, sample: Sample) -> None:
-        self._steps.append(sample)
+        self._steps.put(sample)
         self._wake.set()
 
-    def _answer(self, payload: bytes) -> bytes:
+    def _answer(self, payload: bytes, asker: str) -> bytes:
         answer: Future[bytes] = Future()
-        self._joins.append((payload, answer))
+        self._joins.append((payload, asker, answer))
         self._wake.set()
         return answer.result(JOIN_PATIENCE)
 
@@ -142,29 +145,28 @@ class LearnerLoop:
     def _take_joins(self) -> int:
         taken = 0
         while self._joins:
-            payload, answer = self._joins.popleft()
+            payload, asker, answer = self._joins.popleft()
             taken += 1
             try:
                 join = pb.Join.FromString(payload)
-                reply = self._learner.join(join)
+                reply = self._learner.join(join, asker)
                 outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "accepted"
-                log.info("actor %s: %s", join.actor, outcome)
+                log.info("actor %s: %s", headline(join.actor), outcome)
                 answer.set_result(reply.SerializeToString())
                 self._metrics_at = -1e9  # tell the new limits before the actor's first steps
             except Exception as error:  # the bus sends it to the actor
                 answer.set_exception(error)
         return taken
 
-    def _take_steps(self) -> int:
+    def _take_steps(self, seconds: float = FLOW_SPACING) -> int:
         taken = 0
-        while self._steps:
-            sample = self._steps.popleft()
+        for sample in self._steps.drain(seconds):
             taken += 1
             with self._process.bus.rejected.skip_on_error(sample.key):
                 step = sample.message()
-                if sample.key.rpartition("/")[2] != step.actor:
+                if names_of(sample.topic, sample.key)["source"] != step.actor:
                     raise BadStep("actor", f"{step.actor!r} published at {sample.key}")
-                self._learner.insert(step)
+                self._learner.insert(step, logged=sample.topic is LOGGED)
         return taken
 
     def _publish_flow(self) -> None:
@@ -212,7 +214,7 @@ class LearnerLoop:
     def _finish(self) -> None:
         """Learn from the steps that arrived, as far as updates are due, and save the result."""
         self._take_joins()
-        self._take_steps()
+        self._take_steps(LINGER)
         if self._settings.learner.lockstep:
             while self._learner.work(UPDATES_A_TURN):
                 pass

@@ -8,9 +8,8 @@ that it drops. When a file is large or old, the recorder finishes it and continu
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathlib import Path
 from brakeline.logs.segment import Attachments, Entry, Metadata, Segment, open_segment
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus.inbox import Inbox, size_in_memory
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import RECORDED
@@ -28,62 +28,9 @@ PERIOD = 0.5  # s between flushes
 RETRY = 1.0  # s between attempts to write to a full disk
 QUIET = 0.3  # s without a message after which a stopping recorder ends
 PATIENCE = 3.0  # s that a stopping recorder waits for this at most
-INBOX = 64 * 2**20  # bytes
-OVERHEAD = 100  # bytes of a sample besides its payload
-BATCH = 2**20  # bytes per write, so that a nearly full disk still takes what fits
 MOST_DRAWING = 2.0  # s of one flush after which the remaining messages are recorded without scenes
 
 Derive = Callable[[Sample], Iterable[Entry]]  # additional entries for a sample, e.g. Foxglove's scenes
-
-
-def size_in_memory(sample: Sample) -> int:
-    """Return a lower bound on the memory of a sample, bytes; an empty sample counts too."""
-    return OVERHEAD + len(sample.payload)
-
-
-class Inbox:
-    """Samples that are not in the file yet.
-
-    Attributes:
-        limit: bytes.
-        bytes: of the waiting samples.
-        dropped: number of dropped samples by key.
-    """
-
-    def __init__(self, limit: int = INBOX) -> None:
-        self.limit = limit
-        self.dropped: Counter[str] = Counter()
-        self.bytes = 0
-        self._samples: deque[Sample] = deque()
-        self._lock = threading.Lock()
-
-    def put(self, sample: Sample) -> None:
-        """Add the sample, or count it as dropped."""
-        with self._lock:
-            if self.bytes + size_in_memory(sample) > self.limit:
-                self.dropped[sample.key] += 1
-            else:
-                self.bytes += size_in_memory(sample)
-                self._samples.append(sample)
-
-    def oldest(self, size: int = BATCH) -> list[Sample]:
-        """Return the oldest samples, about `size` bytes; they stay in the inbox until `remove`."""
-        batch: list[Sample] = []
-        total = 0
-        with self._lock:
-            for sample in self._samples:
-                if batch and total + size_in_memory(sample) > size:
-                    break
-                batch.append(sample)
-                total += size_in_memory(sample)
-        return batch
-
-    def remove(self, samples: list[Sample]) -> None:
-        """Remove the samples that `oldest` returned: they are in the file."""
-        with self._lock:
-            for sample in samples:
-                self._samples.popleft()
-                self.bytes -= size_in_memory(sample)
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from http.server import ThreadingHTTPServer
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import MetricsHandler
+
+from brakeline.messaging.http_server import BoundedHandler, BoundedServer
 
 LOCALHOST = "127.0.0.1"
 
@@ -94,8 +95,7 @@ class MetricsServer:
         metrics = CollectorRegistry()
         metrics.register(ProcessCollector(status))
 
-        class Handler(MetricsHandler):
-            timeout = 5.0  # for one request [s]
+        class Handler(BoundedHandler, MetricsHandler):
             registry = metrics
 
             def do_GET(self) -> None:
@@ -103,22 +103,16 @@ class MetricsServer:
                 if path == "/metrics":
                     super().do_GET()
                 elif path == "/live":
-                    self._answer(200 if status().live else 503)
+                    self._answer(status().live)
                 elif path == "/ready":
-                    self._answer(200 if status().ready else 503)
+                    self._answer(status().ready)
                 else:
-                    self._answer(404)
+                    self.reply_text(404, "there are /metrics, /live and /ready\n")
 
-            def _answer(self, code: int) -> None:
-                body = {200: b"yes\n", 503: b"no\n", 404: b"there are /metrics, /live and /ready\n"}[code]
-                self.send_response(code)
-                self.send_header("Content-Type", "text/plain")
-                self.send_header("Content-Length", str(len(body)))
-                self.end_headers()
-                self.wfile.write(body)
+            def _answer(self, yes: bool) -> None:
+                self.reply_text(200 if yes else 503, "yes\n" if yes else "no\n")
 
-        self._server = ThreadingHTTPServer((host or LOCALHOST, int(port)), Handler)
-        self._server.daemon_threads = True
+        self._server = BoundedServer((host or LOCALHOST, int(port)), Handler, own_port=False)
         self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
         self._thread.start()

@@ -7,8 +7,10 @@ with Process(settings, "safety") as process:
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import queue
 import sys
 import threading
 import time
@@ -26,6 +28,8 @@ from brakeline.messaging.topics import HEALTH, LOG
 log = logging.getLogger("brakeline.process")
 
 MAX_SILENCE = 10.0  # time without a Health after which the process counts as stuck [s]
+MAX_WAITING_LINES = 1000  # log lines that wait for the bus; further ones are lost to it
+CLOSE_TIMEOUT = 1.0  # for the log lines that wait when the process ends [s]
 LEVELS = {"CRITICAL": "ERROR"}  # levels that LogLine does not have
 
 
@@ -63,6 +67,7 @@ class Process:
 
     def __enter__(self) -> Self:
         self.bus = Bus(self.settings, self.source)
+        self._bus_handler = BusHandler(self.bus.publisher(LOG), self.source)
         try:
             if self.settings.metrics:
                 self._metrics = MetricsServer(self.settings.metrics, self._status)
@@ -132,7 +137,8 @@ class Process:
         )
 
     def _all_figures(self) -> dict[str, float]:
-        return self.figures | {"passed over": self.bus.rejected.count}
+        lost = self._bus_handler.lost
+        return self.figures | {"passed over": self.bus.rejected.count} | ({"log lines lost": lost} if lost else {})
 
     def _put_health(self, last: bool = False) -> None:
         if self.refresh is not None:
@@ -151,7 +157,7 @@ class Process:
         )
 
     def _start_logging(self) -> None:
-        self._handlers = [BusHandler(self.bus.publisher(LOG), self.source)]  # `__exit__` relies on this order
+        self._handlers = [self._bus_handler]  # `__exit__` relies on this order
         if self._stderr:
             stream = logging.StreamHandler(sys.stderr)
             stream.setFormatter(logging.Formatter(f"%(asctime)s {self.source} %(levelname)s %(message)s"))
@@ -167,24 +173,43 @@ class Process:
         root.setLevel(self._level)
         for handler in self._handlers:
             root.removeHandler(handler)
+            handler.close()
 
 
 class BusHandler(logging.Handler):
-    """A handler that publishes log records, except those that arise while it publishes."""
+    """A handler that publishes log records in a thread of its own, until `close`.
+
+    A thread that logs never waits for the bus: it may be the thread that empties the queue into which the line goes.
+
+    Attributes:
+        lost: number of lines that found `MAX_WAITING_LINES` lines waiting.
+    """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
         super().__init__()
+        self.lost = 0
         self._publisher, self._process = publisher, process
-        self._busy = threading.local()
+        self._lines: queue.Queue[pb.LogLine | None] = queue.Queue(MAX_WAITING_LINES)
+        self._thread = threading.Thread(target=self._publish, name="log", daemon=True)
+        self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        if getattr(self._busy, "now", False):
+        if threading.current_thread() is self._thread:
             return
-        self._busy.now = True
+        level = LEVELS.get(record.levelname, record.levelname)
         try:
-            level = LEVELS.get(record.levelname, record.levelname)
-            self._publisher.put(pb.LogLine(process=self._process, level=level, text=self.format(record)))
-        except BusError:
-            pass  # the bus is closing; stderr has the line
-        finally:
-            self._busy.now = False
+            self._lines.put_nowait(pb.LogLine(process=self._process, level=level, text=self.format(record)))
+        except queue.Full:
+            self.lost += 1  # stderr has the line
+
+    def close(self) -> None:
+        """Publish the waiting lines, for at most `CLOSE_TIMEOUT`."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put(None, timeout=CLOSE_TIMEOUT)
+        self._thread.join(CLOSE_TIMEOUT)
+        super().close()
+
+    def _publish(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with contextlib.suppress(BusError):  # the bus is closing; stderr has the line
+                self._publisher.put(line)

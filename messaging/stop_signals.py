@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-REPEAT_TIME = 1.0  # signals within this time are one [s]: the kernel repeats it for each thread of a dead parent
+REPEAT_TIME = 0.5  # signals within this time are one [s]: the kernel repeats it for each thread of a dead parent
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -46,9 +46,10 @@ def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[th
 def _listen(receiver: socket.socket, stop: threading.Event, patient: bool) -> None:
     first: float | None = None
     with receiver:
-        while received := receiver.recv(1):
+        while received := receiver.recv(4096):  # a volley at once
             now = time.monotonic()
             first = now if first is None else first
-            if received[0] in NUMBERS and now - first > REPEAT_TIME and not patient:
-                os._exit(128 + received[0])
+            number = next((one for one in received if one in NUMBERS), None)
+            if number is not None and now - first > REPEAT_TIME and not patient:
+                os._exit(128 + number)
             stop.set()

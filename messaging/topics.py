@@ -1,8 +1,8 @@
 """THE table of topics: key, message, delivery, rate, roles that publish and subscribe, and whether it is recorded.
 
-A publisher fills in `{robot}` and `{source}` in a key; for a subscriber they are wildcards. The publisher of a query
-asks it, and a subscriber answers it with another message. With keys, the routers of a bus let nothing pass that is not
-in this table (messaging/bus/access_control.py).
+A publisher fills in `{robot}` and `{source}` in a key; for a subscriber they are wildcards. `{source}` is the name of
+the publisher, or begins with it and a dot. The publisher of a query asks it, and a subscriber answers it with another
+message. With keys, the routers of a bus let nothing pass that is not in this table (messaging/bus/access_control.py).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Topic:
     recorded: bool
     answer: type[Message] | None = None  # to a query
     largest: int = 2**20  # bytes; larger messages are rejected
-    own: bool = True  # `{source}` must be the publisher's name, or begin with the name and a dot
+    own: bool = True  # False: `{source}` is an actor of a log, whose steps a feeder publishes
 
     @property
     def stale_after(self) -> float | None:
@@ -66,9 +66,9 @@ class Topic:
 FILE = 2**26  # largest message with a file [bytes]
 BLOCK, DROP, QUERY = Delivery.BLOCK, Delivery.DROP, Delivery.QUERY
 # fmt: off
-DECIDE = Topic("decide", "safety/{robot}/decide", pb.RequestBatch, QUERY, None, ("actor", "client"), ("safety",), False,
-               pb.ReplyBatch)
-JOIN = Topic("join", "learner/{robot}/join", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
+DECIDE = Topic("decide", "safety/{robot}/decide/{source}", pb.RequestBatch, QUERY, None, ("actor", "client"),
+               ("safety",), False, pb.ReplyBatch)
+JOIN = Topic("join", "learner/{robot}/join/{source}", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
              pb.JoinReply)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, BLOCK, None, ("certify",), ("safety",), True, largest=FILE)
 STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, ("actor",), ("learner", "certify"), True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -14,13 +13,14 @@ from brakeline.deploy.commands.common_options import BusOptions, Unprefixed
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
 from brakeline.logs.watch.live_page_server import LivePageServer
-from brakeline.messaging.bus import Bus, Sample
+from brakeline.messaging.bus import Bus
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import RECORDED
 
 REFRESH_PERIOD = 0.05  # s
-INBOX_SIZE = 20_000  # samples; the oldest of more are not shown, so that no publisher has to wait
+MOST_SHOWING = 1.0  # s of one refresh; a signal ends the command after it
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,7 @@ class WatchCommand:
 
     def run(self) -> int:
         """Serve the live views until SIGINT or SIGTERM. Returns the exit status."""
-        inbox: deque[Sample] = deque(maxlen=INBOX_SIZE)
-        board, live = Dashboard(), None
+        inbox, board, live = Inbox(), Dashboard(), None
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
             server = stack.enter_context(LivePageServer(board.view, self.host, self.port))
@@ -50,7 +49,7 @@ class WatchCommand:
                 live = stack.enter_context(FoxgloveServer(self.host, self.foxglove_port, origins=self.origins))
             stop = stack.enter_context(stop_on_signals(threading.Event()))
             for topic in RECORDED:
-                bus.subscribe(topic, inbox.append)
+                bus.subscribe(topic, inbox.put)
             self._print_addresses(server.url, live.url if live is not None else None)
             while not stop.wait(REFRESH_PERIOD):
                 show_received(inbox, board, live, bus.rejected)
@@ -66,12 +65,9 @@ class WatchCommand:
         console.print("[dim]^C ends only this command; the run continues[/]")
 
 
-def show_received(
-    inbox: deque[Sample], board: Dashboard, live: FoxgloveServer | None, rejected: RejectedMessages
-) -> None:
+def show_received(inbox: Inbox, board: Dashboard, live: FoxgloveServer | None, rejected: RejectedMessages) -> None:
     """Empty the inbox into the web page and the Foxglove server. Skip messages that can't be shown."""
-    for _ in range(len(inbox)):
-        sample = inbox.popleft()
+    for sample in inbox.drain(MOST_SHOWING):
         with rejected.skip_on_error(sample.key):
             board.add(sample)
             if live is not None:

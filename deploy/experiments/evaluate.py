@@ -18,7 +18,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.methods import Model
 from brakeline.safety.model.model_config import DDPC, check_reservations
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.sim_conditions import Conditions
@@ -56,7 +56,7 @@ def in_process(model: Model, accept_bound: float | None = None) -> Ask:
 
 def asking(models: ModelRegistry) -> Ask:
     """Return a function that asks the core of the safety service with these models, in the bytes of the bus."""
-    answer = batch_handler(models, ServiceCounts())
+    answer = BatchHandler(models, ServiceCounts())
 
     def ask(requests: Sequence[pb.Request]) -> list[pb.Reply]:
         payload = pb.RequestBatch(requests=requests).SerializeToString()

@@ -8,7 +8,6 @@ import os
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,7 +18,8 @@ from brakeline.deploy.run.adaptation import Adaptation, Recertification
 from brakeline.deploy.run.processes import CERTIFIER
 from brakeline.errors import BadModel, BrakelineError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
@@ -31,7 +31,7 @@ from brakeline.safety.service.signature import ModelSigner
 log = logging.getLogger("brakeline.certifier")
 
 PERIOD = 0.5  # s between two looks at the messages
-BACKLOG = 10_000  # messages that may wait during a fit; older ones are lost
+MOST_TAKING = 10.0  # s in which it takes in the messages that waited during a fit
 START_ALLOWANCE, TERMINATION_TIMEOUT = 60.0, 10.0  # s, of a certifier beside a safety service
 NOTE = "adaptation"  # of Health, with the robot's name: the result of the last attempt
 
@@ -64,9 +64,9 @@ def main(settings: CertifierSettings) -> None:
     with Process(settings.bus, settings.name) as process:
         robots = [robot_maybe_with_task(name) for name in settings.robots]
         kinds = {robot.name: _adaptation(robot, settings) for robot in robots}
-        inbox: deque[Sample] = deque(maxlen=BACKLOG)
+        inbox = Inbox()
         for topic in (STEP, EXCHANGE):
-            process.bus.subscribe(topic, inbox.append)
+            process.bus.subscribe(topic, inbox.put)
         # In a thread, so that a fit does not delay the end of the process.
         threading.Thread(target=_run, args=(inbox, kinds, signer, process), name="certifier", daemon=True).start()
         process.announce()
@@ -83,17 +83,16 @@ def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:
     return Adaptation(robot, in_use, settings.accept_bound)
 
 
-def _run(inbox: deque[Sample], kinds: dict[str, Adaptation], signer: ModelSigner, process: Process) -> None:
+def _run(inbox: Inbox, kinds: dict[str, Adaptation], signer: ModelSigner, process: Process) -> None:
     while not process.stop.wait(PERIOD):
         _take_in(inbox, kinds, process)
         for kind in kinds.values():
             _follow(kind, signer, process)
 
 
-def _take_in(inbox: deque[Sample], kinds: dict[str, Adaptation], process: Process) -> None:
+def _take_in(inbox: Inbox, kinds: dict[str, Adaptation], process: Process) -> None:
     """Give the received messages to the robot kinds that they are about."""
-    while inbox:
-        sample = inbox.popleft()
+    for sample in inbox.drain(MOST_TAKING):
         with process.bus.rejected.skip_on_error(sample.key):
             message = sample.message()
             if isinstance(message, pb.Step) and message.robot in kinds:

@@ -24,7 +24,8 @@ from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
@@ -109,7 +110,8 @@ class Launcher:
         self.lines: deque[str] = deque(maxlen=200)
         self.ending = False
         self._earlier: set[Path] = set()  # files of the log from before a resumption
-        self._inbox: deque[Sample] = deque()
+        self._inbox = Inbox()
+        self._lacks_messages = False  # because the inbox was full
         self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
 
     def run(self, show: Callable[[Launcher], Any] = lambda run: None) -> dict[str, Any]:
@@ -127,7 +129,7 @@ class Launcher:
             self._rejected = process.bus.rejected
             self._claim_folder()
             for topic in RECORDED:
-                process.bus.subscribe(topic, self._inbox.append)
+                process.bus.subscribe(topic, self._inbox.put)
             process.refresh = lambda: self._update_health(process)
             try:
                 if self.config.record:
@@ -150,7 +152,7 @@ class Launcher:
                 self._drain()
                 outcome = "finished" if self.finished else "stopped before its last step"
                 process.notes["outcome"] = f"failed: {failure}" if failure is not None else outcome
-        self._drain()
+        self._drain(LAST_MESSAGES_TIMEOUT)
         figures = self.figures()
         try:
             write_atomically(self.folder / FIGURES, json.dumps(figures, indent=2).encode())
@@ -271,10 +273,10 @@ class Launcher:
                 said = last_line(self.folder / "logs" / "recorder.log")
                 log.error("no recorder, so the run starts without a log: %s", said)
 
-    def _drain(self) -> None:
-        """Take in the received messages."""
-        while self._inbox:
-            sample = self._inbox.popleft()
+    def _drain(self, seconds: float = PERIOD) -> None:
+        """Take in the received messages, for at most so long: a flood must not keep the launcher from its processes."""
+        self._report_drops()
+        for sample in self._inbox.drain(seconds):
             with self._rejected.skip_on_error(sample.key):
                 message = sample.message()
                 self.metrics.add(sample.key, message, sample.received)
@@ -284,6 +286,13 @@ class Launcher:
                             child.record_sign_of_life(message.pid)
                 if sample.topic.name == "log" and message.level in ("WARNING", "ERROR"):
                     self.lines.append(f"{message.process}: {headline(message.text)}")
+
+    def _report_drops(self) -> None:
+        """Log once that the figures of the launcher lack messages."""
+        if self._inbox.dropped and not self._lacks_messages:
+            self._lacks_messages = True
+            keys = ", ".join(key for key, _ in self._inbox.dropped.most_common(3))
+            log.error("messages come faster than the launcher counts them, most at %s: its figures lack some", keys)
 
     def _end(self) -> None:
         """End the actors first, so that none lacks answers, and the recorder last, so that it logs all messages."""

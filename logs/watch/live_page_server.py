@@ -11,15 +11,14 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, Self
 
 from brakeline.logs.json_values import finite
-from brakeline.logs.watch.allowed_hosts import rejection_reason
+from brakeline.messaging.http_server import MOST_CLIENTS, BoundedHandler, BoundedServer
 
 RATE = 10.0  # Hz of events
-TIMEOUT = 10.0  # s for a request, and for a client that does not read
+MOST_STREAMS = MOST_CLIENTS // 2  # pages at the same time; the other places are for short requests
 FILES = {  # path: file in logs/, media type. The report and the live page share svg.js and scene.js.
     "/": ("watch/page.html", "text/html; charset=utf-8"),
     "/page.css": ("watch/page.css", "text/css; charset=utf-8"),
@@ -48,8 +47,8 @@ class LivePageServer:
     def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0) -> None:
         """Create the server; `port` 0 selects a free port. `view` returns what the page shows."""
         self._ended = threading.Event()
-        self._http = ThreadingHTTPServer((host, port), partial(_Handler, view, self._ended, host))
-        self._http.daemon_threads = True
+        streams = threading.Semaphore(MOST_STREAMS)
+        self._http = BoundedServer((host, port), partial(_Handler, view, self._ended, streams))
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._http.server_address[1]}/"
 
@@ -63,21 +62,17 @@ class LivePageServer:
         self._http.server_close()
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(BoundedHandler):
     protocol_version = "HTTP/1.1"
 
-    timeout = TIMEOUT
-
-    def __init__(self, view: View, ended: threading.Event, host: str, *rest: Any) -> None:
-        self._view, self._ended, self._host = view, ended, host
+    def __init__(self, view: View, ended: threading.Event, streams: threading.Semaphore, *rest: Any) -> None:
+        self._view, self._ended, self._streams = view, ended, streams
         super().__init__(*rest)
 
     def do_GET(self) -> None:
         path = self.path.split("?", 1)[0]
         try:
-            if why := rejection_reason(self.headers, self._host, self.connection.getsockname()[1]):
-                self._send(403, "text/plain; charset=utf-8", f"{why}\n".encode(errors="replace"))
-            elif path == "/events":
+            if path == "/events":
                 self._events()
             elif path == "/view.json":
                 self._send(200, "application/json", encode(self._view()).encode())
@@ -85,7 +80,7 @@ class _Handler(BaseHTTPRequestHandler):
                 name, kind = FILES[path]
                 self._send(200, kind, (files("brakeline.logs") / name).read_bytes())
             else:
-                self._send(404, "text/plain; charset=utf-8", b"not found; the page is at /\n")
+                self.reply_text(404, "not found; the page is at /\n")
         except (ConnectionError, TimeoutError):  # the client has disconnected
             self.close_connection = True
 
@@ -98,22 +93,25 @@ class _Handler(BaseHTTPRequestHandler):
     def _events(self) -> None:
         """Send the view repeatedly until the client disconnects or the server stops."""
         self.close_connection = True
-        self._head(200, "text/event-stream")
-        self.send_header("Connection", "close")
-        self.end_headers()
-        while not self._ended.is_set():
-            self.wfile.write(b"data: " + encode(self._view()).encode() + b"\n\n")
-            self.wfile.flush()
-            time.sleep(1.0 / RATE)
+        if not self._streams.acquire(blocking=False):
+            self.reply_text(503, f"{MOST_STREAMS} pages are open already\n")
+            return
+        try:
+            self._head(200, "text/event-stream")
+            self.send_header("Connection", "close")
+            self.end_headers()
+            while not self._ended.is_set():
+                self.wfile.write(b"data: " + encode(self._view()).encode() + b"\n\n")
+                self.wfile.flush()
+                time.sleep(1.0 / RATE)
+        finally:
+            self._streams.release()
 
     def _head(self, status: int, kind: str) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         for name, value in HEADERS.items():
             self.send_header(name, value)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log no requests."""
 
 
 def encode(view: dict[str, Any]) -> str:

@@ -10,15 +10,16 @@ import contextlib
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Collection
 from email.parser import BytesHeaderParser
 
-from brakeline.logs.watch.allowed_hosts import rejection_reason
+from brakeline.messaging.allowed_hosts import rejection_reason
+from brakeline.messaging.http_server import ConnectionSlots
 
 MOST_HANDSHAKE = 2**14  # bytes
 TIMEOUT = 5.0  # s for the handshake
 BUFFER = 2**16  # bytes
-MOST_CLIENTS = 64  # at the same time
 
 
 def hidden_host() -> str:
@@ -37,7 +38,7 @@ class WebSocketGate:
         self._host, self._behind, self._origins = host, behind, origins
         self._socket = socket.create_server((host, port))
         self.port = int(self._socket.getsockname()[1])
-        self._free_slots = threading.Semaphore(MOST_CLIENTS)
+        self._slots = ConnectionSlots()
         self._thread = threading.Thread(target=self._run, name="gate", daemon=True)
         self._thread.start()
 
@@ -54,7 +55,7 @@ class WebSocketGate:
                 client, _ = self._socket.accept()
             except OSError:  # closed
                 return
-            if self._free_slots.acquire(blocking=False):
+            if self._slots.enter(client):
                 threading.Thread(target=self._serve, args=(client,), name="client", daemon=True).start()
             else:
                 client.close()
@@ -64,8 +65,10 @@ class WebSocketGate:
         try:
             with client, contextlib.suppress(OSError):
                 head = _handshake(client)
-                request, _, headers = head.partition(b"\r\n")
-                why = rejection_reason(BytesHeaderParser().parsebytes(headers), self._host, self.port, self._origins)
+                self._slots.serve(client)
+                request, _, lines = head.partition(b"\r\n")
+                headers = BytesHeaderParser().parsebytes(lines)
+                why = rejection_reason(headers, (self._host,), self.port, self._origins)
                 if why or not request.startswith(b"GET "):
                     text = f"{why or 'this server accepts only WebSocket connections'}\n".encode(errors="replace")
                     client.sendall(b"HTTP/1.1 403 Forbidden\r\nConnection: close\r\nContent-Type: text/plain\r\n")
@@ -75,14 +78,14 @@ class WebSocketGate:
                     inside.sendall(head)
                     _forward(client, inside)
         finally:
-            self._free_slots.release()
+            self._slots.leave(client)
 
 
 def _handshake(client: socket.socket) -> bytes:
     """Receive the handshake up to the empty line. Raises OSError: it is too long, or it does not arrive in time."""
-    client.settimeout(TIMEOUT)
-    head = b""
+    until, head = time.monotonic() + TIMEOUT, b""
     while b"\r\n\r\n" not in head:
+        client.settimeout(max(until - time.monotonic(), 1e-3))
         piece = client.recv(BUFFER)
         head += piece
         if not piece or len(head) > MOST_HANDSHAKE:

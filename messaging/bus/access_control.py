@@ -11,8 +11,11 @@ from typing import Any
 
 from brakeline.messaging.bus.identity import role_of
 from brakeline.messaging.bus.topic_keys import own_key
-from brakeline.messaging.topics import HEALTH, TOPICS, Delivery
+from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, HEALTH, ROLES, STEP, TOPICS, Delivery
 
+MOST_ROBOTS = 64  # of one actor process: a request batch holds as many
+SHARED = ("actor", "safety")  # roles of which many processes may share a certificate with the role as its name, in pods
+OF_ROBOTS = (STEP, EPISODE, EXCHANGE, FRAMES)  # an actor publishes them under the name of each robot
 ALIVE = "alive/{source}"  # key of the liveliness token of a process
 EVERYTHING = (
     *("put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"),
@@ -57,10 +60,14 @@ def grants(name: str, prefix: str) -> list[Grant]:
         everywhere = f"{prefix}/{topic.at()}"
         query = topic.delivery is Delivery.QUERY
         if role in topic.publishers and query:
-            for key in (everywhere, own_key(everywhere, "*")):
-                granted += [(INGRESS, ("query",), key), (EGRESS, ("reply", "declare_queryable"), key)]
+            for key in _own(topic.key, name, shared=True):
+                for at in (f"{prefix}/{key}", own_key(f"{prefix}/{key}", "*")):
+                    granted += [(INGRESS, ("query",), at), (EGRESS, ("reply",), at)]
+            granted += [(EGRESS, ("declare_queryable",), at) for at in (everywhere, own_key(everywhere, "*"))]
         elif role in topic.publishers:
-            keys = _own(topic.key, name) if topic.own else [topic.key.format(robot="*", source="*")]
+            keys = (
+                _own(topic.key, name, shared=role in SHARED, robots=topic in OF_ROBOTS) if topic.own else [topic.at()]
+            )
             granted += [(INGRESS, ("put",), f"{prefix}/{key}") for key in keys]
             granted.append((EGRESS, ("declare_subscriber",), everywhere))
         if role in topic.listeners and query:
@@ -68,7 +75,7 @@ def grants(name: str, prefix: str) -> list[Grant]:
                 granted += [(INGRESS, ("declare_queryable", "reply"), key), (EGRESS, ("query",), key)]
         elif role in topic.listeners:
             granted += [(INGRESS, ("declare_subscriber",), everywhere), (EGRESS, ("put",), everywhere)]
-    granted += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name)]
+    granted += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name, shared=True)]
     if role in HEALTH.listeners:  # they may watch which processes are alive, too
         everyone = f"{prefix}/{ALIVE.format(source='*')}"
         granted.append((INGRESS, ("declare_liveliness_subscriber", "liveliness_query"), everyone))
@@ -76,7 +83,22 @@ def grants(name: str, prefix: str) -> list[Grant]:
     return granted
 
 
-def _own(key: str, name: str) -> list[str]:
-    """Return the keys in which `{source}` is a name, or begins with the name and a dot."""
-    sources = (name, f"{name}.$*") if "{source}" in key else ("",)
-    return [key.format(robot="*", source=source) for source in sources]
+def _own(key: str, name: str, shared: bool, robots: bool = False) -> list[str]:
+    """Return the keys in which `{source}` is a name under which the process may speak.
+
+    Exact names admit no key with a wildcard, which would reach the subscribers of many keys.
+
+    Args:
+        shared: admit all names that begin with this one and a dot, if the name is that of a role. Several processes
+            may share such a certificate.
+        robots: admit the names of the robots in an actor.
+    """
+    sources = [name]
+    if shared and name in ROLES:
+        sources.append(f"{name}.$*")
+    elif robots and role_of(name) == "actor":
+        sources += [f"{name}.{number}" for number in range(MOST_ROBOTS)]
+    elif name == "certify":
+        sources.append("certify.adapt")  # the certifier of a run
+    keys = [key.format(robot="*", source=source) for source in sources]
+    return list(dict.fromkeys(keys))

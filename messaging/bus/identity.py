@@ -27,6 +27,21 @@ def certified_name(source: str) -> str:
     return source.split(".", 1)[0]
 
 
+def identity_of(source: str) -> str:
+    """Return who answers for what a source sends: the holder of the certificate NAME, for all NAME.MORE.
+
+    Several processes may share the certificate of a whole role, such as the actors `actor.POD`. Each one then counts
+    for itself, although the certificate does not tell them apart.
+    """
+    name, _, more = source.partition(".")
+    return f"{name}.{more.partition('.')[0]}" if more and name in ROLES else name
+
+
+def speaks_for(owner: str, name: str) -> bool:
+    """Return whether a process may speak under a name: its own, or one that begins with it and a dot."""
+    return name == owner or name.startswith(f"{owner}.")
+
+
 def certificate_file(folder: Path, name: str) -> Path:
     """Return the path of a certificate."""
     return folder / f"{name}.pem"

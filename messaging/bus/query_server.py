@@ -12,10 +12,12 @@ from typing import Any
 
 import zenoh
 
-from brakeline.errors import Busy, Expired
+from brakeline.errors import Busy, Expired, Malformed
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.fair_queue import FairQueue
+from brakeline.messaging.bus.identity import identity_of
 from brakeline.messaging.bus.subscription import ReceiverThreads
+from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
 
 LONGEST = 10.0  # longest time that a query waits; the default for one without a deadline [s]
@@ -26,11 +28,17 @@ class PendingQuery:
     """A query and its deadline (time.monotonic)."""
 
     query: zenoh.Query
+    asker: str  # name in the key, which the router has compared with the certificate
     until: float
 
 
+Answer = Callable[
+    [bytes, str], bytes
+]  # from the payload of a query and the name of the asker to the payload of the reply
+
+
 class QueryServer(ReceiverThreads):
-    """Answers the queries of all receivers, one at a time.
+    """Answers the queries of all receivers, one at a time, of each identity in turn.
 
     Two threads receive in turn at each receiver: one notes the time of new queries while the other one answers. The
     thread that receives a query while no thread answers starts to answer, since waking another thread takes 0.1 ms.
@@ -40,9 +48,20 @@ class QueryServer(ReceiverThreads):
     """
 
     def __init__(
-        self, name: str, receivers: Sequence[Any], handler: Callable[[bytes], bytes], rejected: RejectedMessages
+        self,
+        name: str,
+        receivers: Sequence[Any],
+        handler: Answer,
+        asker_in: Callable[[str], str],
+        rejected: RejectedMessages,
     ) -> None:
-        self._handler, self._rejected, self._turns = handler, rejected, FairQueue[PendingQuery]()
+        """Start to answer.
+
+        Args:
+            asker_in: returns the name of the asker in the key of a query.
+        """
+        self._handler, self._asker_in, self._rejected = handler, asker_in, rejected
+        self._turns = FairQueue[PendingQuery]()
         self._state = threading.Lock()
         self._answering = False
         runs = []
@@ -65,9 +84,10 @@ class QueryServer(ReceiverThreads):
 
     def _admit(self, query: zenoh.Query) -> bool:
         """Add a query to the queue. Return whether no thread answers now."""
-        pending = PendingQuery(query, time.monotonic() + _patience(query))
+        asker = self._asker_in(str(query.key_expr))
+        pending = PendingQuery(query, asker, time.monotonic() + _patience(query))
         with self._state:
-            left_out = self._turns.add(_client(query), pending)
+            left_out = self._turns.add(identity_of(asker), pending)
             idle, self._answering = not self._answering, True
         if left_out is not None:
             with left_out.query as one:
@@ -87,7 +107,9 @@ class QueryServer(ReceiverThreads):
                 self._pass_over(query, Expired("the deadline of the query has passed"))
                 return
             try:
-                answer = self._handler(query.payload.to_bytes() if query.payload else b"")
+                if not NAME.fullmatch(pending.asker):
+                    raise Malformed(f"{pending.asker[:100]!r} cannot ask: a query names one asker in its key")
+                answer = self._handler(query.payload.to_bytes() if query.payload else b"", pending.asker)
                 query.reply(query.key_expr, answer, express=True)
             except Exception as error:
                 _refuse(query, error)
@@ -102,12 +124,6 @@ class QueryServer(ReceiverThreads):
 def _refuse(query: zenoh.Query, error: Exception) -> None:
     refusal = pb.Error(type=type(error).__name__, field=str(getattr(error, "field", "")), message=str(error))
     query.reply_err(refusal.SerializeToString(), encoding=zenoh.Encoding.APPLICATION_PROTOBUF)
-
-
-def _client(query: zenoh.Query) -> str:
-    """Return the session that asks; all sessions that do not identify themselves share one place in the queue."""
-    source = query.source_info
-    return "" if source is None else str(source.source_id.zid)
 
 
 def _patience(query: zenoh.Query) -> float:

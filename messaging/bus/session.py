@@ -16,13 +16,14 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from brakeline.errors import Malformed
 from brakeline.messaging.bus.access_control import ALIVE
 from brakeline.messaging.bus.bus_settings import BusSettings, open_session
 from brakeline.messaging.bus.publisher import Publisher
 from brakeline.messaging.bus.query_client import QueryClient
-from brakeline.messaging.bus.query_server import QueryServer
+from brakeline.messaging.bus.query_server import Answer, QueryServer
 from brakeline.messaging.bus.subscription import Listener, ReceiverThreads, Sample, Subscription
-from brakeline.messaging.bus.topic_keys import exact_key, key_of, own_key
+from brakeline.messaging.bus.topic_keys import exact_key, key_of, names_of, own_key
 from brakeline.messaging.bus.zenoh_sessions import close_sessions
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -118,12 +119,15 @@ class Bus:
         self._subscriptions.append(listener)
         return listener
 
-    def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> QueryServer:
+    def serve(self, topic: Topic, handler: Answer, **names: str) -> QueryServer:
         """Answer the queries of a topic, one at a time, of each client in turn, in a thread of its own.
 
         If the handler raises an exception, the client gets it as `Refused`, with the exception's `field`. A query whose
         deadline has passed is dropped. Several processes may serve one topic: the queries of a client go to the service
         that answered first, and to another one if that service is gone or late.
+
+        Args:
+            handler: gets the payload and the name of the asker, which with keys holds the certificate of that name.
         """
         key = key_of(topic, names)
         shared = self._full(key)
@@ -131,7 +135,12 @@ class Bus:
             self._queries.declare_queryable(at, FifoChannel(FIFO), complete=True)
             for at in (own_key(shared, self._queries.zid()), shared)
         ]
-        service = QueryServer(key, receivers, handler, self.rejected)
+        cut = len(self.settings.prefix) + 1
+
+        def asker_in(key: str) -> str:
+            return names_of(topic, key[cut:]).get("source", "")
+
+        service = QueryServer(key, receivers, handler, asker_in, self.rejected)
         self._subscriptions.append(service)
         return service
 
@@ -140,6 +149,7 @@ class Bus:
 
         Args:
             timeout: deadline [s].
+            names: of the key; `source`, who asks, is this process by default.
 
         Raises:
             NoReply: there is no service. This error does not wait for the deadline.
@@ -147,6 +157,7 @@ class Bus:
             Refused: the service answered with an error.
             ValueError: a name is missing or unknown.
         """
+        names = {"source": self.source} | names
         return self._query_client.ask(self._full(exact_key(topic, names)), payload, timeout)
 
     def living(self, timeout: float = 1.0) -> frozenset[str]:
@@ -154,7 +165,8 @@ class Bus:
         replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(
             self._full(ALIVE.format(source="*")), timeout=timeout
         )
-        return frozenset(str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
+        names = (str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
+        return frozenset(name for name in names if NAME.fullmatch(name))
 
     def watch(self, handler: Callable[[str, bool], None]) -> Subscription:
         """Call `handler(source, alive)` for each process that is alive now, and for each that comes or goes."""
@@ -163,7 +175,10 @@ class Bus:
         )
 
         def take(sample: zenoh.Sample) -> None:
-            handler(str(sample.key_expr).rsplit("/", 1)[1], sample.kind == zenoh.SampleKind.PUT)
+            name = str(sample.key_expr).rsplit("/", 1)[1]
+            if not NAME.fullmatch(name):
+                raise Malformed(f"{name[:100]!r} is no name of a process")
+            handler(name, sample.kind == zenoh.SampleKind.PUT)
 
         watching = Subscription("alive/*", receiver, take, self.rejected)
         self._subscriptions.append(watching)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,8 @@ import zenoh
 from google.protobuf.message import DecodeError
 
 from brakeline.errors import Implausible, Malformed
-from brakeline.messaging.bus.topic_keys import names_of
+from brakeline.messaging.bus.stated_names import check_names
+from brakeline.messaging.bus.topic_keys import names_of, sender_of
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error
 from brakeline.messaging.message_checks import NAME, check
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -21,6 +23,7 @@ from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.topics import Topic
 
 MOST_KEYS = 2048  # of one subscription; samples at further keys are rejected
+MOST_KEYS_OF_ONE = 256  # of one identity, so that it cannot take the place of the others
 
 
 @dataclass(frozen=True)
@@ -41,20 +44,10 @@ class Sample:
         try:
             message = self.topic.message.FromString(self.payload)
             check(message)
+            check_names(names_of(self.topic, self.key), message)
         except (DecodeError, Implausible) as error:
             raise Malformed(f"{self.key}: not a {self.topic.message.DESCRIPTOR.name}: {error}") from error
-        for field, name in names_of(self.topic, self.key).items():
-            for stated in _stated_names(message, field):
-                if stated not in ("", name):
-                    raise Malformed(f"{self.key}: says that its {field} is {stated!r}")
         return message
-
-
-def _stated_names(message: Any, field: str) -> list[str]:
-    """Return the names of the robot or source in a message; the router has only checked those in the key."""
-    names = ("robot",) if field == "robot" else ("actor", "process")
-    stated = [str(getattr(message, name)) for name in names if name in message.DESCRIPTOR.fields_by_name]
-    return stated if field == "robot" else [*stated, str(message.header.source)]
 
 
 class ReceiverThreads:
@@ -107,6 +100,7 @@ class Listener(Subscription):
         rejected: RejectedMessages,
     ) -> None:
         self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
+        self._keys_of: Counter[str] = Counter()  # by identity
         self._heard: dict[str, float] = {}  # time (time.monotonic) of the latest sample by key
         super().__init__(key, receiver, self._take, rejected)
 
@@ -117,12 +111,11 @@ class Listener(Subscription):
         return frozenset(key for key, moment in self._heard.copy().items() if now - moment > limit)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)[self._cut :]
+        key, size = str(sample.key_expr)[self._cut :], len(sample.payload)
+        if size > self._topic.largest:
+            raise Malformed(f"{key[:200]}: {size} bytes; a message has at most {self._topic.largest}")
         if key not in self._heard:
             self._admit(key)
-        size = len(sample.payload)
-        if size > self._topic.largest:
-            raise Malformed(f"{key}: {size} bytes; a message has at most {self._topic.largest}")
         self._heard[key] = time.monotonic()
         self._handler(Sample(self._topic, key, sample.payload.to_bytes(), steady_time_ns()))
 
@@ -132,3 +125,7 @@ class Listener(Subscription):
             raise Malformed(f"{key[:200]!r} is no key of {self._topic.name}")
         if len(self._heard) >= MOST_KEYS:
             raise Malformed(f"{key}: there are already {MOST_KEYS} keys")
+        sender = sender_of(self._topic, key)
+        if self._keys_of[sender] >= MOST_KEYS_OF_ONE:
+            raise Malformed(f"{key[:200]}: {sender} publishes at {MOST_KEYS_OF_ONE} keys already")
+        self._keys_of[sender] += 1

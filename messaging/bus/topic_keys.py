@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from brakeline.messaging.bus.identity import identity_of
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.topics import Topic
 
@@ -31,6 +32,12 @@ def exact_key(topic: Topic, names: dict[str, str]) -> str:
 def own_key(key: str, session_id: object) -> str:
     """Return the key that addresses one of several services at `key`, by the id of its session."""
     return f"{key}/{session_id}"
+
+
+def sender_of(topic: Topic, key: str) -> str:
+    """Return the identity that answers for the samples at a key; the topic's name if its keys name no source."""
+    source = names_of(topic, key).get("source")
+    return topic.name if source is None else identity_of(source)
 
 
 def names_of(topic: Topic, key: str) -> dict[str, str]:

@@ -4,9 +4,11 @@ The service keeps nothing about a robot, so a request must state what the servic
 u_0 .. u_{N-1} comes with a token for each of the next periods, until the plan ends. The k-th token is a MAC
 (HMAC-SHA-256, 16 bytes) of what the request will hold k periods later if no better plan comes in between:
 
-    robot, actor, model | u_{k-1} (the input in force), u_k .. u_{N-1}, stop .. stop (the tail) | prediction, if k = 1.
+    names | u_{k-1} (the input in force), u_k .. u_{N-1}, stop .. stop (the tail) | prediction, if k = 1.
 
-So a request needs one token, and the service computes one MAC to check it. All replicas of a service share the key.
+The names are those of the robot, the asker, the actor and the model. The asker is the process that asks, by its
+certificate: nobody else can use its tokens. So a request needs one token, and the service computes one MAC to check it.
+All replicas of a service share the key.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ class PlanAuthenticator:
         log.info("no %s: plans that another replica verified count as unverified here", KEY_FILE)
         return cls(secrets.token_bytes(KEY_SIZE))
 
-    def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot) -> list[bytes]:
+    def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot, asker: str = "") -> list[bytes]:
         """Return the tokens of a decision, one for each of the next periods.
 
         The last token stays valid, since from there on the plan's tail no longer changes.
@@ -71,25 +73,25 @@ class PlanAuthenticator:
             moving -= 1
         inputs = plan + stop * (n + 1)
         tails, in_force, row = _bytes(inputs), _bytes(_without_feedback(inputs, robot)), 8 * m
-        names, predicted = _names(robot.name, request.actor, decision.model), _prediction(decision)
+        names, predicted = _names(robot.name, asker, request.actor, decision.model), _prediction(decision)
         tokens = []
         for k in range(1, max(2, 1 + moving) + 1):
             message = names + in_force[(k - 1) * row : k * row] + tails[k * row : (k + n) * row]
             tokens.append(self._mac(message + predicted if k == 1 else message))
         return tokens
 
-    def is_authentic(self, request: pb.Request, robot: Robot) -> bool:
+    def is_authentic(self, request: pb.Request, robot: Robot, asker: str = "") -> bool:
         """Return whether a request's token proves that the named model verified its plan, or it names no model."""
         if request.model in ("", UNVERIFIED):
             return True
         if len(request.input_in_force) != robot.action_dim:
             return False
-        return hmac.compare_digest(self.plan_token(request, robot), request.plan_token)
+        return hmac.compare_digest(self.plan_token(request, robot, asker), request.plan_token)
 
-    def plan_token(self, request: pb.Request, robot: Robot) -> bytes:
+    def plan_token(self, request: pb.Request, robot: Robot, asker: str = "") -> bytes:
         """Return the token that a request needs."""
         in_force = _bytes(_without_feedback(request.input_in_force, robot))
-        message = _names(robot.name, request.actor, request.model) + in_force + _bytes(request.plan)
+        message = _names(robot.name, asker, request.actor, request.model) + in_force + _bytes(request.plan)
         if request.predicted_center or request.predicted_half_width:
             message += _prediction(request)
         return self._mac(message)
@@ -98,8 +100,8 @@ class PlanAuthenticator:
         return hmac.digest(self._key, message, "sha256")[:SIZE]
 
 
-def _names(robot: str, actor: str, model: str) -> bytes:
-    return repr((robot, actor, model)).encode()
+def _names(robot: str, asker: str, actor: str, model: str) -> bytes:
+    return repr((robot, asker, actor, model)).encode()
 
 
 def _without_feedback(inputs: Sequence[float], robot: Robot) -> Sequence[float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -14,7 +14,9 @@ from brakeline.errors import BadModel, BadRequest, BusError, NoModel, StaleModel
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus.identity import certified_name, speaks_for
 from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
@@ -148,53 +150,66 @@ class ServiceCounts:
         return figures
 
 
-def batch_handler(
-    models: ModelRegistry, counts: ServiceCounts, authenticator: PlanAuthenticator | None = None
-) -> Callable[[bytes], bytes]:
-    """Return the service's core: a function from the bytes of a RequestBatch to the bytes of a ReplyBatch.
+@dataclass(frozen=True)
+class Receipt:
+    """Who asked, and when the question arrived (perf_counter_ns)."""
 
-    The function raises BadRequest for bytes that are not a batch.
+    asker: str
+    time: int
 
-    Args:
+    @property
+    def holder(self) -> str:
+        """The name on the certificate of the asker, to which plan tokens are issued."""
+        return certified_name(self.asker)
+
+    def about(self, message: pb.Request) -> str:
+        """Name the robot of a request for the log; the request itself may name the robot of another asker."""
+        name = message.actor or message.robot
+        return name if speaks_for(self.asker or name, name) else f"{self.asker}, about {headline(name)}"
+
+
+@dataclass(frozen=True)
+class BatchHandler:
+    """The service's core: a function from the bytes of a RequestBatch to the bytes of a ReplyBatch.
+
+    Attributes:
         models: the methods in use.
         counts: to count in.
         authenticator: checks the plan tokens. Without one (in process, or when a log is replayed), every plan counts as
             verified by the model that the request names.
     """
-    return BatchHandler(models, counts, authenticator).handle
-
-
-@dataclass(frozen=True)
-class BatchHandler:
-    """The stages from a batch to its replies. See `batch_handler` for the attributes."""
 
     models: ModelRegistry
     counts: ServiceCounts
-    authenticator: PlanAuthenticator | None
+    authenticator: PlanAuthenticator | None = None
 
-    def handle(self, payload: bytes) -> bytes:
-        """Return the replies to a batch. Raises BadRequest if the bytes are not a batch."""
+    def __call__(self, payload: bytes, asker: str = "") -> bytes:
+        """Return the replies to a batch. Raises BadRequest if the bytes are not a batch.
+
+        Args:
+            asker: name of the process that asks; empty within one process.
+        """
         received = perf_counter_ns()
         batch = batch_of(payload)
         replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
         for world in group_by_fleet(batch.requests):
             messages = [batch.requests[i] for i in world]
-            for i, reply in zip(world, self._decide_world(messages, received), strict=True):
+            for i, reply in zip(world, self._decide_world(messages, Receipt(asker, received)), strict=True):
                 replies[i] = reply
         answer = pb.ReplyBatch(replies=replies, request=digest(payload)).SerializeToString()
         self.counts.busy_time += (perf_counter_ns() - received) * 1e-9
         return answer
 
-    def _decide_world(self, messages: Sequence[pb.Request], received: int) -> list[pb.Reply]:
-        """Return the replies about the robots of one world; received: time of receipt [ns]."""
+    def _decide_world(self, messages: Sequence[pb.Request], receipt: Receipt) -> list[pb.Reply]:
+        """Return the replies about the robots of one world."""
         if not messages[0].fleet:
-            return [self._decide(message, received) for message in messages]
+            return [self._decide(message, receipt) for message in messages]
         try:
             check_fleet(messages)
             reservations = {message.actor: self._current_reservation(message) for message in messages}
         except (BadRequest, UnknownRobot) as error:
             return [self._refuse(error) for _ in messages]
-        return [self._decide(message, received, reservations) for message in messages]
+        return [self._decide(message, receipt, reservations) for message in messages]
 
     def _current_reservation(self, message: pb.Request) -> Reservation:
         """Return the reservation of a fleet's robot. One that stands without it reserves the space it stands in."""
@@ -217,35 +232,36 @@ class BatchHandler:
         return method.standing_reservation(request.state)
 
     def _decide(
-        self, message: pb.Request, received: int, reservations: dict[str, Reservation] | None = None
+        self, message: pb.Request, receipt: Receipt, reservations: dict[str, Reservation] | None = None
     ) -> pb.Reply:
         """Return the reply about one robot; reservations: of its world's robots, in which its own is replaced."""
         try:
             method = self.models.method_for(message)
-            token_rejected = self._reject_token(message, method.robot)
+            token_rejected = self._reject_token(message, method.robot, receipt.holder)
             own, others = reservations_for(message.actor, reservations)
             request = request_of(message, method.robot, own, others)
-            queue_ms = (perf_counter_ns() - received) * 1e-6
+            queue_ms = (perf_counter_ns() - receipt.time) * 1e-6
             decision = method.decide(request)
         except (BadRequest, UnknownRobot) as error:
             return self._refuse(error)
         except Exception as error:  # the robot brakes on the error reply, and the service goes on
-            log.exception("decide failed for %s", message.actor or message.robot)
+            log.exception("decide failed for %s", receipt.about(message))
             return self._refuse(error)
         self.counts.add(decision, request.finite)
         if not decision.contained:
-            log.warning("%s, step %d: outside the predicted set", message.actor or message.robot, message.step)
+            log.warning("%s, step %d: outside the predicted set", receipt.about(message), message.step)
         if reservations is not None and decision.reservation is not None:
             reservations[message.actor] = decision.reservation
         reply = decision_reply(decision, queue_ms)
         reply.robot, reply.decision.token_rejected = method.robot.name, token_rejected
         if self.authenticator is not None and decision.verified:
-            reply.decision.plan_tokens.extend(self.authenticator.plan_tokens(message, reply.decision, method.robot))
+            tokens = self.authenticator.plan_tokens(message, reply.decision, method.robot, receipt.holder)
+            reply.decision.plan_tokens.extend(tokens)
         return reply
 
-    def _reject_token(self, message: pb.Request, robot: Robot) -> bool:
+    def _reject_token(self, message: pb.Request, robot: Robot, asker: str) -> bool:
         """Return whether a request's plan token does not match its plan. If so, mark the plan as unverified."""
-        rejected = self.authenticator is not None and not self.authenticator.is_authentic(message, robot)
+        rejected = self.authenticator is not None and not self.authenticator.is_authentic(message, robot, asker)
         if rejected:
             self.counts.token_rejected += 1
             message.model = UNVERIFIED
@@ -319,7 +335,7 @@ def main(settings: SafetySettings) -> None:
 
         process.refresh = refresh
         process.bus.subscribe(MODEL, replace)
-        process.bus.serve(DECIDE, batch_handler(models, counts, authenticator))
+        process.bus.serve(DECIDE, BatchHandler(models, counts, authenticator))
         process.announce()
         log.info("ready")
         process.stop.wait()

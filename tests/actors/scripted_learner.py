@@ -17,7 +17,7 @@ class ScriptedLearner:
         self._flow, self._weights = bus.publisher(FLOW, robot="ground"), bus.publisher(WEIGHTS, robot="ground")
         bus.serve(JOIN, self._join, robot="ground")
 
-    def _join(self, payload: bytes) -> bytes:
+    def _join(self, payload: bytes, asker: str) -> bytes:
         join = pb.Join.FromString(payload)
         self.joins.append(join)
         if join.layout != self.layout:

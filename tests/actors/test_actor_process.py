@@ -16,7 +16,7 @@ from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.topics import DECIDE, EXCHANGE, STEP
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from tests.actors.scripted_learner import ScriptedLearner
 from tests.robots import GROUND
 from tests.waiting import until
@@ -32,13 +32,13 @@ class Service:
 
         models = ModelRegistry()
         models.install(model_for(GROUND, ModelConfig()))
-        self._answer = batch_handler(models, ServiceCounts())
+        self._answer = BatchHandler(models, ServiceCounts())
         self.batches: list[list[str]] = []
         self.proposals: list[list[float]] = []  # of the first robot
         self.failing = self.fails_when_moving = False
         bus.serve(DECIDE, self._decide, robot="ground")
 
-    def _decide(self, payload: bytes) -> bytes:
+    def _decide(self, payload: bytes, asker: str) -> bytes:
         requests = pb.RequestBatch.FromString(payload).requests
         self.batches.append([request.actor for request in requests])
         self.proposals.append(list(requests[0].action))

@@ -19,7 +19,7 @@ from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from examples.foreign import table, train
 from examples.foreign.distance_field import DistanceField
 from examples.foreign.run import missing_seeds
@@ -69,7 +69,7 @@ def test_behind_the_filter_driving_at_hazards_costs_nothing(tmp_path, robot, fol
     endpoint = free_endpoint()
     words = [robot, "adversarial", "--seeds", "0", "1", "--steps", "300"]
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
-        bus.serve(DECIDE, batch_handler(models, ServiceCounts()))
+        bus.serve(DECIDE, BatchHandler(models, ServiceCounts()))
         printed = last_line(python, "run.py", *words, "--connect", endpoint, "--out", str(lines))
     figures = json.loads(printed)
     assert figures["cost"] == 0.0 and figures["steps"] == 300

@@ -11,7 +11,7 @@ import logging
 import tempfile
 import time
 import traceback
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -38,20 +38,21 @@ from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
 from brakeline.logs.foxglove import RATE
 from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis
 from brakeline.logs.reader import Log
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.report_page import render
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.methods import decode
 from brakeline.safety.service.client import read_reply, request_message
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from tests.fuzz.message_fuzzer import MessageFuzzer
 
 LOOK = 25_000  # messages between two looks at the processes' figures
@@ -105,7 +106,7 @@ def launcher(folder: Path) -> Party:
     one = Launcher(RunConfig(), folder, BusSettings(listen=("tcp/127.0.0.1:1",)))
 
     def take(sample: Sample) -> None:
-        one._inbox.append(sample)
+        one._inbox.put(sample)
         one._drain()
 
     return Party(RECORDED, take, lambda: (line(one.metrics.figures()), one.figures()), one._rejected)
@@ -129,10 +130,11 @@ def recorder(folder: Path) -> Party:
 
 
 def watch() -> Party:
-    board, rejected = Dashboard(), RejectedMessages()
+    board, rejected, inbox = Dashboard(), RejectedMessages(), Inbox()
 
     def take(sample: Sample) -> None:
-        show_received(deque([sample]), board, None, rejected)
+        inbox.put(sample)
+        show_received(inbox, board, None, rejected)
 
     return Party(RECORDED, take, lambda: encode(board.view()), rejected)
 
@@ -181,7 +183,7 @@ def actor(robot: RobotWithTask) -> Party:
 def safety() -> Party:
     """Serve requests and install models; a refusal goes back to the client."""
     models, rejected = ModelRegistry(), RejectedMessages()
-    answer = batch_handler(models, ServiceCounts())
+    answer = BatchHandler(models, ServiceCounts())
 
     def take(sample: Sample) -> None:
         try:

@@ -20,10 +20,11 @@ import brakeline.logs
 from brakeline.logs import foxglove_scene
 from brakeline.logs.foxglove import ArenaLayout, FoxgloveConverter
 from brakeline.logs.reader import read
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.segment import Entry
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.topics import EXCHANGE, STEP
 from tests.logs.conftest import Say
 from tests.robots import GROUND, QUADROTOR

@@ -16,11 +16,12 @@ from brakeline.deploy.cli import main
 from brakeline.errors import LogError
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import Log, open_log
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.segment import being_written, open_segment
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.topics import STEP
 from tests.logs.conftest import Say, Start
 from tests.logs.sample_log import ABOUT, Writer

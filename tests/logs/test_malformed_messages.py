@@ -4,7 +4,6 @@ import json
 import math
 import struct
 import tracemalloc
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,13 @@ from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.segment import MOST_CHANNELS, Entry
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
 from tests.logs.conftest import Say
@@ -99,7 +99,10 @@ MALFORMED = [
 def test_watch_skips_malformed_messages(malformed: Sample, say: Say) -> None:
     board, rejected = Dashboard(), RejectedMessages()
     step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
-    show_received(deque([malformed, say("step/ground/b", step)]), board, None, rejected)
+    inbox = Inbox()
+    for sample in (malformed, say("step/ground/b", step)):
+        inbox.put(sample)
+    show_received(inbox, board, None, rejected)
     shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
     assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
 

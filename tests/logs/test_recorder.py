@@ -17,11 +17,12 @@ from mcap.reader import make_reader
 from brakeline.logs import recorder
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import open_log, read
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.segment import BufferedFile, Entry
 from brakeline.logs.segment_rotation import Rotation
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.topics import EPISODE, EXCHANGE, LEARNER, LOG, STEP
 from tests.faults.failing_calls import Died, failing, full
 from tests.logs.conftest import Say, Start

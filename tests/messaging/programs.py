@@ -15,7 +15,7 @@ import os, sys, time
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.topics import DECIDE
 bus = Bus(BusSettings({place}=("{endpoint}",)), "safety-{name}")
-bus.serve(DECIDE, lambda payload: b"{name}:" + payload)
+bus.serve(DECIDE, lambda payload, asker: b"{name}:" + payload)
 print("ready", flush=True)
 time.sleep(60)
 """

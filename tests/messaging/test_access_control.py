@@ -17,7 +17,7 @@ import zenoh
 from brakeline.errors import BadKeys, BusError, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
-from brakeline.messaging.bus.access_control import grants
+from brakeline.messaging.bus.access_control import MOST_ROBOTS, grants
 from brakeline.messaging.bus.bus_settings import local
 from brakeline.messaging.free_ports import HERE, free_endpoint
 from brakeline.messaging.process_runtime import Process
@@ -25,6 +25,8 @@ from brakeline.messaging.topics import (
     DECIDE,
     FLOW,
     HEALTH,
+    JOIN,
+    LOG,
     LOGGED,
     MODEL,
     ROLES,
@@ -162,9 +164,56 @@ def test_a_second_queryable_answers_nobody(system: System) -> None:
         return
     with pytest.raises(NoReply):
         asker.ask(DECIDE, b"?", 2.0, robot="ground")
-    system.join("safety").serve(DECIDE, lambda payload: b"verified")
+    system.join("safety").serve(DECIDE, lambda payload, asker: b"verified")
     time.sleep(JOINED)
     assert {asker.ask(DECIDE, b"?", 10.0, robot="ground") for _ in range(200)} == {b"verified"}
+
+
+WILD = {  # by role: keys that a client of the role may not publish at, and one that it may
+    "client": (("log/client.$*", "log/*", "log/**", "log/client.x", "health/client.$*", "health/$*"), "log/client"),
+    "viewer": (("log/viewer.$*", "log/$*", "health/viewer.$*", "health/*"), "log/viewer"),
+    "actor-1": (("log/actor-1.$*", "step/ground/actor-1.$*", "step/ground/*", "step/**", "log/*"), "log/actor-1"),
+}
+
+
+@pytest.mark.parametrize("name", WILD)
+def test_a_key_with_a_wildcard_reaches_nobody(system: System, name: str) -> None:
+    """A publication at a wildcard reaches the subscribers of all keys that it matches; each one would refuse it."""
+    attacker, listener = system.attacker(name), system.join("recorder")
+    keys, honest = WILD[name]
+    with heard(listener, LOG) as got:
+        for topic in (HEALTH, STEP):
+            listener.subscribe(topic, got.append)
+        time.sleep(JOINED)
+        for key in keys:
+            attacker.put(f"brakeline/{key}", b"evil")
+        attacker.put(f"brakeline/{honest}", b"end")
+        until(lambda: any(sample.payload == b"end" for sample in got))
+        time.sleep(JOINED)
+        assert [sample.key for sample in got if "*" in sample.key] == []
+        assert (listener.rejected.count > 0) == (system.keys is None)
+
+
+def test_nobody_asks_under_the_name_of_another(system: System) -> None:
+    """The name in the key of a query decides whose turn it is, for whom a token is, and who joins the learner."""
+    attacker = system.attacker("actor-1")
+    askers: list[str] = []
+    for source, topic in (("safety", DECIDE), ("learner", JOIN)):
+        system.join(source).serve(topic, lambda payload, asker: askers.append(asker) or b"answer")
+    time.sleep(JOINED)
+    for root in ("safety/ground/decide", "learner/ground/join"):
+        for asker in ("actor-0", "actor-10", "actor-1.0", "client", "*", "actor-$*", "actor-1"):
+            list(attacker.get(f"brakeline/{root}/{asker}", timeout=2.0))
+    assert {*askers} == ({"actor-1"} if system.keys else {"actor-0", "actor-10", "actor-1.0", "client", "actor-1"})
+
+
+@pytest.mark.parametrize("name", ["viewer.$*", "actor-0"])
+def test_who_poses_as_alive_under_another_name(secure: System, name: str) -> None:
+    viewer, attacker = secure.join("viewer"), secure.attacker("viewer")
+    attacker.liveliness().declare_token(f"brakeline/alive/{name}")
+    attacker.liveliness().declare_token("brakeline/alive/viewer.true")
+    until(lambda: "viewer.true" in viewer.living())
+    assert name not in viewer.living()
 
 
 def test_an_eavesdropper_on_everything_hears_nothing(system: System) -> None:
@@ -240,7 +289,7 @@ def test_the_table_works_with_keys(secure: System, topic: Topic) -> None:
     robot = {"robot": "ground"} if "{robot}" in topic.key else {}
     if topic.delivery is Delivery.QUERY:
         for listener in listeners:
-            listener.serve(topic, lambda payload: b"answer", **({} if topic is DECIDE else robot))
+            listener.serve(topic, lambda payload, asker: b"answer", **({} if topic is DECIDE else robot))
         time.sleep(JOINED)
         for role in speakers:
             assert secure.join(names.get(role, role)).ask(topic, b"?", 5.0, **robot) == b"answer"
@@ -277,9 +326,12 @@ def test_a_role_is_granted_what_the_table_says_and_no_more(role: str) -> None:
     for key in keys:
         root = key.split("/")[1]
         if root not in ("weights", "flow", "metrics", "logged"):
-            assert key.split("/")[-1] in (f"{role}-7", f"{role}-7.$*"), "under its own name"
+            assert "*" not in key.split("/")[-1], "under exact names"
+            robots = {f"actor-7.{number}" for number in range(MOST_ROBOTS)} if role == "actor" else set()
+            assert key.split("/")[-1] in {f"{role}-7"} | robots, "under its own name"
     answers = {key for _, messages, key in granted if "declare_queryable" in messages and "reply" in messages}
     asks = {key for flow, messages, key in granted if flow == "ingress" and "query" in messages}
+    assert all(key.split("/")[4] == f"{role}-7" for key in asks), "and asks under its own name"
     assert bool({key for key in asks if "decide" in key}) == (role in ("actor", "client"))
     assert role in ("safety", "actor", "client") or not any("decide" in key for key in answers)
     assert not any("**" in key for _, _, key in granted)

@@ -132,7 +132,7 @@ def test_everything_comes_back_after_the_router_was_killed(join: Join, spawn: Sp
     router = spawn(ROUTER.format(endpoint=endpoint))
     actor, safety = join("actor-0"), join("safety")
     got: list[int] = []
-    safety.serve(DECIDE, lambda payload: payload)
+    safety.serve(DECIDE, lambda payload, asker: payload)
     safety.subscribe(LOG, lambda sample: got.append(sample.message().header.sequence))
     until(lambda: answers(actor) == b"?")
     router.kill()

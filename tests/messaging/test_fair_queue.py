@@ -41,7 +41,7 @@ def test_an_asker_is_not_delayed_by_the_many_questions_of_another(join: Join) ->
     router, patient, flood = join("launcher", listen=True), join("actor-0"), join("actor-1")
     order: list[bytes] = []
 
-    def work(payload: bytes) -> bytes:
+    def work(payload: bytes, asker: str) -> bytes:
         order.append(payload)
         time.sleep(0.05)
         return payload
@@ -80,7 +80,7 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
     answered: list[bytes] = []
     held, release = threading.Event(), threading.Event()
 
-    def work(payload: bytes) -> bytes:
+    def work(payload: bytes, asker: str) -> bytes:
         if payload == b"slow":
             held.set()
             assert release.wait(PATIENCE)

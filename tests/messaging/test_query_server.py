@@ -33,7 +33,7 @@ def test_failures_of_a_question_are_typed(
 
     release = threading.Event()
 
-    def handler(payload: bytes) -> bytes:
+    def handler(payload: bytes, asker: str) -> bytes:
         if payload == b"wrong":
             raise BadRequest("not finite")
         if payload == b"slow":
@@ -99,8 +99,8 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
     heard: dict[str, int] = {"a": 0, "b": 0}
     slow: set[str] = set()
 
-    def batch_handler(name: str) -> Callable[[bytes], bytes]:
-        def answer(payload: bytes) -> bytes:
+    def batch_handler(name: str) -> Callable[[bytes, str], bytes]:
+        def answer(payload: bytes, asker: str) -> bytes:
             heard[name] += 1
             if name in slow:
                 time.sleep(0.5)
@@ -138,7 +138,7 @@ def test_of_replicas_behind_linked_routers_one_works_and_another_when_it_is_slow
 def test_a_question_does_not_wait_behind_telemetry(join: Join, stalled: Callable[[], float]) -> None:
     router, actor, safety = join("launcher", listen=True), join("actor-0"), join("safety")
     release = threading.Event()
-    safety.serve(DECIDE, lambda payload: payload)
+    safety.serve(DECIDE, lambda payload, asker: payload)
     router.subscribe(STEP, lambda _: release.wait(10.0) and None)
     safety.subscribe(STEP, lambda _: release.wait(10.0) and None)
     until(lambda: answers(actor) == b"?")
@@ -157,7 +157,7 @@ def test_who_has_the_patience_gets_an_answer_though_the_link_stalls(join: Join, 
     """Zenoh drops what a busy link does not take in time: once an answer, and a run in lockstep braked for nothing."""
     router = spawn(ROUTER.format(endpoint=endpoint))
     actor, safety = join("actor-0"), join("safety")
-    safety.serve(DECIDE, lambda payload: payload[:10], robot="ground")
+    safety.serve(DECIDE, lambda payload, asker: payload[:10], robot="ground")
     until(lambda: answers(actor, b"x") == b"x")
     router.send_signal(signal.SIGSTOP)
     wake = threading.Timer(0.3, router.send_signal, [signal.SIGCONT])

@@ -7,7 +7,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.filter_client import accept
 from brakeline.safety.service.plan_token import PlanAuthenticator
-from brakeline.safety.service.server import ModelRegistry, ServiceCounts, batch_handler
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 
 
 class Service:
@@ -17,7 +17,7 @@ class Service:
         self.models, self.counts = ModelRegistry(archive, accept_bound=1.0), ServiceCounts()
         for model in models:
             self.models.install(model)
-        self.answer = batch_handler(self.models, self.counts, None if key is None else PlanAuthenticator(key))
+        self.answer = BatchHandler(self.models, self.counts, None if key is None else PlanAuthenticator(key))
 
     def replies(self, *requests):
         payload = pb.RequestBatch(requests=requests).SerializeToString()

@@ -37,7 +37,7 @@ def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
 
 def say(launcher: Launcher, topic: Topic, message: object) -> None:
     payload = message if isinstance(message, bytes) else message.SerializeToString()
-    launcher._inbox.append(Sample(topic, topic.at(robot="ground", source="a"), payload, 1))
+    launcher._inbox.put(Sample(topic, topic.at(robot="ground", source="a"), payload, 1))
     launcher._drain()
 
 

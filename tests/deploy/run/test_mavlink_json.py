@@ -13,9 +13,10 @@ from brakeline.deploy.run.mavlink_json import ENCODING, frames_as_json
 from brakeline.errors import ExportError, Malformed
 from brakeline.logs.log_export import to_tlog
 from brakeline.logs.reader import read
-from brakeline.logs.recorder import Inbox, LogSettings, Recording
+from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
+from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.topics import FRAMES, LOG
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.quadrotor import Quadrotor

@@ -1,0 +1,86 @@
+"""Hold received samples in bounded memory, until the thread that works on them has the time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Iterator
+
+from brakeline.messaging.bus.subscription import Sample
+from brakeline.messaging.bus.topic_keys import sender_of
+
+LIMIT = 64 * 2**20  # bytes
+SHARE = 0.5  # of the limit, for the samples of one identity
+OVERHEAD = 100  # bytes of a sample besides its payload
+BATCH = 2**20  # bytes per write, so that a nearly full disk still takes what fits
+
+
+def size_in_memory(sample: Sample) -> int:
+    """Return a lower bound on the memory of a sample, bytes; an empty sample counts too."""
+    return OVERHEAD + len(sample.payload)
+
+
+class Inbox:
+    """A thread-safe queue of samples that never blocks: it drops and counts what exceeds its limits.
+
+    The samples of one identity may take `SHARE` of the limit, so that one sender cannot take the place of the others.
+
+    Attributes:
+        limit: bytes.
+        bytes: of the waiting samples.
+        dropped: number of dropped samples by key.
+    """
+
+    def __init__(self, limit: int = LIMIT) -> None:
+        self.limit = limit
+        self.dropped: Counter[str] = Counter()
+        self.bytes = 0
+        self._bytes_of: Counter[str] = Counter()  # by identity
+        self._samples: deque[Sample] = deque()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def put(self, sample: Sample) -> None:
+        """Add the sample, or count it as dropped."""
+        size, identity = size_in_memory(sample), sender_of(sample.topic, sample.key)
+        with self._lock:
+            if self.bytes + size > self.limit or self._bytes_of[identity] + size > SHARE * self.limit:
+                self.dropped[sample.key] += 1
+            else:
+                self._count(identity, size)
+                self._samples.append(sample)
+
+    def oldest(self, size: int = BATCH) -> list[Sample]:
+        """Return the oldest samples, about `size` bytes; they stay in the inbox until `remove`."""
+        batch: list[Sample] = []
+        total = 0
+        with self._lock:
+            for sample in self._samples:
+                if batch and total + size_in_memory(sample) > size:
+                    break
+                batch.append(sample)
+                total += size_in_memory(sample)
+        return batch
+
+    def remove(self, samples: list[Sample]) -> None:
+        """Remove the samples that `oldest` returned."""
+        with self._lock:
+            for sample in samples:
+                self._samples.popleft()
+                self._count(sender_of(sample.topic, sample.key), -size_in_memory(sample))
+
+    def drain(self, seconds: float) -> Iterator[Sample]:
+        """Remove and yield samples, oldest first, until the inbox is empty or the time has passed."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and (batch := self.oldest(1)):
+            self.remove(batch)
+            yield from batch
+
+    def _count(self, identity: str, size: int) -> None:
+        self.bytes += size
+        self._bytes_of[identity] += size
+        if not self._bytes_of[identity]:
+            del self._bytes_of[identity]

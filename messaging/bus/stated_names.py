@@ -1,0 +1,88 @@
+"""Check the names in a message against its key. The router compares only the key with the publisher's certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any
+
+from google.protobuf.descriptor import Descriptor
+
+from brakeline.errors import Implausible
+from brakeline.messaging.bus.identity import role_of, speaks_for
+from brakeline.messaging.bus.topic_keys import names_of
+from brakeline.messaging.topics import TOPICS
+
+_ROOTS = {topic.key.split("/", 1)[0]: topic for topic in TOPICS}
+
+
+def check_names(names: Mapping[str, str], message: Any) -> None:
+    """Check the robot, the sources and the published keys that a message states.
+
+    Args:
+        names: `robot` and `source` in the key of the message, if the key has them.
+
+    Raises:
+        Implausible: the message speaks for another robot, or for another process.
+    """
+    fields = _name_fields(message.DESCRIPTOR)
+    if (robot := names.get("robot")) is not None:
+        for stated in fields.robots(message):
+            if stated not in ("", robot):
+                raise Implausible(f"says that its robot is {stated!r}")
+    if (source := names.get("source")) is not None:
+        for stated in fields.sources(message):
+            if stated and not speaks_for(source, stated):
+                raise Implausible(f"says that its source is {stated!r}")
+        for key in message.published if fields.counts else ():
+            if not _publishes(source, key):
+                raise Implausible(f"says that it publishes at {key[:200]!r}")
+
+
+def _publishes(source: str, key: str) -> bool:
+    """Return whether a process may publish at a key: under its own names; at a key without a source, by its role."""
+    topic = _ROOTS.get(key.split("/", 1)[0])
+    if topic is None:
+        return False
+    stated = names_of(topic, key).get("source")
+    if stated is not None:
+        return speaks_for(source, stated)
+    try:
+        return role_of(source) in topic.publishers
+    except ValueError:  # without keys, a process may have any name
+        return True
+
+
+class _NameFields:
+    """The fields of a message type, and of the request in it, that hold names."""
+
+    def __init__(self, kind: Descriptor) -> None:
+        self._own, self._within = _names_in(kind), ()
+        if "request" in kind.fields_by_name:
+            self._within = _names_in(kind.fields_by_name["request"].message_type)
+        self._header = "header" in kind.fields_by_name
+        self.counts = "published" in kind.fields_by_name
+
+    def robots(self, message: Any) -> Iterator[str]:
+        return self._stated(message, ("robot",))
+
+    def sources(self, message: Any) -> Iterator[str]:
+        if self._header:
+            yield message.header.source
+        yield from self._stated(message, ("actor", "process"))
+
+    def _stated(self, message: Any, wanted: tuple[str, ...]) -> Iterator[str]:
+        for name in wanted:
+            if name in self._own:
+                yield getattr(message, name)
+            if name in self._within:
+                yield getattr(message.request, name)
+
+
+@cache
+def _name_fields(kind: Descriptor) -> _NameFields:
+    return _NameFields(kind)
+
+
+def _names_in(kind: Descriptor) -> tuple[str, ...]:
+    return tuple(name for name in ("robot", "actor", "process") if name in kind.fields_by_name)
