@@ -25,12 +25,14 @@ from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.step_admission import StepAdmission
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus.identity import identity_of
 from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
 
 K = TypeVar("K")
 V = TypeVar("V")
 
 MOST_STREAMS = 20_000  # keys and process starts; a message beyond them is rejected
+MOST_STREAMS_OF_ONE = 5_000  # of one identity, so that it cannot take the place of the others
 MOST_NAMES = 4_000  # actors, learners or processes; the sketches of one actor take 10 kB and more
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 SILENT = HEALTH.stale_after or 3.0  # s without a Health message after which a process counts as silent
@@ -100,6 +102,7 @@ class Metrics:
         self.decisions: dict[str, DecisionStats] = {}
         self.plans: dict[str, TubeStats] = {}
         self.streams: dict[tuple[str, int], PublisherStream] = {}
+        self._streams_of: Counter[str] = Counter()  # by identity
         self.learners: dict[str, pb.LearnerMetrics] = {}
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()
@@ -128,7 +131,7 @@ class Metrics:
         """
         header: pb.Header = message.header
         sequence, place = header.sequence, (key, header.run)
-        stream = self.streams.get(place) or _get_or_create(self.streams, place, PublisherStream)
+        stream = self.streams.get(place) or self._new_stream(place)
         if sequence and sequence <= stream.last:
             stream.duplicates += 1
             return False
@@ -217,7 +220,7 @@ class Metrics:
             process.silences += silence > SILENT
             process.longest_silence = max(process.longest_silence, silence)
         else:
-            process.starts += 1
+            process.starts += health.header.run not in process.runs  # two processes with one name take turns
         process.run, process.last_health_at = health.header.run, now
         if len(process.runs) < MOST_STREAMS:
             process.runs.add(process.run)
@@ -225,8 +228,18 @@ class Metrics:
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
             if count and key.split("/", 1)[0] in self._roots:
-                stream = _get_or_create(self.streams, (key, health.header.run), PublisherStream)
+                place = key, health.header.run
+                stream = self.streams.get(place) or self._new_stream(place)
                 stream.published = max(stream.published, count)
+
+    def _new_stream(self, place: tuple[str, int]) -> PublisherStream:
+        """Return the counts of a new publisher. Raises Implausible."""
+        sender = identity_of(place[0].rpartition("/")[2])
+        if self._streams_of[sender] >= MOST_STREAMS_OF_ONE:
+            raise Implausible(f"{place[0]} is rejected: {sender} has {MOST_STREAMS_OF_ONE} keys and starts already")
+        stream = _get_or_create(self.streams, place, PublisherStream)
+        self._streams_of[sender] += 1
+        return stream
 
     def _log_line(self, line: pb.LogLine) -> None:
         self.log_lines[line.level if line.level in LEVELS else "other"] += 1

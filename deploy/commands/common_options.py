@@ -208,11 +208,15 @@ class RunBusOptions:
         """Return the bus settings of the launcher. Makes the run's own keys if the run needs any."""
         from brakeline.deploy.run.run_keys import make_run_keys
         from brakeline.messaging.bus import BusSettings
+        from brakeline.messaging.bus.bus_settings import local
         from brakeline.messaging.free_ports import free_endpoint
 
         keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
-        endpoint = self.listen or free_endpoint("tcp" if keys is None else "tls")
-        return BusSettings(listen=(endpoint,), keys=keys, insecure=self.insecure, metrics=self.metrics)
+        endpoints = (free_endpoint("tcp" if keys is None else "tls"),)
+        if self.listen:
+            # Strangers who crowd an endpoint that other machines reach do not delay the run's own processes at another.
+            endpoints = (self.listen,) if local(self.listen) else (*endpoints, self.listen)
+        return BusSettings(listen=endpoints, keys=keys, insecure=self.insecure, metrics=self.metrics)
 
 
 def settings_from(kind: type[T], options: object, **values: Any) -> T:

@@ -50,6 +50,18 @@ def access(names: Iterable[str], prefix: str) -> dict[str, Any]:
     }
 
 
+def size_limits(prefix: str) -> list[dict[str, Any]]:
+    """Return Zenoh's setting `low_pass_filter`: a router passes no message on that its topic does not allow."""
+    limits: dict[int, list[str]] = {}
+    for topic in TOPICS:
+        if topic.delivery is not Delivery.QUERY:
+            limits.setdefault(topic.largest, []).append(f"{prefix}/{topic.at()}")
+    return [
+        {"flows": ["ingress"], "messages": ["put"], "key_exprs": keys, "size_limit": largest}
+        for largest, keys in limits.items()
+    ]
+
+
 def grants(name: str, prefix: str) -> list[Grant]:
     """Return the messages that a process of this name may send and receive."""
     role = role_of(name)

@@ -11,11 +11,15 @@ from pathlib import Path
 import zenoh
 
 from brakeline.errors import BadKeys, Unreachable
-from brakeline.messaging.bus.access_control import access
+from brakeline.messaging.bus.access_control import access, size_limits
 from brakeline.messaging.bus.identity import names_in, tls
 from brakeline.messaging.bus.zenoh_sessions import zenoh_config
+from brakeline.messaging.topics import FILE
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # between two attempts to connect to a router [s]
+MOST_UNAUTHENTICATED = 4000  # connections that wait for their authentication at a router
+AUTHENTICATION_TIME = 3.0  # for it [s]
+MOST_SESSIONS = 10_000  # of a router
 SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # the place in Zenoh's source in an error message
 
 
@@ -107,6 +111,11 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         "connect/timeout_ms": 0 if client else -1,
         "listen/endpoints": settings.listen,
         "scouting/gossip/enabled": False,
+        # Clients that have not authenticated themselves must not take the places of those that will.
+        "transport/unicast/accept_pending": MOST_UNAUTHENTICATED,
+        "transport/unicast/accept_timeout": int(AUTHENTICATION_TIME * 1e3),
+        "transport/unicast/max_sessions": MOST_SESSIONS,
+        "transport/link/rx/max_message_size": 2 * FILE,
         "transport/link/tx/lease": int(settings.lease * 1e3),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": int(settings.stall * 1e6),
     }
@@ -114,6 +123,8 @@ def configuration(settings: BusSettings, source: str) -> zenoh.Config:
         values["transport/link/tls"] = tls(settings.keys, source, listens=not client)
         if not client:
             values["access_control"] = access(names_in(settings.keys), settings.prefix)
+    if not client:
+        values["low_pass_filter"] = size_limits(settings.prefix)
     return zenoh_config(values)
 
 

@@ -57,9 +57,8 @@ class _NameFields:
     """The fields of a message type, and of the request in it, that hold names."""
 
     def __init__(self, kind: Descriptor) -> None:
-        self._own, self._within = _names_in(kind), ()
-        if "request" in kind.fields_by_name:
-            self._within = _names_in(kind.fields_by_name["request"].message_type)
+        request = kind.fields_by_name["request"].message_type if "request" in kind.fields_by_name else None
+        self._own, self._within = _names_in(kind), _names_in(request)
         self._header = "header" in kind.fields_by_name
         self.counts = "published" in kind.fields_by_name
 
@@ -84,5 +83,7 @@ def _name_fields(kind: Descriptor) -> _NameFields:
     return _NameFields(kind)
 
 
-def _names_in(kind: Descriptor) -> tuple[str, ...]:
+def _names_in(kind: Descriptor | None) -> tuple[str, ...]:
+    if kind is None:
+        return ()
     return tuple(name for name in ("robot", "actor", "process") if name in kind.fields_by_name)

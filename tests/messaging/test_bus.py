@@ -210,4 +210,4 @@ def test_keys_of_nobody_and_too_many_or_too_large_ones_are_passed_over(
     session.put("brakeline/log/2", line)
     until(lambda: len(got) == 5)
     assert got == ["log/0", "log/1", "log/2", "log/0", "log/2"]
-    assert router.rejected.count == 3 + 2 + 1
+    assert router.rejected.count == 3 + 2, "and the router stops what is too large"

@@ -132,3 +132,35 @@ def test_the_key_of_the_tokens_is_in_the_folder_of_keys(tmp_path: Path) -> None:
     (tmp_path / "vouchers.key").write_bytes(b"short")
     with pytest.raises(BadKeys):
         PlanAuthenticator.of(tmp_path)
+
+
+def test_a_token_is_of_use_to_the_asker_that_got_it(model: ModelSet) -> None:
+    """The router has compared the asker's name with its certificate; the name in the request it has not."""
+    service = Service(model, key=KEY)
+    _, request = driving(service)
+    payload = pb.RequestBatch(requests=[request]).SerializeToString()
+
+    def ask(asker: str, request: pb.Request) -> pb.Decision:
+        batch = service.answer(pb.RequestBatch(requests=[request]).SerializeToString(), asker)
+        return pb.ReplyBatch.FromString(batch).replies[0].decision
+
+    assert not pb.ReplyBatch.FromString(service.answer(payload)).replies[0].decision.token_rejected
+    assert ask("actor-1", request).token_rejected, "the token was issued within this process"
+    fresh = pb.Request.FromString(request.SerializeToString())
+    fresh.model, fresh.plan_token = "", b""
+    fresh.plan[:] = [0.0] * len(fresh.plan)
+    fresh.input_in_force[:] = [0.0] * len(fresh.input_in_force)
+    for name in ("predicted_center", "predicted_half_width", "predicted_heading"):
+        fresh.ClearField(name)
+    decision = ask("actor-0", fresh)
+    m = len(request.input_in_force)
+    later = pb.Request.FromString(fresh.SerializeToString())
+    later.model, later.plan_token = decision.model, decision.plan_tokens[0]
+    later.input_in_force[:] = decision.plan[:m]
+    later.plan[:] = [*decision.plan[m:], *([0.0] * m)]
+    later.predicted_center.extend(decision.predicted_center)
+    later.predicted_half_width.extend(decision.predicted_half_width)
+    later.predicted_heading = decision.predicted_heading
+    assert not ask("actor-0", later).token_rejected and not ask("actor-0.3", later).token_rejected
+    for thief in ("actor-1", "actor-00", "client", ""):
+        assert ask(thief, later).token_rejected, thief
