@@ -212,7 +212,7 @@ class RunBusOptions:
         from brakeline.messaging.free_ports import free_endpoint
 
         keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
-        endpoints = (free_endpoint("tcp" if keys is None else "tls"),)
+        endpoints: tuple[str, ...] = (free_endpoint("tcp" if keys is None else "tls"),)
         if self.listen:
             # Strangers who crowd an endpoint that other machines reach do not delay the run's own processes at another.
             endpoints = (self.listen,) if local(self.listen) else (*endpoints, self.listen)

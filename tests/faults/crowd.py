@@ -69,7 +69,7 @@ def _junk(settings: BusSettings, question: bool, rate: int, sent: Connection, st
     with session:
         step = f"{settings.prefix}/{STEP.at(robot='ground', source='actor-0')}"
         publisher = session.declare_publisher(step, congestion_control=zenoh.CongestionControl.BLOCK)
-        decide = f"{settings.prefix}/{DECIDE.at(robot='ground')}"
+        decide = f"{settings.prefix}/{DECIDE.at(robot='ground', source='actor-0')}"
         drop = zenoh.CongestionControl.DROP
         querier = session.declare_querier(decide, timeout=DEADLINE, congestion_control=drop)
 

@@ -156,7 +156,7 @@ def test_a_second_queryable_answers_nobody(system: System) -> None:
             query.reply(query.key_expr, b"allowed")
 
     attacker, asker = system.attacker(), system.join("actor-0")
-    for key in ("brakeline/safety/*/decide", "brakeline/safety/*/decide/*"):  # of all, and of each by itself
+    for key in ("brakeline/safety/*/decide/*", "brakeline/safety/*/decide/*/*"):  # of all, and of each by itself
         attacker.declare_queryable(key, evil, complete=True)
     time.sleep(JOINED)
     if system.keys is None:
