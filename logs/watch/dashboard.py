@@ -139,7 +139,6 @@ class Dashboard:
         self._lines: deque[str] = deque(maxlen=LINES)
         self._returns: dict[str, deque[float]] = {}  # by robot kind
         self._started = self._last_message = time.monotonic()
-        self._health_at: dict[str, float] = {}  # s since the Unix epoch, of the latest Health, by process
         self._figures: dict[str, Any] = {}
         self._figures_at = -1e9
         self._lock = threading.Lock()
@@ -155,8 +154,6 @@ class Dashboard:
             self._last_message = time.monotonic()
             if not self.metrics.add(sample.key, message, sample.received):
                 return
-            if isinstance(message, pb.Health):
-                self._health_at[message.process] = sample.received * 1e-9
             if isinstance(message, pb.LogLine):
                 if message.level in ("WARNING", "ERROR"):
                     self._lines.append(f"{message.process}: {headline(message.text)}")
@@ -236,8 +233,9 @@ class Dashboard:
         processes = self.metrics.processes
         if not processes[name].alive:
             return "ended"
-        # By the clock here: those of the processes may differ from it, or lie.
-        quiet = max(self._health_at.values()) - self._health_at[name] + time.monotonic() - self._last_message
+        # The clocks of the processes may differ from the clock here.
+        latest = max(process.last_health_at for process in processes.values())
+        quiet = (latest - processes[name].last_health_at) * 1e-9 + time.monotonic() - self._last_message
         return "silent" if quiet > SILENT else "alive"
 
 
