@@ -53,6 +53,25 @@ class Trajectory:
     headings: Array | None = None
 
 
+def _continues(first: Trajectory, second: Trajectory) -> bool:
+    """Return whether a trajectory begins with the state and the input that another one ends with."""
+    if second.before is None or (first.headings is None) != (second.headings is None):
+        return False
+    same = np.array_equal(first.states[-1], second.states[0]) and np.array_equal(first.inputs[-1], second.before)
+    return same and first.paths.shape[1] == second.paths.shape[1]
+
+
+def _chained(parts: list[Trajectory]) -> Trajectory:
+    if len(parts) == 1:
+        return parts[0]
+    states = np.concatenate([parts[0].states[:1], *(t.states[1:] for t in parts)])
+    inputs, paths, turned = (
+        np.concatenate([getattr(t, name) for t in parts]) for name in ("inputs", "paths", "turned")
+    )
+    within = [t.headings for t in parts if t.headings is not None]
+    return Trajectory(states, inputs, paths, turned, parts[0].before, np.concatenate(within) if within else None)
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Recorded trajectories of one robot.
@@ -83,6 +102,20 @@ class Dataset:
         restless = int(self.about.get(RESTLESS, "0"))
         about = {name: value for name, value in self.about.items() if name != RESTLESS}
         return replace(self, trajectories=self.trajectories[: len(self.trajectories) - restless], about=about)
+
+    def joined(self) -> Dataset:
+        """Return the data set with trajectories joined where one continues the one before it.
+
+        `import` cuts a recording into many, because the linear modes hold out whole trajectories. No window of a
+        plan's length crosses a cut.
+        """
+        chains: list[list[Trajectory]] = []
+        for t in self.trajectories:
+            if chains and _continues(chains[-1][-1], t):
+                chains[-1].append(t)
+            else:
+                chains.append([t])
+        return replace(self, trajectories=tuple(_chained(chain) for chain in chains))
 
     def check(self) -> None:
         """Check shapes, finite values, the bounds of inputs, and that no position jumps.

@@ -254,18 +254,18 @@ def fit_one_step(
     robot = data.robot
     if robot.feedback:
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
-    s = samples_of(data)
+    s = samples_of(data.joined())
     chosen, candidates, regression = choose(robot, s, progress)
     progress(CHOSEN)
-    weight = _weight(robot, s, regression, chosen.ridge, model_config.outside)
-    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, progress)
+    weight, speeds = _weight_and_speeds(robot, s, regression, chosen.ridge, model_config.outside)
+    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, speeds, progress)
     kinds = driving_kinds(robot, s.z, s.start)
     factor, first = (_factor(each, kinds, model_config.outside) for each in (scores, others))
     if not robot.position_dim:  # the limited coordinates are scored with the plan
         first = max(factor, first)
     one_step = regression.fit(chosen.ridge, weight=weight)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factor)
     first_scale = np.where(np.arange(n) < d, factor, first)
@@ -324,32 +324,37 @@ def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> 
     return shape.bound(data.robot, data.robot.horizon, slice(1), np.ones(1))
 
 
-def _weight(robot: Robot, s: Samples, regression: _Regression, ridge: float, outside: float) -> float:
-    """Return the largest weight of the leverage with which the last sets of plans are nearly as narrow as with any.
+def _weight_and_speeds(
+    robot: Robot, s: Samples, regression: _Regression, ridge: float, outside: float
+) -> tuple[float, bool]:
+    """Return the weight of the leverage, and whether half-widths grow with the speeds, for the narrowest sets of plans.
 
-    Without it, one factor widens all sets because some windows at the edge of the data are predicted badly, and sets
-    outside of the data are as narrow as within.
+    Of several nearly as narrow (of the last sets, on average), take the largest weight, then a shape without speeds.
+    Without the leverage, one factor widens all sets because some windows at the edge of the data are predicted badly,
+    and sets outside of the data are as narrow as within. Minutes of driving may hold few errors at a large speed that
+    the inputs do not announce, such as the sway of a boat: then a slope on that speed is mostly noise.
     """
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, found = plans_from(robot, z), dict.fromkeys(WEIGHTS, 0.0)
-    for weight in WEIGHTS:
+    plans, found = plans_from(robot, z), dict.fromkeys(product(WEIGHTS, (True, False)), 0.0)
+    for weight, speeds in found:
         scores, width = np.zeros(len(z)), 0.0
         for i in range(len(regression.gram)):
             one_step, held = regression.fit(ridge, i, weight), fold == i
             stretch = one_step.stretches(robot, z)[:, -1:, None]
             errors = (after - one_step.rollouts(robot, z)[:, -1:][..., used]) / stretch
-            shape = Shape.around(robot, z[~held], errors[~held], last=True)
+            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds)
             scores[held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
             wide = shape.widths(robot, plans, last=True)[:, 0] * one_step.stretches(robot, plans)[:, -1:]
             width += float(wide.mean())
-        found[weight] = max(float(np.quantile(scores, 1.0 - outside)), 1.0) * width
-    return max(weight for weight, width in found.items() if width <= SIMPLER * min(found.values()))
+        found[weight, speeds] = max(float(np.quantile(scores, 1.0 - outside)), 1.0) * width
+    good = [pair for pair, width in found.items() if width <= SIMPLER * min(found.values())]
+    return max(good, key=lambda pair: (pair[0], not pair[1]))
 
 
 def _scores(
-    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float, progress: Progress
+    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float, speeds: bool, progress: Progress
 ) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
 
@@ -364,7 +369,7 @@ def _scores(
         held = s.fold == i
         one_step = regression.fit(ridge, i, weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held])
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds)
         widths = shape.widths(robot, s.z[held])
         shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = shares[..., used].max((1, 2))

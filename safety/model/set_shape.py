@@ -56,19 +56,32 @@ class Shape:
         return np.asarray(np.stack(parts, axis=1) + self.w)
 
     @staticmethod
-    def around(robot: Robot, z: Array, errors: Array, inflation: float = 1.0, last: bool = False) -> Shape:
+    def around(
+        robot: Robot, z: Array, errors: Array, inflation: float = 1.0, last: bool = False, speeds: bool = True
+    ) -> Shape:
         """Return the shape that holds all errors (T, N, n') and is tightest, on average, for plans as the filter has.
 
-        Driving that was recorded holds large inputs to the end of a window; plans brake. last: the errors (T, 1, n')
-        are those after the last period.
+        Driving that was recorded holds large inputs to the end of a window; plans brake.
+
+        Args:
+            robot: the robot.
+            z (T, nz): regressors.
+            errors (T, N, n'): errors to hold.
+            inflation: factor on the shape.
+            last: the errors (T, 1, n') are those after the last period.
+            speeds: whether half-widths grow with the measured speeds too, besides the inputs.
         """
         _, N, n = errors.shape
         found, plans = [], plans_from(robot, z)
         for k in range(N):
             period = robot.horizon if last else k + 1
             used, typical = spread_features(robot, z, period), spread_features(robot, plans, period)
+            if not speeds:
+                used[:, : len(robot.regressor)] = typical[:, : len(robot.regressor)] = 0.0
             found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical) for i in range(n)]
         slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
+        if not speeds:
+            slopes[:, : len(robot.regressor)] = 0.0
         return Shape(slopes.reshape(N, n, -1), w.reshape(N, n))
 
     def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
@@ -87,10 +100,10 @@ class Shape:
         return ErrorBound(np.zeros_like(kappa), changes, M, kappa, w, np.eye(len(w)))
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array) -> Shape:
+def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool) -> Shape:
     """Return the shape of the errors, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
-    shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2))
+    shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2), speeds=speeds)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
