@@ -59,6 +59,7 @@ FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
 MOST_UNKNOWN = 3  # columns of a file that nothing is known of; more are left out
 CHOSEN_PERIOD = 0.1  # s, where the log shows no beat
 GUESS = "a guess: the inputs of the log show no beat; take the period of your controller"
+ENDLESS = 1e6  # periods of a stop: a damaged value falls forever
 LONGEST_PLAN = 40  # periods: if a stop takes more, a period is several beats
 NAMED = 12  # columns that a note names
 
@@ -186,7 +187,7 @@ def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Seque
     """Return the periods of the braking, and those of the longest delay."""
     ramps = [(max(-c.least, c.most), c.change) for c in inputs if c.jumps is False and c.change > 0.0]
     falls = [(max(abs(c.least), abs(c.most)), c.change) for c in states if c.follows and c.change > 0.0]
-    brake = max((math.ceil(round(most / change, 6)) for most, change in (*ramps, *falls)), default=1)
+    brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
     return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
 
 

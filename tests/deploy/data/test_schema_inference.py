@@ -10,7 +10,7 @@ from mcap.writer import Writer
 
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.importer import import_sources, tables_of
-from brakeline.deploy.data.schema_inference import infer_schema
+from brakeline.deploy.data.schema_inference import InferredColumn, brake_periods, infer_schema
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import ROBOTS_FOLDER as ROBOTS
@@ -144,3 +144,9 @@ def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
     assert "holds the robots ground, quadrotor: name the file after" in " ".join(capsys.readouterr().err.split())
     assert main(["robot", "new", str(tmp_path / "quadrotor.toml"), "--from", str(log)]) == 0
     assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()
+
+
+@pytest.mark.parametrize("most", [np.inf, 1e308])
+def test_a_value_that_falls_forever_needs_endless_periods_to_stop(most: float) -> None:
+    column = InferredColumn("v", "m/s", -1.0, most, change=1e-9)
+    assert brake_periods(0.1, [], [column])[0] >= 1_000_000
