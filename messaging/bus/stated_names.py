@@ -40,12 +40,15 @@ def check_names(names: Mapping[str, str], message: Any) -> None:
 
 
 def _publishes(source: str, key: str) -> bool:
-    """Return whether a process may publish at a key: under its own names; at a key without a source, by its role."""
+    """Return whether a process may publish at a key: under its own names, or by its role.
+
+    Keys without a source, and those of logged steps, which name the actor of the log, are a matter of the role.
+    """
     topic = _ROOTS.get(key.split("/", 1)[0])
     if topic is None:
         return False
     stated = names_of(topic, key).get("source")
-    if stated is not None:
+    if stated is not None and topic.own:
         return speaks_for(source, stated)
     try:
         return role_of(source) in topic.publishers

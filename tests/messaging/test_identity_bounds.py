@@ -33,6 +33,7 @@ def message(topic: Topic, key: str, content: object) -> object:
         (HEALTH, "health/actor-1", pb.Health(process="safety")),
         (HEALTH, "health/actor-1", pb.Health(published={"step/ground/actor-0": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"metrics/ground": 10**9})),
+        (HEALTH, "health/actor-1", pb.Health(published={"logged/ground/actor-1": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"elsewhere/actor-1": 10**9})),
         (LOG, "log/actor-1", pb.LogLine(process="launcher")),
     ],
@@ -45,6 +46,7 @@ def test_a_message_that_speaks_for_another_is_malformed(topic: Topic, key: str, 
 def test_a_process_speaks_for_itself_and_its_robots() -> None:
     published = {"health/actor-1": 1, "step/ground/actor-1.3": 2}
     message(HEALTH, "health/actor-1", pb.Health(process="actor-1", published=published))
+    message(HEALTH, "health/feeder.a", pb.Health(process="feeder.a", published={"logged/ground/actor-0": 2}))
     message(HEALTH, "health/learner-ground", pb.Health(process="learner-ground", published={"metrics/ground": 3}))
     message(EXCHANGE, "exchange/ground/actor-1.3", pb.Exchange(request=pb.Request(robot="ground", actor="actor-1.3")))
     assert speaks_for("actor-1", "actor-1.3") and not speaks_for("actor-1", "actor-10")
