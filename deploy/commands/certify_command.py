@@ -76,6 +76,7 @@ class CertifyCommand:
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
+        settings = ModelConfig(outside=self.outside)  # before data are recorded: it may be out of range
         path, data, note = self._load()
         accepted_bound(data.robot, self.accept_bound)
         models: list[tuple[ModelSet, ValidationReport]] = []
@@ -87,7 +88,7 @@ class CertifyCommand:
             for kind, mode in forms:
                 progress.begin(f"certifying {kind}, {mode}")
                 try:
-                    config = ModelConfig(kind, mode, outside=self.outside)
+                    config = replace(settings, certificate=kind, mode=mode)
                     config = config.of_minutes() if self.few else config
                     model, report, unsupported = certify_supported(
                         data, config, self.windows, self.until_held, progress

@@ -81,8 +81,8 @@ def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_le
     assert ModelSet.load(tmp_path / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
     assert found[1]["inflation"] < found[0]["inflation"] and found[1]["half_width_rest"] < found[0]["half_width_rest"]
     assert found[1]["bound_plan"] > found[0]["bound_plan"] and found[1]["marginal"] > found[0]["marginal"]
-    status, _, err = run(capsys, *words, "--outside", "0.5")
-    assert status == 1 and "between 0 and 0.1" in err
+    status, _, err = run(capsys, "certify", "--robot", "ground", "--outside", "0.5")
+    assert status == 1 and "between 0 and 0.1" in err and not (tmp_path / "ground").exists()
 
 
 @pytest.mark.parametrize(
