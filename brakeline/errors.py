@@ -80,7 +80,7 @@ class InvalidField(BrakelineError, ValueError):
 
 
 class BadText(BrakelineError, ValueError):
-    """A text is no JSON or TOML, or is nested too deeply."""
+    """A text is not JSON or TOML, or is nested too deeply."""
 
 
 class BadLink(BrakelineError, ValueError):

@@ -13,19 +13,19 @@ def parse_json(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        BadText: the text is no JSON, or nested too deeply.
+        BadText: the text is not JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise BadText(f"no JSON: {error}") from error
+        raise BadText(f"not JSON: {error}") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
     """Return the values of a TOML text.
 
     Raises:
-        BadText: the text is no TOML, or nested too deeply.
+        BadText: the text is not TOML, or nested too deeply.
     """
     try:
         return tomllib.loads(text)

@@ -356,7 +356,7 @@ def test_a_scan_is_loaded_from_a_file(tmp_path):
     image = read(3, json.dumps({"ranges": np.ones((45, 90)).tolist(), "at": [0, 0, 1]}))
     assert isinstance(image, RangeImage) and image.ranges.shape == (45, 90)
     for dim, text, said in (
-        (2, "{", "not a Scan: no JSON: Expecting property name"),
+        (2, "{", "not a Scan: not JSON: Expecting property name"),
         (2, "[]", "a JSON object of ranges, angles, pose"),
         (2, '{"ranges": [1], "angels": [0]}', "a JSON object of ranges, angles, pose"),
         (2, '{"ranges": [1], "angles": [0]}', "missing 1 required positional argument: 'pose'"),
