@@ -9,7 +9,7 @@ exactly:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -134,6 +134,10 @@ class OneStep:
         from brakeline.safety.filter.kernels import rollout_kernels
 
         return rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
+
+    def leverages(self, robot: Robot, z: Array) -> Array:
+        """Return the leverages (T, N) of windows z (T, r + N·m), with which the sets grow."""
+        return replace(self, weight=1.0).stretches(robot, z) ** 2 - 1.0
 
     def arguments(self, robot: Robot) -> Arguments:
         """Return the arguments of the kernels that are the same for every plan."""

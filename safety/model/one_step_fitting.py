@@ -337,18 +337,19 @@ def _weight_and_speeds(
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, found = plans_from(robot, z), dict.fromkeys(product(WEIGHTS, (True, False)), 0.0)
-    for weight, speeds in found:
-        scores, width = np.zeros(len(z)), 0.0
-        for i in range(len(regression.gram)):
-            one_step, held = regression.fit(ridge, i, weight), fold == i
-            stretch = one_step.stretches(robot, z)[:, -1:, None]
-            errors = (after - one_step.rollouts(robot, z)[:, -1:][..., used]) / stretch
+    plans, pairs = plans_from(robot, z), [*product(WEIGHTS, (True, False))]
+    scores, sums = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
+    for i in range(len(regression.gram)):
+        one_step, held = regression.fit(ridge, i), fold == i
+        off = after - one_step.rollouts(robot, z)[:, -1:][..., used]
+        leverages, of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans))
+        for p, (weight, speeds) in enumerate(pairs):
+            errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
             shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds)
-            scores[held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
-            wide = shape.widths(robot, plans, last=True)[:, 0] * one_step.stretches(robot, plans)[:, -1:]
-            width += float(wide.mean())
-        found[weight, speeds] = max(float(np.quantile(scores, 1.0 - outside)), 1.0) * width
+            scores[p, held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
+            wide = shape.widths(robot, plans, last=True)[:, 0] * np.sqrt(1.0 + weight * of_plans)
+            sums[p] += wide.mean()
+    found = dict(zip(pairs, np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * sums, strict=True))
     good = [pair for pair, width in found.items() if width <= SIMPLER * min(found.values())]
     return max(good, key=lambda pair: (pair[0], not pair[1]))
 

@@ -195,19 +195,21 @@ def stretches(
     r, F = len(others), len(terms)
     N = (z.shape[1] - r) // inputs - 1
     found, v, y = np.empty((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
-    p, total = np.empty(1 + len(v) + len(saturations)), np.empty(F)
+    p, total, along = np.empty(1 + len(v) + len(saturations)), np.empty(F), np.empty(F)
+    across = root.T.copy()  # so that the inner loop runs along memory, and is vectorized
     for t in range(len(z)):
         total[:], v[:r] = 0.0, z[t, :r]
         for k in range(N):
             now = r + (k + 1) * inputs
             v[r : r + inputs], v[r + inputs :] = z[t, now : now + inputs], z[t, now - inputs : now]
             _predict(C, scale, saturations, terms, v, p, total, y)
-            square = 0.0
+            along[:], square = 0.0, 0.0
+            for j in range(F):
+                column, sums = across[j, j:], along[j:]
+                for i in range(len(column)):
+                    sums[i] += column[i] * total[j]
             for i in range(F):
-                along = 0.0
-                for j in range(i + 1):
-                    along += root[i, j] * total[j]
-                square += along * along
+                square += along[i] * along[i]
             found[t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
             for i in range(r):
                 v[i] = y[others[i]]
