@@ -6,6 +6,7 @@ so only in another unit (degrees, km/h) has that unit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -80,25 +81,31 @@ def heading_contradiction(name: str, unit: str, score: float) -> str:
 
 
 def heading_unit(log: AlignedLog, name: str) -> tuple[str, float]:
-    """Return the unit in which a column agrees best with the direction of motion, and its `heading_score`."""
-    scores = {unit: heading_score(log, name, unit) for unit in HEADING_UNITS}
+    """Return the unit in which a column agrees best with the direction of motion, and how well, in [0, 1]."""
+    scores = heading_scores(log, name)
     best = max(scores, key=lambda unit: scores[unit])
     clear = scores[best] > SAME_CORRELATION and scores[best] > scores["rad"] + 0.1
     return (best, scores[best]) if clear else ("rad", scores["rad"])
 
 
-def heading_score(log: AlignedLog, name: str, unit: str = "rad") -> float:
-    """Return how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|, in [0, 1]."""
-    angles = in_si(log.columns[name], unit, "rad")
-    assert angles is not None
+def heading_scores(log: AlignedLog, name: str) -> dict[str, float]:
+    """Return for each unit how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|.
+
+    On a straight path, a constant agrees as well as the heading does: 0 if the angle does not change.
+    """
     i, j = log.spans(SPAN)
     x, y = (log.change(p, i, j) for p in log.positions[:2])
     length = np.hypot(x, y)
-    far = length > 0.3 * np.quantile(length, 0.99) if len(length) else np.zeros(0, bool)
-    cosines = np.abs(np.cos(np.arctan2(y, x) - angles[(i + j) // 2]))[far]
-    # On a straight path a constant agrees as well as the heading does: require that the angle changes.
-    turned = np.ptp(angles) > 0.5
-    return float(cosines.mean()) if turned and len(cosines) >= FEWEST_SPANS else 0.0
+    far = np.flatnonzero(length > 0.3 * np.quantile(length, 0.99)) if len(length) else i
+    if len(far) < FEWEST_SPANS:
+        return dict.fromkeys(HEADING_UNITS, 0.0)
+    direction, middle, scores = np.arctan2(y[far], x[far]), ((i + j) // 2)[far], {}
+    for unit in HEADING_UNITS:
+        angles = in_si(log.columns[name], unit, "rad")
+        assert angles is not None
+        turned = np.ptp(angles) > 0.5
+        scores[unit] = float(np.abs(np.cos(direction - angles[middle])).mean()) if turned else 0.0
+    return scores
 
 
 def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
@@ -124,7 +131,7 @@ def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_in
     means = (sums[j + 1] - sums[i]) / (j - i + 1)
     lags = range(0, round(MAX_LAG / log.step) + 1, max(round(0.1 / log.step), 1)) if is_input else (0,)
     fits = [
-        SpeedFit(correlation(speed[lag:], means[:end]), _gain(speed[lag:], means[:end]), unit)
+        SpeedFit(*agreement(speed[lag:], means[:end]), unit)
         for unit, speed in speeds
         for lag in lags
         if (end := len(means) - lag) >= FEWEST_SPANS
@@ -133,16 +140,19 @@ def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_in
     return best if best.correlation > (FOLLOWS_CORRELATION if is_input else SAME_CORRELATION) else None
 
 
-def correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 for too few values, or if one is constant."""
-    if len(one) < FEWEST_SPANS or np.ptp(one) == 0.0 or np.ptp(other) == 0.0:
-        return 0.0
-    return float(np.corrcoef(one, other)[0, 1])
+def agreement(one: Array, other: Array) -> tuple[float, float]:
+    """Return the correlation of two series, and the ratio of the second's standard deviation to the first's.
 
-
-def _gain(one: Array, other: Array) -> float:
-    spread = float(np.std(one)) if len(one) else 0.0
-    return float(np.std(other)) / spread if spread else 0.0
+    Both are 0 for too few values, or if one series is constant.
+    """
+    if len(one) < FEWEST_SPANS or one.min() == one.max() or other.min() == other.max():
+        return 0.0, 0.0
+    # Shorter than numpy.corrcoef, because `speed_fit` compares every column at every lag.
+    one, other = one - one.sum() / len(one), other - other.sum() / len(other)
+    size, other_size = math.sqrt(one @ one), math.sqrt(other @ other)
+    if not 0.0 < size * other_size < math.inf:  # values too small or too large to be squared
+        return 0.0, 0.0
+    return float(one @ other) / size / other_size, other_size / size
 
 
 def same_gain(gain: float) -> bool:

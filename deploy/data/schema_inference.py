@@ -23,7 +23,7 @@ from brakeline.deploy.data.motion_check import (
     MAX_LAG,
     SAME_CORRELATION,
     SPAN,
-    correlation,
+    agreement,
     heading_contradiction,
     heading_unit,
     same_gain,
@@ -377,8 +377,8 @@ def _lagged_correlation(log: AlignedLog, name: str, other: str) -> float:
 
 def _near_correlation(one: Array, other: Array) -> float:
     """Return the correlation of two series; 0 if the gain is not near 1."""
-    near = len(one) > 0 and np.std(one) > 0.0 and same_gain(float(np.std(other) / np.std(one)))
-    return correlation(one, other) if near else 0.0
+    value, gain = agreement(one, other)
+    return value if same_gain(gain) else 0.0
 
 
 def _delay(log: AlignedLog, name: str, follower: str) -> float | None:

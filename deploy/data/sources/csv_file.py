@@ -151,11 +151,12 @@ def _separator(sample: list[str]) -> str:
         cells, lines = counts.most_common(1)[0]
         return lines / len(sample) if cells > 1 else 0.0
 
-    best = max(map(agreement, SEPARATORS))
+    shares = {one: agreement(one) for one in SEPARATORS}
+    best = max(shares.values())
     if best == 0.0:
         return ","
     # A header whose names hold spaces, or rows of decimal commas, agree less often: prefer the first near the best.
-    return next(one for one in SEPARATORS if agreement(one) >= best - 0.05)
+    return next(one for one, share in shares.items() if share >= best - 0.05)
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,7 @@ def _decoded(types: Typestore, topic: BagTopic, raw: bytes) -> Any:
 def _types_or_none(topic: BagTopic, contents: BagContents) -> Typestore | None:
     """Return the message types of a topic, or None if its definition is damaged."""
     try:
-        return _types_of(topic)
+        return _types_of(topic.type, topic.definition, topic.idl)
     except MemoryError:
         raise
     except Exception as error:  # the parser of definitions raises many types
@@ -157,15 +158,16 @@ def _types_or_none(topic: BagTopic, contents: BagContents) -> Typestore | None:
         return None
 
 
-def _types_of(topic: BagTopic) -> Typestore:
-    """Return the message types that the bag defines, or those of the latest ROS 2 if the bag defines none."""
-    if not topic.definition:
+@lru_cache(32)  # the topics and files of a bag repeat their definitions, and each store compiles code for its types
+def _types_of(kind: str, definition: str, idl: bool) -> Typestore:
+    """Return the message types that a bag defines, or those of the latest ROS 2 if the bag defines none."""
+    if not definition:
         return get_typestore(Stores.LATEST)
     types = get_typestore(Stores.EMPTY)
-    if not topic.idl:
-        types.register(get_types_from_msg(topic.definition, topic.type))
+    if not idl:
+        types.register(get_types_from_msg(definition, kind))
         return types
-    for part in topic.definition.split("=" * 80 + "\n"):
+    for part in definition.split("=" * 80 + "\n"):
         types.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
     return types
 
