@@ -2,15 +2,17 @@
 
 python -m benchmarks campaign [--kills 1000] [--seed 0] [--folder runs/campaign]
 
-The other kinds are lost links and damaged files. The campaign has legs of 50 faults, each with a run of its own. A leg
-draws one to six faults at a time; the next ones come when every process is back and both robots go on. Each leg adds a
-line to `campaign-SEED.jsonl` in the folder; the same command goes on after the last line. At the end of a leg its
-figures are compared with the logs, message by message, and each damaged file must have been named by what read it.
+The other kinds are lost links and damaged files. The campaign has legs of 100 faults, each with a run of its own. A leg
+draws one to twelve faults at a time; the next ones come when every process is back and both robots go on. Each leg adds
+a line to `campaign-SEED.jsonl` in the folder; the same command goes on after the last line. At the end of a leg its
+figures are compared with the logs, message by message, and each damaged file must have been named by what read it. The
+logs of a leg with a mistake stay in the folder.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import sys
 import tempfile
@@ -33,11 +35,11 @@ from tests.faults.five_hosts import CLOCKS, TURN, Fleet
 from tests.faults.network_hosts import Hosts
 from tests.faults.small_volume import SmallVolume
 
-LEG = 50  # faults
-MOST_AT_ONCE = 6
+LEG = 100  # faults
+MOST_AT_ONCE = 12
 STAGGER = 0.5  # s, the longest time between two faults of a group
 FARTHEST = 10.0  # h that a host's clock may be off: certificates are valid from a day before
-VOLUME = 96  # MiB for each log and each learner
+VOLUME = 192  # MiB for each log and each learner
 STARTED = ("resumed at step", " ready")  # log lines of a process that accepted what it read
 KINDS = ("kill", "stop", "full disk", "clock jump", "lost link", "damaged file")
 
@@ -140,15 +142,18 @@ class Leg:
         self.fleet.launch(name)
         popen = self.fleet.spots[name].popen
         assert popen is not None
-        deadline, said = time.monotonic() + PATIENCE, ""
-        while popen.poll() is None and time.monotonic() < deadline and not any(word in said for word in STARTED):
+        deadline, said, ended = time.monotonic() + PATIENCE, "", False
+        while not ended and time.monotonic() < deadline and not any(word in said for word in STARTED):
             time.sleep(TURN)
+            ended = popen.poll() is not None  # before the output is read, so that its last words are
             with output.open("rb") as file:
                 file.seek(before)
                 said = file.read().decode(errors="replace")
         refused = popen.poll() not in (None, 0) and (path.stem in said or path.name in said)
         # A space, or a letter of a hexadecimal number: the signature or the number is the same.
         same = path.suffix in (".seal", "") and any(word in said for word in STARTED)
+        if not (refused or same):
+            print(f"{name} did not name {path.name} (status {popen.poll()}): {said}", file=sys.stderr, flush=True)
         self.damages.append(Damage(path, lambda: refused or same))
         self.counts["damaged file, the same in meaning"] += same
         self._end(name)
@@ -215,8 +220,14 @@ def wrong_figures(fleet: Fleet, elapsed: float) -> list[str]:
     return wrong
 
 
-def leg(seed: str, faults: int) -> dict[str, Any]:
-    """Make a run with faults, and judge it. Raises NoHosts, and CalledProcessError if nothing can be mounted here."""
+def leg(seed: str, faults: int, evidence: Path) -> dict[str, Any]:
+    """Make a run with faults, and judge it. Raises NoHosts, and CalledProcessError if nothing can be mounted here.
+
+    Args:
+        seed: of the faults.
+        faults: how many.
+        evidence: the logs and outputs of a leg with a mistake are copied to this folder.
+    """
     random, began = Random(seed), time.monotonic()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="campaign")))
@@ -242,7 +253,7 @@ def leg(seed: str, faults: int) -> dict[str, Any]:
         judged = Judged()
         judged.read(fleet)
         elapsed = time.monotonic() - began
-        return {
+        row = {
             "seed": seed,
             "faults": dict(run.counts),
             "steps": judged.steps,
@@ -255,6 +266,9 @@ def leg(seed: str, faults: int) -> dict[str, Any]:
             "longest recovery": max(run.chaos.recovery, default=0.0),
             "minutes": elapsed / 60.0,
         }
+        if judged.collisions or judged.twice or any(row[what] for what in ("not named", "wrong", "stuck")):
+            shutil.copytree(folder, evidence, ignore=shutil.ignore_patterns("keys", "data", "ballast"))
+        return row
 
 
 def campaign(faults: int, seed: int, folder: Path) -> Figures:
@@ -266,7 +280,7 @@ def campaign(faults: int, seed: int, folder: Path) -> Figures:
         print(f"leg {number}, after {done} of {faults} faults", file=sys.stderr, flush=True)
         if number and not any(_rows(results)[-1]["faults"].values()):
             raise Stuck(f"the last leg made no fault: {_rows(results)[-1]['stuck']}")
-        row = leg(f"{seed}/{number}", min(LEG, faults - done))
+        row = leg(f"{seed}/{number}", min(LEG, faults - done), folder / f"leg-{seed}-{number}")
         with results.open("a") as file:
             file.write(json.dumps(row) + "\n")
     return table(_rows(results))
