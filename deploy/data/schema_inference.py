@@ -18,6 +18,8 @@ from brakeline.deploy.data.aligned_log import AlignedLog, align, joined
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.input_delay import estimate_delay
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
+from brakeline.deploy.data.message_columns import FIELDS
+from brakeline.deploy.data.message_columns import HEADING as HEADING_NAME
 from brakeline.deploy.data.motion_check import (
     FEWEST_SPANS,
     MAX_LAG,
@@ -57,6 +59,7 @@ JUMP = 0.8  # share of an input's range: an input that changes more in one perio
 HELD = 0.5  # share of rows that repeat the row before: only inputs, which are held, repeat this often
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
 MOST_UNKNOWN = 3  # columns of a file that nothing is known of; more are left out
+FLAT = 1e-3  # m: a standard deviation of z below it is noise of a robot in the plane
 CHOSEN_PERIOD = 0.1  # s, where the log shows no beat
 GUESS = "a guess: the inputs of the log show no beat; take the period of your controller"
 ENDLESS = 1e6  # periods of a stop: a damaged value falls forever
@@ -108,7 +111,7 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
     """
     log, notes = _read(sources, options)
     constant = [name for name, values in log.columns.items() if np.ptp(values) == 0.0]
-    notes += [f"{name} never changes, so that it is left out" for name in constant]
+    notes += [f"left out, as they never change: {_listed(constant)}"] if constant else []
     for name in constant:
         del log.columns[name]
     log.positions, log.inputs = ([n for n in names if n not in constant] for names in (log.positions, log.inputs))
@@ -123,7 +126,8 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
     pairs = _followers(log, others)
     for name, follower in pairs.items():
         log.units.setdefault(name, log.units.get(follower, ""))
-    unknown = [n for n in others if not log.units.get(n) and n not in pairs.values() and n not in options.fields]
+    known = {*pairs.values(), *options.fields, *FIELDS, HEADING_NAME}
+    unknown = [name for name in others if not log.units.get(name) and name not in known]
     if len(unknown) > MOST_UNKNOWN:
         notes.append(f"left out, as the motion shows no role of them: {_listed(unknown)}. --map NAME=COLUMN takes one")
         others = [name for name in others if name not in unknown]
@@ -156,7 +160,7 @@ def _read(sources: Sequence[Sequence[Table]], options: LogOptions) -> tuple[Alig
     for tables in sources:
         fields = _from_messages(tables, options) if tables[0].name else _from_columns(tables[0], options)
         places, more = without_glitches(fields.places, fields.positions, heading=fields.heading)
-        notes += [*notes_of(tables), *choice_notes(tables, places), *more]
+        notes += [*notes_of(tables), *fields.notes, *choice_notes(tables, places), *more]
         logs.append(align(places, fields.positions, fields.inputs, fields.units, fields.heading))
     log = joined(logs)
     if lost := sorted({name for one in logs for name in one.columns} - set(log.columns)):
@@ -231,6 +235,7 @@ class _Fields:
     inputs: list[str]
     units: dict[str, str]
     heading: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def _from_messages(tables: Sequence[Table], options: LogOptions) -> _Fields:
@@ -249,7 +254,7 @@ def _from_messages(tables: Sequence[Table], options: LogOptions) -> _Fields:
         return candidates[0] if candidates else None
 
     up = field_of("position.z", "z")
-    flat = up is None or float(np.nanstd(up[0].columns[up[1]])) < 1e-3
+    flat = up is None or _is_flat(up[0].columns[up[1]])
     wanted = [(axis, "m", f"position.{axis}") for axis in (AXES[:2] if flat else AXES)]
     wanted += [("heading", "rad", "yaw")] if flat else []
     wanted += [(name, unit, quantity) for quantity, (name, unit) in (STATES if flat else SPACE).items()]
@@ -281,9 +286,13 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
             f"the position columns `x` and `y` are missing; the columns are: {', '.join(table.columns)}. Name them "
             "with --map x=COLUMN y=COLUMN"
         )
+    flat = axes.pop("z") if "z" in axes and "z" not in chosen and _is_flat(table.columns[axes["z"]]) else ""
+    notes = (f"left out, as it changes by less than a millimetre: {flat}",) if flat else ()
     positions = [axes[axis] for axis in AXES if axis in axes]
     # Those who name columns name all that matter.
-    names = [*positions, *(n for n in chosen if n not in positions)] if chosen else list(table.columns)
+    names = (
+        [*positions, *(n for n in chosen if n not in positions)] if chosen else [n for n in table.columns if n != flat]
+    )
     places: Places = {name: (table, chosen.get(name, name)) for name in names}
     places = {name: place for name, place in places.items() if np.isfinite(table.columns[place[1]]).any()}
     known = {name: values[np.isfinite(values)] for name, (t, c) in places.items() for values in (t.columns[c],)}
@@ -291,7 +300,13 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
         name for name in places if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
     ]
     places, units = _in_si(places, options)
-    return _Fields(places, positions, inputs, units)
+    return _Fields(places, positions, inputs, units, notes=notes)
+
+
+def _is_flat(z: Array) -> bool:
+    """Return whether a robot stays in the plane, by its z."""
+    known = z[np.isfinite(z)]
+    return len(known) > 0 and float(known.std()) < FLAT
 
 
 def _in_si(places: Places, options: LogOptions) -> tuple[Places, dict[str, str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as arrow
 import pyarrow.parquet as parquet
 
-from brakeline.deploy.data.sources.source_table import Array, Table
+from brakeline.deploy.data.sources.source_table import Array, Table, natural_order
 from brakeline.errors import NoSource
 
 ENDING = ".parquet"
@@ -46,7 +46,7 @@ def files_of(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     files = [file for file in path.rglob(f"*{ENDING}") if file.is_file() and not file.name.startswith(("_", "."))]
-    return sorted(files, key=lambda file: [(len(part), part) for part in re.split(r"(\d+)", str(file))])
+    return sorted(files, key=natural_order)
 
 
 def _columns(file: Path) -> dict[str, Array]:

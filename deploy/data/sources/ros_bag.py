@@ -19,7 +19,7 @@ from rosbags.typesys.store import Typestore
 from brakeline.deploy.data.sources.bag_storage import ROS1, BagContents, BagTopic, stored_messages
 from brakeline.deploy.data.sources.message_tables import Columns, MessageKind, MessageTables
 from brakeline.deploy.data.sources.quantity_names import AXES
-from brakeline.deploy.data.sources.source_table import Table
+from brakeline.deploy.data.sources.source_table import Table, natural_order
 from brakeline.errors import NoSource
 
 ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap", ".mcap.zstd")
@@ -113,7 +113,11 @@ def read(path: Path) -> list[Table]:
 
 def files_of(path: Path) -> list[Path]:
     """Return the files of a bag; of a folder those whose names end as those of a bag."""
-    return [path] if path.is_file() else sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS))
+    return (
+        [path]
+        if path.is_file()
+        else sorted((file for file in path.iterdir() if file.name.endswith(ENDINGS)), key=natural_order)
+    )
 
 
 def _add_messages(file: Path, messages: MessageTables, contents: BagContents) -> None:

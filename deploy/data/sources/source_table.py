@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +53,11 @@ class Table:
             )
         new = np.diff(time, prepend=-np.inf) > 0.0  # the first of several samples at the same time
         return time[new], values[new]
+
+
+def natural_order(file: Path) -> list[tuple[int, str]]:
+    """Return the key by which files are sorted, part-2 before part-10."""
+    return [(len(part), part) for part in re.split(r"(\d+)", str(file))]
 
 
 def notes_of(tables: Sequence[Table]) -> tuple[str, ...]:

@@ -96,13 +96,16 @@ def _on_recorder_clock(table: Table, path: Path) -> Table:
     stamps = next((unit * table.columns[name] for name, unit in VEHICLE_STAMPS.items() if name in table.columns), None)
     if stamps is None or len(table.time) < 2:
         return table
-    restarts = np.flatnonzero(np.diff(stamps) < -RESTART) + 1
+    restarts = np.flatnonzero((np.diff(stamps) < -RESTART) | (np.diff(table.run) != 0)) + 1
     parts = zip(np.split(table.time, restarts), np.split(stamps, restarts), strict=True)
     time = np.concatenate([_dated(received, stamps) for received, stamps in parts])
     order = np.argsort(time, kind="stable")
     columns = {name: values[order] for name, values in table.columns.items()}
     note = f"{path}: the stamps of {table.name} step back {len(restarts)} times: the parts are dated one by one"
-    return replace(table, time=time[order], columns=columns, notes=(*table.notes, *[note] * bool(len(restarts))))
+    run = table.run[order]
+    return replace(
+        table, time=time[order], columns=columns, run=run, notes=(*table.notes, *[note] * bool(len(restarts)))
+    )
 
 
 def _dated(received: Array, stamps: Array) -> Array:

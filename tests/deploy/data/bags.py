@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from tests.deploy.data.porter import COLUMNS
 
+ODOMETRY = {"/odom": 0.0}
 EPOCH = 1_760_000_000_123_456_789  # ns
 
 
@@ -42,11 +43,11 @@ def write_json_lines(path, time, values):
     return path
 
 
-def write_bag(path, time, values, storage=StoragePlugin.SQLITE3):
+def write_bag(path, time, values, storage=StoragePlugin.SQLITE3, odometry=ODOMETRY):
     """A ROS 2 bag."""
     types = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(path, version=9, storage_plugin=storage) as bag:
-        write_messages(bag, types, types.serialize_cdr, time, values)
+        write_messages(bag, types, types.serialize_cdr, time, values, odometry)
     return path
 
 
@@ -61,8 +62,11 @@ def write_ros1_bag(path, time, values, compression=None):
     return path
 
 
-def write_messages(bag, types, serialize, time, values):
-    """/odom with a header, /cmd_vel without; positions in the world, velocities of the body."""
+def write_messages(bag, types, serialize, time, values, odometry=ODOMETRY):
+    """/odom with a header, /cmd_vel without; positions in the world, velocities of the body.
+
+    odometry: topics of odometry, and how far x is off in each [m].
+    """
 
     def kind(name):
         return types.types[name.replace("/", "/msg/")]
@@ -71,10 +75,10 @@ def write_messages(bag, types, serialize, time, values):
         kind(f"geometry_msgs/{name}") for name in ("Vector3", "Quaternion", "Point", "Pose", "Twist")
     )
     posed, twisted = (kind(f"geometry_msgs/{name}WithCovariance") for name in ("Pose", "Twist"))
-    odometry, text = kind("nav_msgs/Odometry"), kind("std_msgs/String")
+    state, text = kind("nav_msgs/Odometry"), kind("std_msgs/String")
     header, stamp, none = kind("std_msgs/Header"), kind("builtin_interfaces/Time"), np.zeros(36)
     first = {"seq": 7} if "seq" in header.__dataclass_fields__ else {}  # of ROS 1
-    kinds = {"/odom": odometry, "/cmd_vel": twist, "/chatter": text}
+    kinds = {**dict.fromkeys(odometry, state), "/cmd_vel": twist, "/chatter": text}
     topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=types) for name, kind in kinds.items()}
 
     def write(topic, message, at):
@@ -87,8 +91,9 @@ def write_messages(bag, types, serialize, time, values):
         q = quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
         moved = twisted(twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w)), none)
         stamped = header(**first, stamp=stamp(*divmod(now, 1_000_000_000)), frame_id="odom")
-        message = odometry(stamped, "base_link", posed(pose(point(x, y, 0.0), q), none), moved)
-        write("/odom", message, now + 3_000_000)  # received a little later
+        for topic, off in odometry.items():
+            message = state(stamped, "base_link", posed(pose(point(x + off, y, 0.0), q), none), moved)
+            write(topic, message, now + 3_000_000)  # received a little later
         if (speed, turn) != last or round(t / 0.02) % 5 == 0:
             write("/cmd_vel", twist(vector(speed, 0.0, 0.0), vector(0.0, 0.0, turn)), now)
             last = speed, turn

@@ -63,6 +63,49 @@ def test_every_format_of_the_same_drive_is_the_same_data(driven, from_csv, tmp_p
     same(from_csv, import_sources([write(tmp_path, *driven)], porter()).data, within)
 
 
+@pytest.mark.parametrize("source", ["sqlite bag", "mcap bag", "ROS 1 bag", "rover's log", "rover's log as text"])
+def test_a_clock_that_begins_again_cuts_messages_as_it_cuts_columns(driven, tmp_path, source):
+    time, values = driven[0][:2000].copy(), driven[1][:2000]
+    time[1000:] -= time[1000]
+    columns = import_sources([write_csv(tmp_path / "drive.csv", time, values)], porter())
+    write, within = SOURCES[source]
+    messages = import_sources([write(tmp_path, time, values)], porter())
+    same(columns.data, messages.data, within)
+    assert any("time steps back by 19.98 s" in note and "cut there" in note for note in messages.report.notes)
+
+
+def test_the_files_of_a_bag_are_read_in_the_order_of_their_numbers(driven, tmp_path):
+    time, values = driven[0][:1200], driven[1][:1200]
+    whole = tables_of(write_bag(tmp_path / "whole", time, values))
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for i, rows in enumerate(np.array_split(np.arange(1200), 12)):
+        write_bag(tmp_path / f"part{i}", time[rows], values[rows])
+        (tmp_path / f"part{i}" / f"part{i}.db3").rename(folder / f"split_{i}.db3")
+    parts = tables_of(folder)
+    (one,), (other,) = ([t for t in tables if t.name == "/odom"] for tables in (whole, parts))
+    assert np.array_equal(one.time, other.time) and not np.any(other.run) and not other.notes
+
+
+def test_one_of_several_odometries_is_taken_the_others_are_named_and_can_be_chosen(driven, tmp_path):
+    topics = {"/odom_noisy": 0.3, "/odom": 0.0, "/odom_kf": 0.1}
+    path = write_bag(tmp_path / "three", driven[0][:2000], driven[1][:2000], odometry=topics)
+    said = "from /odom; /odom_noisy, /odom_kf also hold them (choose with --topics /odom_noisy)"
+    plain = import_sources([path], porter())
+    assert any(said in note for note in plain.report.notes), plain.report.notes
+    mapped = LogOptions(fields={name: f"/odom_kf/position.{name}" for name in "xy"})
+    for options, off in ((LogOptions(topics=("/odom_kf",)), 0.1), (mapped, 0.1)):
+        chosen = import_sources([path], porter(), options).data.trajectories[0]
+        assert np.allclose(chosen.states - plain.data.trajectories[0].states, [off, 0.0, 0.0, 0.0, 0.0])
+    toml = tmp_path / "a.toml"
+    assert main(["robot", "new", str(toml), "--from", str(path)]) == 0
+    assert said in toml.read_text()
+    places = ("x=/odom_kf/position.x", "y=/odom_kf/position.y")
+    toml.unlink()
+    assert main(["robot", "new", str(toml), "--from", str(path), "--map", *places]) == 0
+    assert "x, y: from /odom_kf; /odom_noisy, /odom also hold them" in toml.read_text()
+
+
 # --- periods out of columns --------------------------------------------------------------------------------------
 
 

@@ -349,3 +349,28 @@ def test_the_fields_of_exported_messages_are_the_coordinates(driven, plain, tmp_
     path.write_text(path.read_text().replace(",speed,turn rate\n", ",cmd v,cmd w\n", 1))
     places = ("--map", "v=speed", "w=turn rate", "speed=cmd v", "turn rate=cmd w")
     same(plain, imported(path, *places), 1e-5)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_odometry_with_covariances_becomes_a_description(driven, tmp_path, capsys, flat):
+    """A base writes z as noise of a nanometre. A camera in space estimates no speeds, and writes zeros."""
+    time, values = (part[:600] for part in driven)
+    rng, pose, twist = np.random.default_rng(0), ".pose.pose.", ".twist.twist."
+    names = [f"{pose}position.{axis}" for axis in "xyz"] + [f"{pose}orientation.{part}" for part in "xyzw"]
+    names += [f"{twist}linear.x", f"{twist}angular.z"] + [f".pose.covariance{k}" for k in range(6)]
+    lines = [",".join(["%time", ".header.seq", *names])]
+    for row, (t, (x, y, heading, v, w, *_)) in enumerate(zip(time, values, strict=True)):
+        turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
+        z, speeds = (1e-10 * rng.normal(), (v, w)) if flat else (0.3 * math.sin(t), (0.0, 0.0))
+        numbers = (x, y, z, *turned, *speeds, *rng.uniform(0.0, 0.01, 6))
+        lines.append(",".join([f"{EPOCH * 10**9 + round(1e9 * t)}", str(row), *map(repr, map(float, numbers))]))
+    path, out = tmp_path / "odom.csv", tmp_path / "odom.toml"
+    path.write_text("\n".join(lines) + "\n")
+    assert main(["robot", "new", str(out), "--from", str(path)]) == 0
+    assert f"as {'it changes by less than a millimetre: z' if flat else 'they never change: '}" in out.read_text()
+    states = [
+        "x [m]",
+        "y [m]",
+        *(["heading [rad]", "speed [m/s]", "turn rate [rad/s]"] if flat else ["z [m]", "heading [1]"]),
+    ]
+    assert [*robot_named(str(out)).state] == states
