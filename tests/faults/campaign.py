@@ -23,6 +23,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
+from threading import Timer
 from typing import Any
 
 from benchmarks.timing import Figures
@@ -66,17 +67,17 @@ class Leg:
 
     def group(self, most: int) -> str:
         """Make some faults at a time, undo them, and return their descriptions."""
-        said, undo = [], []
+        said, timers = [], []
         for _ in range(min(self.random.randint(1, MOST_AT_ONCE), most)):
             kind = self.random.choice(KINDS)
             self.counts[kind] += 1
             text, seconds, back = getattr(self, f"_{kind.replace(' ', '_')}")()
             said.append(text)
-            undo.append((time.monotonic() + seconds, back))
+            timers.append(Timer(seconds, back))
+            timers[-1].start()
             time.sleep(self.random.uniform(0.0, STAGGER))
-        for at, back in sorted(undo, key=lambda item: item[0]):
-            time.sleep(max(0.0, at - time.monotonic()))
-            back()
+        for timer in timers:
+            timer.join()
         return ", ".join(said)
 
     def _kill(self) -> tuple[str, float, Callable[[], None]]:
@@ -140,24 +141,26 @@ class Leg:
         whole, output = self._flip(path), self.fleet.folder / f"{name}.out"
         before = output.stat().st_size if output.exists() else 0
         self.fleet.launch(name)
-        popen = self.fleet.spots[name].popen
-        assert popen is not None
-        deadline, said, ended = time.monotonic() + PATIENCE, "", False
-        while not ended and time.monotonic() < deadline and not any(word in said for word in STARTED):
+        deadline, spot = time.monotonic() + PATIENCE, self.fleet.spots[name]
+        said, refused, started = "", False, False
+        while not (refused or started) and time.monotonic() < deadline:
             time.sleep(TURN)
-            ended = popen.poll() is not None  # before the output is read, so that its last words are
+            ended = not spot.alive  # before the output is read, so that its last words are
             with output.open("rb") as file:
                 file.seek(before)
                 said = file.read().decode(errors="replace")
-        refused = popen.poll() not in (None, 0) and (path.stem in said or path.name in said)
+            started = any(word in said for word in STARTED)
+            refused = ended and not spot.done and (path.stem in said or path.name in said)
+            if ended and not refused:
+                self.fleet.keep()  # other faults kept it from the file: start it again, as a container engine does
         # A space, or a letter of a hexadecimal number: the signature or the number is the same.
-        same = path.suffix in (".seal", "") and any(word in said for word in STARTED)
+        same = path.suffix in (".seal", "") and started
         if not (refused or same):
-            print(f"{name} did not name {path.name} (status {popen.poll()}): {said}", file=sys.stderr, flush=True)
+            print(f"{name} did not name {path.name}: {said}", file=sys.stderr, flush=True)
         self.damages.append(Damage(path, lambda: refused or same))
         self.counts["damaged file, the same in meaning"] += same
         self._end(name)
-        path.write_bytes(whole)
+        _overwrite(path, whole)
         return f"a bit of {path.name}, which {name} reads", 0.0, lambda: None
 
     def _end(self, name: str) -> None:
@@ -170,9 +173,14 @@ class Leg:
         place = self.random.randrange(len(whole))
         flipped = bytearray(whole)
         flipped[place] ^= 1 << self.random.randrange(8)
-        with path.open("r+b") as file:
-            file.write(flipped)
+        _overwrite(path, flipped)
         return whole
+
+
+def _overwrite(path: Path, data: bytes) -> None:
+    """Write as many bytes as the file has, in place: its disk may be full."""
+    with path.open("r+b") as file:
+        file.write(data)
 
 
 CLOCKS_OF_ALL = {host: CLOCKS.get(host, 0.0) for host in range(1, 6)}
