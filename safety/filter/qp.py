@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 ROW_TIGHTENING = 1e-6  # m by which the QP's rows are tighter, so that a rounded answer passes the exact check
-REGULARIZATION = 1e-4  # ε: weight of all other variables; with much less the solver needs thousands of iterations
+REGULARIZATION = 1e-4  # ε: weight of all other variables
 ROUNDING = 1e-12  # of a unit row of W: a row with smaller entries for f does not depend on f
 
 
@@ -59,12 +59,12 @@ class ObstacleRows:
         extra = L + np.concatenate([at_start, at_start, [N]])  # the chord deviations, then the stopping distance
         columns = np.ascontiguousarray(np.argsort(~used, axis=1, kind="stable")[:, :most])
         end_directions = np.ascontiguousarray(np.take_along_axis(directions, columns[:, None, :], axis=2))
-        self._ends: tuple[Index, Index, Array, Index, Index] = end, period, end_directions, columns, extra
+        self.ends: tuple[Index, Index, Array, Index, Index] = end, period, end_directions, columns, extra
         self._sizes = L + N + 1
 
     def rows(self, center: Center, normals: Array, offsets: Array, widening: float) -> ConstraintRows:
         """Return rows for half-spaces `a·p <= b` in the robot's frame, a (n, N, d), b (n, N)."""
-        parts = *center, *self._ends
+        parts = *center, *self.ends
         return ConstraintRows(*halfspace_kernels.rows(normals, offsets, *parts, self._sizes, widening))
 
     def slack(self, center: Center, normals: Array, offsets: Array, sizes: Array, z: Array) -> Array:
@@ -72,7 +72,7 @@ class ObstacleRows:
 
         This is faster than building the rows: there may be hundreds, each as wide as the tube has generators.
         """
-        parts = *center, *self._ends
+        parts = *center, *self.ends
         return halfspace_kernels.slack(normals, offsets, *parts, sizes, z)
 
 
@@ -84,8 +84,7 @@ class QPBuilder:
         min ‖f_0 - r‖² + REGULARIZATION (‖f_1 ..‖² + ‖t‖²)      each in units of its range
         s.t. gradient z + spread (M t + ...) <= bound,   ±(W z) <= t,   low <= f <= high,   |f_k - f_{k-1}| <= slew
 
-    Variables are in units of their range (`scale`) and rows have unit length: without that, one problem in a hundred
-    took ten milliseconds.
+    Variables are in units of their range (`scale`) and rows have unit length, so that one tolerance fits all rows.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
@@ -156,9 +155,7 @@ class QPBuilder:
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
         fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        return QuadraticProgram(
-            self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]), len(fixed)
-        )
+        return QuadraticProgram(self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]))
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Return center and half-widths (F·m,) of the free inputs within bounds and slew after `before` (m,)."""
