@@ -22,6 +22,7 @@ from rich.console import Console
 from benchmarks import (
     askers,
     autopilot_conformance,
+    batch_decide,
     costs,
     decide,
     driving_groups,
@@ -86,6 +87,7 @@ class Benchmark:
 
 BENCHMARKS = {
     "decide": Benchmark(decide, lambda _: decide.run()),
+    "batch": Benchmark(batch_decide, lambda _: batch_decide.run()),
     "perception": Benchmark(perception_cost, lambda _: perception_cost.run()),
     "solvers": Benchmark(solvers, lambda _: solvers.run()),
     "reachability": Benchmark(reachability, lambda _: reachability.run()),

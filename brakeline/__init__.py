@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from brakeline.messaging.scan import Scan
     from brakeline.messaging.task import RobotWithTask, Task, robot_with_task
     from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
+    from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+    from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
+    from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
     from brakeline.safety.filter.filter import Filter
     from brakeline.safety.filter.request import Decision, Request
     from brakeline.safety.gym import SafetyWrapper
@@ -64,6 +67,9 @@ PLACES = {
     "brakeline.messaging.scan": ("Scan",),
     "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
     "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
+    "brakeline.safety.filter.batch.decision_arrays": ("DecisionArrays",),
+    "brakeline.safety.filter.batch.obstacle_arrays": ("ObstacleArrays",),
+    "brakeline.safety.filter.batch.request_arrays": ("PastArrays", "PredictionArrays", "RequestArrays"),
     "brakeline.safety.filter.filter": ("Filter",),
     "brakeline.safety.filter.request": ("Decision", "Request"),
     "brakeline.safety.gym": ("SafetyWrapper",),
@@ -82,10 +88,11 @@ _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 # fmt: off
 __all__ = [
     "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan", "BadShape", "BusError",
-    "BusSettings", "Dataset", "Decision", "Disc", "ErrorBoundError", "Filter", "FilterClient", "FleetClient",
-    "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion", "NoReply", "Obstacle", "Prediction",
-    "RangeImage", "Refused", "Request", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper",
-    "Scan", "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__",
+    "BusSettings", "Dataset", "Decision", "DecisionArrays", "Disc", "ErrorBoundError", "Filter", "FilterClient",
+    "FleetClient", "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion", "NoReply", "Obstacle",
+    "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage", "Refused", "Request",
+    "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper", "Scan", "Shapes", "Task",
+    "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__",
     "filled", "fit_model_set", "memory_of", "robot_named", "robot_with_task", "validate",
 ]
 # fmt: on

@@ -12,9 +12,12 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter_ns
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +52,14 @@ from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
 from brakeline.safety.perception.scan_free_space import shows_free
 
+if TYPE_CHECKING:
+    from brakeline.safety.filter.batch.batch_filter import BatchFilter
+    from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+    from brakeline.safety.filter.batch.request_arrays import RequestArrays
+
 Array = NDArray[np.float64]
 
+WORTH_A_BATCH = 64  # requests; fewer are decided sooner one by one
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -181,6 +190,52 @@ class Filter:
             if in_domain and not blind and request.reservation is None:  # other robots rely on the reservation
                 candidate = self._recovered(request, local_map, z_0) or candidate
         return self._decision(request, local_map, candidate, record)
+
+    @cached_property
+    def _batch(self) -> BatchFilter:
+        from brakeline.safety.filter.batch.batch_filter import BatchFilter  # few callers need it
+
+        return BatchFilter(self)
+
+    def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
+        """Decide on many requests at once: arrays in, arrays out, with the batch first.
+
+        Every decision is of the kind that `decide` gives, and its inputs differ by less than 1e-6. The batch verifies
+        its plans with the same tubes and half-spaces, and leaves to `decide` what it does not cover or what rounding
+        could turn (docs/performance.md). The arrays may be NumPy's, or torch tensors on any device; the answers are of
+        the same namespace and on the same device.
+
+        >>> from brakeline import Filter, Obstacle, ObstacleArrays, RequestArrays, Shapes
+        >>> ground, rows = Filter.load("ground"), 2
+        >>> wall = Shapes.of([Obstacle("box", (0.25, 0.0), (0.2, 2.0))], dim=2)
+        >>> answers = ground.decide_batch(RequestArrays(
+        ...     state=np.zeros((rows, 5)), action=np.tile([0.25, 0.0], (rows, 1)), input_in_force=np.zeros((rows, 2)),
+        ...     plan=np.zeros((rows, 3, 2)), obstacles=ObstacleArrays.of([wall, Shapes.of([], dim=2)]),
+        ...     known_free=np.ones(rows, dtype=bool)))
+        >>> [answers.row(row).kind for row in range(rows)], answers.plan.shape
+        (['adjusted', 'allowed'], (2, 3, 2))
+
+        Raises:
+            BadRequest: an array has the wrong shape, or a row is not valid; the error names the field and the row.
+        """
+        return self._batch.decide(requests)
+
+    def decide_all(self, requests: Sequence[Request]) -> list[Decision]:
+        """Decide on several requests, in their order: many at once if there are enough of them, else one by one.
+
+        Raises:
+            BadRequest: as `decide`.
+        """
+        from brakeline.safety.filter.batch.request_arrays import RequestArrays
+
+        fitting = [i for i, request in enumerate(requests) if RequestArrays.fits(request, self.ordinary)]
+        if len(fitting) < WORTH_A_BATCH or not self._batch.covers:
+            return [self.decide(request) for request in requests]
+        for i in fitting:
+            check_surroundings(self.robot, requests[i])
+        answers = self.decide_batch(RequestArrays.of([requests[i] for i in fitting]))
+        decided = {i: answers.row(row) for row, i in enumerate(fitting)}
+        return [decided[i] if i in decided else self.decide(request) for i, request in enumerate(requests)]
 
     def _committed(
         self, request: Request, local_map: LocalMap, z_0: Array, record: DecisionRecord, in_domain: bool

@@ -80,9 +80,13 @@ class InProcess:
     def decide_all(self, backup_plans: Sequence[BackupPlan], requests: Sequence[Request]) -> list[Answer]:
         """Decide for several robots of the kind, each with its own backup plan and its `request`.
 
+        The filter decides on many at once (`Filter.decide_all`).
+
         It raises as `decide` does, before it commits to any plan.
         """
-        answers = [Answer.of(self.method.decide(request), self.robot) for request in requests]
+        many = getattr(self.method, "decide_all", None)  # the rivals decide one by one
+        decisions = many(requests) if many else [self.method.decide(request) for request in requests]
+        answers = [Answer.of(decision, self.robot) for decision in decisions]
         for backup_plan, answer in zip(backup_plans, answers, strict=True):
             accept(backup_plan, answer)
         return answers

@@ -1,0 +1,163 @@
+"""`Filter.decide` for thousands of robots at once, on any device of an array namespace.
+
+    batch = BatchFilter(Filter.load("ground"))
+    answers = batch.decide(RequestArrays.of(requests))     # or arrays of your own; torch tensors may lie on a GPU
+
+The batch decides what it can verify as the single path does: proposals and inputs of a QP among obstacles that stand
+still. It leaves every other row to `Filter.decide`: a state outside the recorded domain, a proposal that is not finite,
+a plan that turns in place, a failsafe, a recovery, and every comparison that rounding could turn.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+from typing import TYPE_CHECKING, Any
+
+import array_api_compat
+import numpy as np
+
+from brakeline.errors import BadRequest
+from brakeline.safety.filter.batch.decision_arrays import KINDS, BlockingArrays, DecisionArrays
+from brakeline.safety.filter.batch.lane_decisions import LaneDecisions
+from brakeline.safety.filter.batch.obstacle_arrays import on_host
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.request import Decision
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
+
+Array = Any  # of any namespace
+
+
+class BatchFilter:
+    """Decides batches of requests with one filter. It stores nothing about a robot.
+
+    Attributes:
+        safety: the filter, which is also the single path.
+        covers: whether batches decide for this robot at all. A robot in joint space, with limits or with a feedback
+            has every request decided singly.
+    """
+
+    def __init__(self, safety: Filter) -> None:
+        robot = safety.robot
+        self.safety = safety
+        self.covers = bool(robot.position_dim) and not robot.limits and not robot.feedback
+        self._prepared: dict[tuple[str, str], LaneDecisions] = {}
+
+    def decide(self, requests: RequestArrays) -> DecisionArrays:
+        """Decide on a batch of requests: see `Filter.decide_batch`."""
+        started = perf_counter_ns()
+        xp, device = array_api_compat.array_namespace(requests.state), array_api_compat.device(requests.state)
+        self._check_shapes(requests)
+        answers = _blank(self.safety, requests, xp, device)
+        decided = xp.zeros(len(requests), dtype=xp.bool, device=device)
+        if self.covers and len(requests):
+            key = xp.__name__, str(device)
+            if key not in self._prepared:
+                self._prepared[key] = LaneDecisions(self.safety, xp, device)
+            with np.errstate(all="ignore"):  # lanes that overflow are left to the single path
+                decided = self._prepared[key].decide(requests, answers)
+        singly = {}
+        for row in np.flatnonzero(~on_host(decided)).tolist():
+            try:
+                singly[row] = self.safety.decide(requests.row(row))
+            except BadRequest as error:
+                raise BadRequest(error.field, f"row {row}: {error}") from error
+            _write(answers, row, singly[row], xp, device)
+        time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
+        about = self.safety.version, self.safety.bound, self.safety.model.one_step is not None
+        return DecisionArrays(**answers, singly=singly, obstacles=requests.obstacles, **_about(about), time_ms=time_ms)
+
+    def _check_shapes(self, requests: RequestArrays) -> None:
+        """Check the shapes of all arrays. Raises BadRequest with the field's name."""
+        robot, B = self.safety.robot, len(requests)
+        n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
+        obstacles, K = requests.obstacles, requests.obstacles.rho.shape[1]
+        expected = {
+            "state": (requests.state, (B, n)),
+            "action": (requests.action, (B, m)),
+            "input_in_force": (requests.input_in_force, (B, m)),
+            "plan": (requests.plan, (B, N, m)),
+            "known_free": (requests.known_free, (B,)),
+            "obstacles": (obstacles.center, (B, K, d)),
+            "obstacles.axes": (obstacles.axes, (B, K, d, d)),
+            "obstacles.half": (obstacles.half, (B, K, d)),
+            "obstacles.round": (obstacles.round, (B, K, d)),
+            "obstacles.rho": (obstacles.rho, (B, K)),
+            "obstacles.margin": (obstacles.margin, (B, K)),
+            "obstacles.count": (obstacles.count, (B,)),
+        }
+        if requests.widening is not None:
+            expected["widening"] = requests.widening, (B,)
+        if (predicted := requests.predicted) is not None:
+            expected["predicted_center"] = predicted.center, (B, n)
+            expected["predicted_half_width"] = predicted.half_width, (B, n)
+            expected["predicted_heading"] = predicted.heading, (B,)
+            expected["predicted"] = predicted.given, (B,)
+        if (past := requests.past) is not None:
+            expected["past"] = past.states, (B, N, n)
+            expected["past.inputs"] = past.inputs, (B, N + 1, m)
+            expected["past.given"] = past.given, (B,)
+        for name, (value, shape) in expected.items():
+            if tuple(value.shape) != shape:
+                raise BadRequest(name, f"{name} has shape {tuple(value.shape)}, a batch of {B} requests has {shape}")
+        counts = on_host(obstacles.count)
+        if counts.size and not (counts.min() >= 0 and counts.max() <= K):
+            raise BadRequest("obstacles.count", f"a row has from 0 to {K} obstacles")
+        if not isinstance(requests.model, str) and len(requests.model) != B:
+            raise BadRequest("model", f"model has {len(requests.model)} versions, a batch of {B} requests has {B}")
+
+
+def _about(about: tuple[str, float | None, bool]) -> dict[str, Any]:
+    return dict(zip(("model", "bound", "judges"), about, strict=True))
+
+
+def _blank(safety: Filter, requests: RequestArrays, xp: Any, device: Any) -> dict[str, Any]:
+    """Return the arrays of a `DecisionArrays` without answers."""
+    robot, B = safety.robot, len(requests)
+    n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
+    shapes = {
+        "plan": (N, m),
+        "tube_center": (N, d),
+        "tube_half_width": (N, d),
+        "predicted_center": (n,),
+        "predicted_half_width": (n,),
+        "predicted_heading": (),
+        "margin": (),
+        "score": (),
+        "proposal_margin": (),
+    }
+    arrays: dict[str, Any] = {
+        name: xp.full((B, *shape), xp.nan, dtype=xp.float64, device=device) for name, shape in shapes.items()
+    }
+    for name in ("at_least", "verified", "contained", "compared", "for_clearance", "scored"):
+        arrays[name] = xp.zeros(B, dtype=xp.bool, device=device)
+    arrays["kind"] = xp.full(B, KINDS.index("failsafe"), dtype=xp.int64, device=device)
+    arrays["steps"] = xp.zeros(B, dtype=xp.int64, device=device)
+    blank = {name: xp.full((B, d), xp.nan, dtype=xp.float64, device=device) for name in ("normal", "at")}
+    alone = {name: xp.full(B, xp.nan, dtype=xp.float64, device=device) for name in ("room", "after")}
+    arrays["blocked"] = BlockingArrays(xp.full(B, -1, dtype=xp.int64, device=device), **alone, **blank)
+    return arrays
+
+
+def _write(answers: dict[str, Any], row: int, decision: Decision, xp: Any, device: Any) -> None:
+    """Write a decision of the single path into its row."""
+    predicted = decision.predicted
+    values = {
+        "plan": decision.plan,
+        "tube_center": decision.tube_center,
+        "tube_half_width": decision.tube_half_width,
+        "predicted_center": predicted.center,
+        "predicted_half_width": predicted.half_width,
+        "predicted_heading": predicted.heading,
+        "margin": decision.margin,
+        "score": np.nan if decision.score is None else decision.score,
+    }
+    for name, value in values.items():
+        answers[name][row] = xp.asarray(np.asarray(value, dtype=float), device=device)
+    for name in ("at_least", "verified", "contained", "compared"):
+        answers[name][row] = getattr(decision, name)
+    answers["for_clearance"][row] = bool(decision.for_clearance)
+    answers["scored"][row] = decision.score is not None
+    answers["kind"][row] = KINDS.index(decision.kind)
+    answers["steps"][row] = decision.iterations

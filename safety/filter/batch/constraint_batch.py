@@ -1,0 +1,200 @@
+"""A tube and the rows that the obstacles of a batch add to it: `TubeConstraints` for many robots; the batch is last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from brakeline.safety.filter.batch.batch_tube import PathBatch, TubeBatch
+from brakeline.safety.filter.batch.obstacle_arrays import Axes, NearObstacles
+from brakeline.safety.filter.batch.plane_batch import EndBatch, PlaneBatch, planes_beside
+from brakeline.safety.filter.constraints import TubeConstraints
+
+Array = Any  # of any namespace
+
+
+@dataclass(frozen=True)
+class SceneBatch:
+    """The surroundings of each robot of a batch: `LocalMap` for obstacles that stand still.
+
+    Attributes:
+        start: per axis (B,), world. turn: turn[j][i] (B,), entry (j, i) of the rotation from the robot's frame.
+        near: the obstacles within reach.
+        beyond (B,) [m]: the distance below which the request names no further obstacle, at most the sensor's range.
+        widening, reach (B,): factor on every set, and radius of the map [m].
+        far (B,): a tube may leave the sensor's range.
+    """
+
+    start: Axes
+    turn: list[Axes]
+    near: NearObstacles
+    beyond: Array
+    widening: Array
+    reach: Array
+    far: Array
+
+    def take(self, xp: Any, lanes: Array) -> SceneBatch:
+        def picked(part: Array) -> Array:
+            return xp.take(part, lanes, axis=-1)
+
+        start, turn = [picked(axis) for axis in self.start], [[picked(part) for part in row] for row in self.turn]
+        rest = (picked(part) for part in (self.beyond, self.widening, self.reach, self.far))
+        return SceneBatch(start, turn, self.near.take(xp, lanes), *rest)
+
+
+@dataclass(frozen=True)
+class PlanBatch:
+    """A batch of plans with their tubes and the half-spaces around them.
+
+    Attributes:
+        z (nz, B): regressors. path: predicted centers. sizes (L+N+1, B): magnitudes with widening.
+        planes: the half-spaces, for each disc of the body.
+        slack (R, B) [m]: what the rows of all half-spaces leave.
+        extent (B,) [m]: distance from the measured position to the farthest point of the body in the tube.
+    """
+
+    z: Array
+    path: PathBatch
+    sizes: Array
+    planes: list[PlaneBatch]
+    slack: Array
+    extent: Array
+
+
+class ConstraintBatch:
+    """The constraints of a tube, in a namespace and on a device. The arguments `scene` belong to the same lanes."""
+
+    def __init__(self, constraints: TubeConstraints, constant: Any, xp: Any) -> None:
+        robot, tube = constraints.robot, constraints.tube
+        self._xp, self.d, self.N, self.L = xp, robot.position_dim, tube.horizon, tube.generators
+        self.tube = TubeBatch(tube, robot.state_dim, constant, xp)
+        self.measured = constraints.measured.tolist()
+        self.body, self.sight, self.widest = constraints.body, robot.sight, constraints.widest
+        self.base_reach, self.base_far = constraints.reach, constraints.far
+        self.discs = []
+        for disc in constraints.discs:
+            at = disc.at.tolist() if disc.aside else None
+            first = 0 if disc.among is None else self.d + disc.among.start
+            measured = [part + disc.swing for part in self.measured]
+            self.discs.append((at, disc.radius, measured, first, EndBatch(disc.layout.ends, constant, xp)))
+        spans = np.abs(tube.directions)
+        self._spans = constant(spans.reshape(-1, self.L))
+        self._directions = [constant(np.ascontiguousarray(tube.directions[:, i, :, None])) for i in range(self.d)]
+
+    # --- one batch of plans ----------------------------------------------------------------------------------------
+
+    def around(self, scene: SceneBatch, z: Array) -> PlanBatch:
+        """Return the plans with regressors z (nz, B), with the half-spaces around them."""
+        path, sizes = self.tube.path(z), self.tube.sizes(z, scene.widening)
+        planes = self._planes(scene, path)
+        return PlanBatch(z, path, sizes, planes, self.slack(planes, path, sizes), self.extent(scene, path, sizes))
+
+    def moved_to(self, scene: SceneBatch, plan: PlanBatch, z: Array) -> PlanBatch:
+        """Return the plans with regressors z (nz, B), with the half-spaces of other plans."""
+        path, sizes = self.tube.path(z), self.tube.sizes(z, scene.widening)
+        slack = self.slack(plan.planes, path, sizes)
+        return PlanBatch(z, path, sizes, plan.planes, slack, self.extent(scene, path, sizes))
+
+    def _planes(self, scene: SceneBatch, path: PathBatch) -> list[PlaneBatch]:
+        found = []
+        for at, radius, measured, first, _ in self.discs:
+            centers = [path.outputs[:, first + i] for i in range(self.d)]
+            nominal = [sum(scene.turn[j][i] * centers[i] for i in range(self.d)) for j in range(self.d)]
+            start = scene.start
+            if at is not None:
+                start = [start[j] + sum(scene.turn[j][i] * at[i] for i in range(self.d)) for j in range(self.d)]
+            found.append(planes_beside(self._xp, scene.near, start, nominal, scene.turn, radius, measured))
+        return found
+
+    def slack(self, planes: list[PlaneBatch], path: PathBatch, sizes: Array) -> Array:
+        """Return what the half-spaces leave to tubes (R, B), R = ends · obstacles · discs."""
+        parts = []
+        for (*_, first, ends), plane in zip(self.discs, planes, strict=True):
+            positions = [path.outputs[:, first + i] for i in range(self.d)]
+            part = ends.slack(plane, positions, path.stretch, sizes)
+            parts.append(self._xp.reshape(part, (-1, part.shape[-1])))
+        return parts[0] if len(parts) == 1 else self._xp.concat(parts)
+
+    def extent(self, scene: SceneBatch, path: PathBatch, sizes: Array) -> Array:
+        """Return the distances (B,) [m] that no point of the body exceeds from its start."""
+        xp, L = self._xp, self.L
+        width = xp.reshape(self._spans @ sizes[:L], (self.N, self.d, -1)) * path.stretch[:, None]
+        corner = xp.abs(path.outputs[:, : self.d]) + width
+        farthest = xp.sqrt(xp.max(xp.sum(corner * corner, axis=1), axis=0))
+        return farthest + self.body + xp.max(sizes[L:], axis=0)
+
+    def least(self, scene: SceneBatch, slack: Array, extent: Array, nearer: float = 0.0) -> Array:
+        """Return the smallest slack (B,), limited to ± the reach (less `nearer`). NaN counts as the worst."""
+        xp, most = self._xp, scene.reach - nearer
+        margin = most if not slack.shape[0] else xp.minimum(most, xp.min(slack, axis=0))
+        margin = xp.where(scene.far, xp.minimum(margin, most - extent), margin)
+        return xp.where(margin >= -scene.reach, margin, -scene.reach)  # false for NaN
+
+    def sets(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
+        """Return centers and half-widths (N, d, B), world, of boxes of the true positions at the periods' ends."""
+        xp, d, L = self._xp, self.d, self.L
+        path, sizes = plan.path, plan.sizes[:L]
+        centers, half = [], []
+        for j in range(d):
+            centers.append(scene.start[j] + sum(scene.turn[j][i] * path.outputs[:, i] for i in range(d)))
+            along = sum(scene.turn[j][i] * self._directions[i] for i in range(d))  # (N, L, B)
+            half.append(self.measured[j] + xp.sum(xp.abs(along) * sizes, axis=1) * path.stretch)
+        return xp.stack(centers, axis=1), xp.stack(half, axis=1)
+
+    def surface(
+        self, scene: SceneBatch, plan: PlanBatch, disc: Array, which: Array, end: Array, when: Array
+    ) -> tuple[Array, Array]:
+        """Return the normals (d, B), world, of one half-space for each lane, and its point nearest to the disc's path.
+
+        The half-space is at the surface of the obstacle, without the body's radius. disc, which, end (B,): indices of
+        the disc, the obstacle and the end of a period; when (B,): the period's number.
+        """
+        xp, N, (K, B) = self._xp, self.N, scene.near.rho.shape
+        period = xp.where(end < N, end, xp.minimum(end - N, xp.full_like(end, N - 1)))
+        normal = xp.zeros((self.d, B), dtype=plan.extent.dtype, device=plan.extent.device)
+        at = xp.zeros_like(normal)
+
+        def one(part: Array) -> Array:
+            """Pick the period and the obstacle of each lane from (N, K, B)."""
+            return xp.take_along_axis(xp.reshape(part, (N * K, B)), (period * K + which)[None], axis=0)[0]
+
+        margin = xp.take_along_axis(scene.near.margin, which[None], axis=0)[0]
+        for number, ((offset, radius, measured, first, _), planes) in enumerate(
+            zip(self.discs, plan.planes, strict=True)
+        ):
+            own = [one(part) for part in planes.normals]
+            kept = xp.maximum(radius + margin, xp.zeros_like(margin))
+            level = one(planes.offsets) + kept + sum(abs(own[i]) * measured[i] for i in range(self.d))
+            path = xp.concat([xp.zeros_like(plan.path.outputs[:1]), plan.path.outputs])
+            moved = [xp.take_along_axis(path[:, first + i], when[None], axis=0)[0] for i in range(self.d)]
+            there = [sum(scene.turn[j][i] * moved[i] for i in range(self.d)) for j in range(self.d)]
+            gap = level - sum(own[i] * there[i] for i in range(self.d))
+            for j in range(self.d):
+                start = scene.start[j]
+                if offset is not None:
+                    start = start + sum(scene.turn[j][i] * offset[i] for i in range(self.d))
+                normal[j] = xp.where(disc == number, own[j], normal[j])
+                at[j] = xp.where(disc == number, start + there[j] + own[j] * gap, at[j])
+        return normal, at
+
+    def clear(self, scene: SceneBatch, plan: PlanBatch, margin: Array, empty: Array) -> tuple[Array, Array]:
+        """Return the margins (B,) for a report, and whether each is only a lower bound: `TubeConstraints.clear`."""
+        xp = self._xp
+        most = xp.where(empty, self.sight - self.widest, scene.reach)
+        exact = (margin < scene.reach) & (margin <= scene.beyond - plan.extent)
+        near_ends = scene.far | (margin + self.widest <= scene.reach) | exact
+        at_least = xp.where(scene.far, margin >= scene.reach - plan.extent, ~near_ends)
+        return xp.where(near_ends, margin, xp.minimum(scene.beyond - plan.extent, most)), at_least
+
+
+def taken(xp: Any, part: Any, lanes: Array) -> Any:
+    """Return the lanes of a nested value whose arrays have the batch last; an array for all lanes stays as it is."""
+    if isinstance(part, list):
+        return [taken(xp, one, lanes) for one in part]
+    if isinstance(part, tuple):
+        return type(part)(*(taken(xp, one, lanes) for one in part))
+    if hasattr(part, "__dataclass_fields__"):
+        return type(part)(*(taken(xp, getattr(part, f.name), lanes) for f in fields(part)))
+    return part if part.shape[-1] == 1 else xp.take(part, lanes, axis=-1)

@@ -1,0 +1,131 @@
+"""The answers to a batch of requests as arrays, with the batch first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brakeline.safety.filter.backup_plan import Prediction
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host
+from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision
+
+Array = Any  # of any namespace
+
+KINDS = (ALLOWED, ADJUSTED, FAILSAFE, RECOVERING)  # `DecisionArrays.kind` holds their indices
+
+
+@dataclass(frozen=True)
+class BlockingArrays:
+    """The constraints that proposals violated: `BlockingConstraint` for each adjusted row.
+
+    Attributes:
+        obstacle (B,): index among the row's obstacles; -1: the tube leaves the visible space.
+        room, after (B,). normal, at (B, d): NaN where there is no half-space.
+    """
+
+    obstacle: Array
+    room: Array
+    after: Array
+    normal: Array
+    at: Array
+
+
+@dataclass(frozen=True)
+class DecisionArrays:
+    """The answers to a `RequestArrays`, in the namespace and on the device of its arrays.
+
+    >>> from brakeline import Filter, Request, RequestArrays, Shapes
+    >>> stand = np.zeros((3, 2))
+    >>> request = Request(np.zeros(5), [0.2, 0.0], stand[0], stand, Shapes.of([], dim=2), known_free=True)
+    >>> answers = Filter.load("ground").decide_batch(RequestArrays.of([request] * 3))
+    >>> [KINDS[kind] for kind in answers.kind], answers.plan[:, 0].tolist()
+    (['allowed', 'allowed', 'allowed'], [[0.2, 0.0], [0.2, 0.0], [0.2, 0.0]])
+
+    Attributes:
+        kind (B,): index in `KINDS`: 0 allowed, 1 adjusted, 2 failsafe, 3 recovering.
+        plan (B, N, m), tube_center, tube_half_width (B, N, d), margin, verified, at_least, contained, compared (B,):
+            see `Decision`.
+        predicted_center, predicted_half_width (B, n), predicted_heading (B,): the set of the next measured state.
+        for_clearance (B,): see `Decision`; false where that is None.
+        score (B,), scored (B,): see `Decision`; a row that is not scored has no score.
+        steps (B,): of the solver.
+        proposal_margin (B,) [m]: the margin of the proposal; NaN where the single path decided.
+        blocked: what the proposals of adjusted rows violated.
+        singly: the decisions of the rows that the single path decided, by row.
+        obstacles: those of the requests. model, bound, judges: see `Decision`.
+        time_ms: time for the whole batch, divided by its rows.
+    """
+
+    kind: Array
+    plan: Array
+    tube_center: Array
+    tube_half_width: Array
+    predicted_center: Array
+    predicted_half_width: Array
+    predicted_heading: Array
+    margin: Array
+    at_least: Array
+    verified: Array
+    contained: Array
+    compared: Array
+    for_clearance: Array
+    score: Array
+    scored: Array
+    steps: Array
+    proposal_margin: Array
+    blocked: BlockingArrays
+    singly: Mapping[int, Decision]
+    obstacles: ObstacleArrays
+    model: str
+    bound: float | None
+    judges: bool
+    time_ms: float
+
+    def __len__(self) -> int:
+        return int(self.kind.shape[0])
+
+    def row(self, index: int) -> Decision:
+        """Return the decision about one robot, as NumPy arrays."""
+        if index in self.singly:
+            return self.singly[index]
+        kind = KINDS[int(self.kind[index])]
+        adjusted, blocked = kind == ADJUSTED, kind != ALLOWED
+        set_ = (on_host(self.predicted_center[index]), on_host(self.predicted_half_width[index]))
+        reason = f"the proposal's tube comes within {float(self.proposal_margin[index]):.3g} m of the free space's edge"
+        return Decision(
+            kind=kind,
+            plan=on_host(self.plan[index]),
+            tube_center=on_host(self.tube_center[index]),
+            tube_half_width=on_host(self.tube_half_width[index]),
+            predicted=Prediction(*set_, float(self.predicted_heading[index])),
+            margin=float(self.margin[index]),
+            at_least=bool(self.at_least[index]),
+            model=self.model,
+            reason="" if not blocked else reason if adjusted else f"{reason}; no verified input was found",
+            verified=bool(self.verified[index]),
+            contained=bool(self.contained[index]),
+            compared=bool(self.compared[index]),
+            time_ms=self.time_ms,
+            verify_ms=self.time_ms,
+            solver="solved" if adjusted else "infeasible" if blocked else "",
+            iterations=int(self.steps[index]),
+            blocked_by=self._blocking(index) if blocked else None,
+            for_clearance=bool(self.for_clearance[index]) if adjusted else None,
+            bound=self.bound,
+            judges=self.judges,
+            score=float(self.score[index]) if bool(self.scored[index]) else None,
+        )
+
+    def _blocking(self, index: int) -> BlockingConstraint:
+        """Return what the proposal of an adjusted row violated."""
+        blocked = self.blocked
+        obstacle, room, after = (part[index] for part in (blocked.obstacle, blocked.room, blocked.after))
+        by = SIGHT if int(obstacle) < 0 else self.obstacles.of_row(index).kind(int(obstacle))
+        normal, at = on_host(blocked.normal[index]), on_host(blocked.at[index])
+        if not np.isfinite(normal).all():
+            return BlockingConstraint.nowhere(by, float(room), float(after))
+        return BlockingConstraint(by, float(room), float(after), normal, at)

@@ -1,0 +1,335 @@
+"""The decisions of a batch that need no single path, in lanes; the batch is last."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brakeline.safety.filter.backup_plan import SAME_SET
+from brakeline.safety.filter.batch.constraint_batch import PlanBatch, SceneBatch, taken
+from brakeline.safety.filter.batch.decision_arrays import KINDS
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host, within_reach
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.batch.score_batch import ScoreBatch
+from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
+from brakeline.safety.filter.halfspaces import rows_per_obstacle
+from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
+
+Array = Any  # of any namespace
+
+LANES = 512  # rows that a processor works on at once, so that they stay in its cache
+MANY = 8  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
+LANES_ON_DEVICE = 1 << 16
+HUGE = 1e100  # a larger number is left to the single path
+
+
+class LaneDecisions:
+    """Decides with the arrays of a filter, in a namespace and on a device."""
+
+    def __init__(self, safety: Filter, xp: Any, device: Any) -> None:
+        self._xp, self._device, self._robot, self._version = xp, device, safety.robot, safety.version
+        constant = as_constant(xp, device)
+        robot, base = safety.robot, safety.constraints
+        self._search = SearchBatch(safety, constant, xp)
+        self._constraints = self._search.constraints
+        self._clearance, self._reach = safety.clearance_margin, base.reach
+        self._furthest = max(robot.sight, base.reach)
+        self._regressor = constant(np.array(robot.regressor))
+        self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
+        self._domain = constant(safety.domain[:, :, None])
+        self._box = None if safety.in_place is None else constant(safety.in_place[0][:, :, None])
+        self._schedule = constant(safety.inputs.schedule)
+        self._predicts = _NextState(safety, constant, xp)
+        rollout = self._constraints.tube.rollout
+        self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
+        self._lanes = LANES if str(device) == "cpu" else LANES_ON_DEVICE
+
+    def decide(self, requests: RequestArrays, answers: dict[str, Any]) -> Array:
+        """Write what can be decided into `answers`; return which rows that is (B,)."""
+        xp, B = self._xp, len(requests)
+        decided = xp.zeros(B, dtype=xp.bool, device=self._device)
+        rows = xp.nonzero(self._usable(requests))[0]
+        for first in range(0, rows.shape[0], MANY * self._lanes):
+            many = rows[first : first + MANY * self._lanes]
+            lanes, left = self._lanes_of(requests, many), []
+            for part, own in self._sorted(lanes):
+                to = xp.take(many, own, axis=0)
+                done, rest = self._allow(requests, part, to, answers)
+                decided[to[done]] = True
+                left.append(own[rest])
+            open_ = xp.concat(left)
+            if open_.shape[0]:
+                for part, own in self._sorted(lanes.take(xp, open_)):
+                    to = xp.take(many, xp.take(open_, own, axis=0), axis=0)
+                    decided[to[self._adjust(requests, part, to, answers)]] = True
+        return decided
+
+    def _usable(self, requests: RequestArrays) -> Array:
+        """Return which rows (B,) a batch may decide: valid, finite, with known surroundings."""
+        xp, B = self._xp, len(requests)
+        whole = xp.concat(
+            [requests.state, requests.action, requests.input_in_force, xp.reshape(requests.plan, (B, -1))], axis=1
+        )
+        whole = xp.permute_dims(whole, (1, 0))
+        good = xp.all((whole >= self._bounds[0]) & (whole <= self._bounds[1]), axis=0)
+        good &= xp.all(xp.abs(requests.action) < HUGE, axis=1)
+        obstacles = requests.obstacles
+        parts = obstacles.center, obstacles.axes, obstacles.half, obstacles.rho, obstacles.round, obstacles.margin
+        for part in parts:
+            finite = xp.abs(xp.reshape(part, (B, -1))) < HUGE
+            good &= xp.all(finite, axis=1)
+        good &= (obstacles.count > 0) | requests.known_free
+        if requests.widening is not None:
+            good &= (requests.widening >= 1.0) & (requests.widening < HUGE)
+        if (predicted := requests.predicted) is not None:
+            sets = xp.concat([predicted.center, predicted.half_width, predicted.heading[:, None]], axis=1)
+            valid = xp.all(xp.abs(sets) < HUGE, axis=1) & xp.all(predicted.half_width >= 0.0, axis=1)
+            good &= valid | ~predicted.given
+        if (past := requests.past) is not None:
+            window = xp.concat([xp.reshape(past.states, (B, -1)), xp.reshape(past.inputs, (B, -1))], axis=1)
+            good &= xp.all(xp.abs(window) < HUGE, axis=1) | ~past.given
+        return good
+
+    def _lanes_of(self, requests: RequestArrays, rows: Array) -> LaneBatch:
+        """Return the lanes of some rows, with the obstacles within reach."""
+        xp, robot, d, m = self._xp, self._robot, self._robot.position_dim, self._robot.action_dim
+
+        def columns(part: Array) -> Array:
+            part = xp.reshape(xp.take(part, rows, axis=0), (rows.shape[0], -1))
+            return xp.asarray(xp.permute_dims(part, (1, 0)), copy=True)
+
+        state, action, before = (columns(part) for part in (requests.state, requests.action, requests.input_in_force))
+        plan = columns(requests.plan)
+        given = robot.committed_steps * m
+        z_0 = xp.concat([xp.take(state, self._regressor, axis=0), before, plan[:given]])
+        proposal = self._search.limited(action, z_0[z_0.shape[0] - m :])
+        widening = xp.ones_like(state[0]) if requests.widening is None else xp.take(requests.widening, rows, axis=0)
+        reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
+        start = [state[i] for i in range(d)]
+        obstacles = ObstacleArrays(*(xp.take(part, rows, axis=0) for part in vars(requests.obstacles).values()))
+        near, beyond = within_reach(xp, obstacles, start, reach)
+        beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
+        far = (widening > 1.0) | self._constraints.base_far
+        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far)
+        return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
+
+    def _turn(self, state: Array) -> list[list[Array]]:
+        """Return the rotations from the robots' frames to the world, entry by entry."""
+        xp, d = self._xp, self._robot.position_dim
+        one, zero = xp.ones_like(state[0]), xp.zeros_like(state[0])
+        turn = [[one if i == j else zero for i in range(d)] for j in range(d)]
+        if self._robot.heading is not None:
+            cos, sin = xp.cos(state[self._robot.heading]), xp.sin(state[self._robot.heading])
+            turn[0][0], turn[0][1], turn[1][0], turn[1][1] = cos, -sin, sin, cos
+        return turn
+
+    def _sorted(self, lanes: LaneBatch) -> Any:
+        """Yield lanes with about the same number of near obstacles, and their indices."""
+        xp, near = self._xp, lanes.scene.near
+        count = xp.sum(xp.astype(near.used, xp.int64), axis=0) if near.used.shape[0] else xp.zeros_like(lanes.z_0[0])
+        order = xp.argsort(count, stable=True)
+        for first in range(0, order.shape[0], self._lanes):
+            own = order[first : first + self._lanes]
+            part = lanes.take(xp, own)
+            most = int(xp.max(xp.take(count, own, axis=0)))
+            yield part.with_slots(most), own
+
+    def _allow(
+        self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]
+    ) -> tuple[Array, Array]:
+        """Decide lanes whose proposals are allowed at once; return their indices, and those of lanes to adjust."""
+        xp, k = self._xp, self._domain.shape[1]
+        in_domain = xp.all((lanes.z_0[:k] >= self._domain[0]) & (lanes.z_0[:k] <= self._domain[1]), axis=0)
+        leave, single = xp.zeros_like(in_domain), ~in_domain
+        if self._box is not None:
+            z = self._search.regressors(lanes.z_0, lanes.proposal)
+            within = (z >= self._box[0]) & (z <= self._box[1])
+            leave = xp.all(within[: self._search.known], axis=0)  # a robot that stands may turn in place
+            single |= xp.all(within, axis=0)
+        proposed = self._search.propose(lanes)
+        done = xp.nonzero(proposed.allowed & ~single)[0]
+        if done.shape[0]:
+            part, margin = taken(xp, proposed.plan, done), xp.take(proposed.margin, done, axis=-1)
+            self._write(requests, lanes.scene.take(xp, done), part, margin, xp.take(rows, done, axis=0), answers)
+        return done, xp.nonzero(~proposed.allowed & ~proposed.unsure & ~leave & ~single)[0]
+
+    def _adjust(self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]) -> Array:
+        """Decide lanes whose proposals are not allowed at once; return the indices of those that are decided."""
+        xp, c = self._xp, self._constraints
+        proposed = self._search.propose(lanes)
+        found = self._search.adjust(lanes, proposed)
+        goes_on = found.hopeless & self._goes_on(requests, rows)
+        done = xp.nonzero(found.allowed | found.adjusted | goes_on)[0]
+        if not done.shape[0]:
+            return done
+        to, scene = xp.take(rows, done, axis=0), lanes.scene.take(xp, done)
+        margin = xp.take(proposed.margin, done, axis=-1)
+        answers["proposal_margin"][to] = margin
+        for name, value in self._blocking(taken(xp, proposed.plan, done), scene, margin).items():
+            getattr(answers["blocked"], name)[to] = value
+        z = xp.where(goes_on, xp.concat([lanes.z_0, lanes.committed]), found.z)
+        plan = c.around(scene, xp.take(z, done, axis=-1))
+        margin = xp.where(goes_on, 0.0, found.margin)
+        margin = xp.where(
+            xp.take(goes_on, done, axis=0), c.least(scene, plan.slack, plan.extent), xp.take(margin, done)
+        )
+        self._write(requests, scene, plan, margin, to, answers)
+        kept = xp.take(rows, xp.nonzero(goes_on)[0], axis=0)
+        answers["plan"][kept] = xp.take(requests.plan, kept, axis=0)
+        kind = xp.where(goes_on, KINDS.index(FAILSAFE), xp.where(found.adjusted, KINDS.index(ADJUSTED), 0))
+        answers["kind"][to] = xp.astype(xp.take(kind, done, axis=0), xp.int64)
+        answers["for_clearance"][to] = xp.take(found.for_clearance & ~goes_on, done, axis=0)
+        answers["steps"][to] = xp.astype(xp.take(found.steps, done, axis=0), xp.int64)
+        return done
+
+    def _goes_on(self, requests: RequestArrays, rows: Array) -> Array:
+        """Return whether the committed plans of some rows still count as verified (B,): see `Filter.decide`.
+
+        This model set verified the plan, and the measured state is in its predicted set. Such a robot recovers nowhere.
+        """
+        xp, host = self._xp, on_host(rows).tolist()
+        model = requests.model
+        own = [(model if isinstance(model, str) else model[row]) == self._version for row in host]
+        verified = xp.asarray(np.array(own, dtype=bool), device=self._device)
+        return verified & self._contained(requests, xp.take(requests.state, rows, axis=0), rows)
+
+    def _write(
+        self,
+        requests: RequestArrays,
+        scene: SceneBatch,
+        plan: PlanBatch,
+        margin: Array,
+        to: Array,
+        answers: dict[str, Any],
+    ) -> None:
+        """Write the verified plans of the rows `to` as allowed ones. scene, plan, margin: of these rows."""
+        xp, robot = self._xp, self._robot
+        centers, half = self._constraints.sets(scene, plan)
+        state = xp.take(requests.state, to, axis=0)
+        predicted, predicted_half = self._predicts(scene, plan)
+        heading = xp.zeros_like(margin)
+        if robot.heading is not None:
+            heading = state[:, robot.heading]
+            predicted[robot.heading] += heading
+        empty = xp.all(~scene.near.used, axis=0) if scene.near.used.shape[0] else xp.ones_like(scene.far)
+        margin, at_least = self._constraints.clear(scene, plan, margin, empty)
+        inputs = xp.permute_dims(self._schedule @ plan.z[robot.regressor_dim :], (1, 0))
+        values = {
+            "kind": xp.zeros_like(to),
+            "plan": xp.reshape(inputs, (-1, robot.horizon, robot.action_dim)),
+            "tube_center": xp.permute_dims(centers, (2, 0, 1)),
+            "tube_half_width": xp.permute_dims(half, (2, 0, 1)),
+            "predicted_center": xp.permute_dims(predicted, (1, 0)),
+            "predicted_half_width": xp.permute_dims(predicted_half, (1, 0)),
+            "predicted_heading": heading,
+            "margin": margin,
+            "at_least": at_least,
+            "verified": xp.ones_like(at_least),
+            "contained": self._contained(requests, state, to),
+        }
+        if requests.predicted is not None:
+            values["compared"] = xp.take(requests.predicted.given, to, axis=0)
+        for name, value in values.items():
+            answers[name][to] = value
+        self._write_scores(requests, state, to, answers)
+
+    def _contained(self, requests: RequestArrays, state: Array, rows: Array) -> Array:
+        """Return whether the measured states (B, n) of rows lie in their predicted sets: `Prediction.contains`."""
+        xp, predicted, heading = self._xp, requests.predicted, self._robot.heading
+        if predicted is None:
+            return xp.ones_like(rows, dtype=xp.bool)
+        center, half, turned, given = (xp.take(part, rows, axis=0) for part in vars(predicted).values())
+        away = state - center
+        off = [away[:, i] for i in range(away.shape[1])]
+        if heading is not None:
+            cos, sin = xp.cos(turned), xp.sin(turned)
+            off[0], off[1] = cos * off[0] + sin * off[1], cos * off[1] - sin * off[0]
+            off[heading] = xp.remainder(off[heading] + math.pi, math.tau) - math.pi
+        return xp.all(xp.abs(xp.stack(off, axis=1)) <= half + SAME_SET, axis=1) | ~given
+
+    def _write_scores(self, requests: RequestArrays, state: Array, to: Array, answers: dict[str, Any]) -> None:
+        """Write the scores of past windows."""
+        xp, past = self._xp, requests.past
+        if past is None or self._score is None:
+            return
+        given = xp.nonzero(xp.take(past.given, to, axis=0))[0]
+        if not given.shape[0]:
+            return
+        to = xp.take(to, given, axis=0)
+        states, inputs = (
+            xp.asarray(xp.permute_dims(xp.take(part, to, axis=0), (1, 2, 0)), copy=True)
+            for part in (past.states, past.inputs)
+        )
+        now = xp.asarray(xp.permute_dims(xp.take(state, given, axis=0), (1, 0)), copy=True)
+        answers["score"][to], answers["scored"][to] = self._score(states, inputs, now), True
+
+    def _blocking(self, plan: PlanBatch, scene: SceneBatch, margin: Array) -> dict[str, Array]:
+        """Return the arrays of a `BlockingArrays` for proposals: `TubeConstraints.worst_of`."""
+        xp, c = self._xp, self._constraints
+        count, (K, B) = rows_per_obstacle(c.N), scene.near.rho.shape
+        blocking = xp.where(margin >= 0.0, self._clearance, 0.0)
+        beyond = xp.where(scene.far, scene.reach - plan.extent, xp.inf)
+        nowhere = xp.full((c.d, B), xp.nan, dtype=margin.dtype, device=self._device)
+        period = xp.full_like(margin, self._robot.period * c.N)
+        if not K:
+            alone = xp.full(B, -1, dtype=xp.int64, device=self._device)
+            places = xp.permute_dims(nowhere, (1, 0))
+            return {"obstacle": alone, "room": beyond, "after": period, "normal": places, "at": places}
+        # In the order of the single path's rows: disc, obstacle, end.
+        slack = xp.reshape(plan.slack, (len(c.discs), count, K, B))
+        slack = xp.reshape(xp.permute_dims(slack, (0, 2, 1, 3)), (-1, B))
+        row = xp.argmin(slack, axis=0)
+        least = xp.take_along_axis(slack, row[None], axis=0)[0]
+        sight = beyond - blocking < least - blocking
+        sight = sight | ~scene.near.used[0]
+        disc, which, end = row // (count * K), row // count % K, row % count
+        when = xp.where(end < c.N, end, xp.minimum(end - c.N + 1, xp.full_like(end, c.N)))
+        after = xp.where(sight, period, self._robot.period * xp.astype(when, margin.dtype))
+        normal, at = c.surface(scene, plan, disc, which, end, when)
+        gone = sight | ~xp.all(xp.isfinite(at), axis=0)
+        return {
+            "obstacle": xp.where(sight, -1, xp.take_along_axis(scene.near.slot, which[None], axis=0)[0]),
+            "room": xp.where(sight, beyond, xp.maximum(least, -scene.reach)),
+            "after": after,
+            "normal": xp.permute_dims(xp.where(gone, xp.nan, normal), (1, 0)),
+            "at": xp.permute_dims(xp.where(gone, xp.nan, at), (1, 0)),
+        }
+
+
+class _NextState:
+    """The predicted sets of the next measured states: `TubeConstraints.predict` for a batch."""
+
+    def __init__(self, safety: Filter, constant: Any, xp: Any) -> None:
+        model, n, nz = safety.model, safety.robot.state_dim, safety.tube.position.shape[2]
+        self._xp, self._d, self._heading = xp, safety.robot.position_dim, safety.robot.heading
+        first = model.first
+        self._regressor = constant(model.first_regressor(np.eye(nz)).T)
+        self._C, self._W, self._M = constant(first.C[:n]), constant(first.W), constant(first.M)
+        self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])
+        self._widths = constant(np.abs(first.generators[:n]))
+
+    def __call__(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
+        """Return centers and half-widths (n, B), the position in the world; the heading is the change of heading."""
+        xp, d = self._xp, self._d
+        window = self._regressor @ plan.z
+        sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
+        half = (self._widths @ sizes) * (scene.widening * plan.path.stretch[0])
+        center = plan.path.first + self._C @ window
+        moved = [scene.start[j] + sum(scene.turn[j][i] * center[i] for i in range(d)) for j in range(d)]
+        center[:d] = xp.stack(moved)
+        return center, half
+
+
+def as_constant(xp: Any, device: Any) -> Any:
+    """Return a function that brings NumPy arrays to a namespace and a device: floats as float64, indices as int64."""
+
+    def constant(array: Any) -> Array:
+        kind = xp.int64 if np.asarray(array).dtype.kind in "iu" else xp.float64
+        return xp.asarray(np.ascontiguousarray(array), dtype=kind, device=device)
+
+    return constant

@@ -1,0 +1,157 @@
+"""The obstacles of a batch of requests: padded arrays, and the distances from points to them (docs/method.md §3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import array_api_compat
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import Shapes
+
+Array = Any  # of any namespace
+Axes = list[Array]  # one array for each axis
+
+TINY = 1e-300
+
+
+def on_host(array: Array) -> NDArray[Any]:
+    """Return an array of any namespace and device as NumPy's own."""
+    return array if isinstance(array, np.ndarray) else np.from_dlpack(array_api_compat.to_device(array, "cpu")).copy()
+
+
+@dataclass(frozen=True)
+class ObstacleArrays:
+    """Up to K obstacles for each of B requests, as `Shapes` has them. Row b uses its first `count[b]` slots.
+
+    >>> from brakeline.messaging.obstacle import Obstacle
+    >>> post = Shapes.of([Obstacle("cylinder", (0.4, 0.0), (0.1,))], dim=2)
+    >>> ObstacleArrays.of([post, Shapes.of([], dim=2)]).count.tolist()
+    [1, 0]
+
+    Attributes:
+        center, half, round (B, K, d), axes (B, K, d, d), rho, margin (B, K): see `Shapes`.
+        count (B,): integers.
+    """
+
+    center: Array
+    axes: Array
+    half: Array
+    rho: Array
+    round: Array
+    margin: Array
+    count: Array
+
+    @staticmethod
+    def of(shapes: Sequence[Shapes]) -> ObstacleArrays:
+        """Pad the obstacles of B requests to the same number. All have the same number of dimensions."""
+        count = np.array([len(one) for one in shapes], dtype=np.int64)
+        most, used = int(count.max(initial=0)), np.repeat(np.arange(len(shapes)), count)
+        slot = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+
+        def padded(name: str) -> Array:
+            flat = np.concatenate([getattr(one, name) for one in shapes])
+            part = np.zeros((len(shapes), most, *flat.shape[1:]))
+            part[used, slot] = flat
+            return part
+
+        center, axes, half, rho, rounded, margin = (padded(field.name) for field in fields(Shapes))
+        return ObstacleArrays(center, axes, half, rho, rounded, margin, count)
+
+    def of_row(self, row: int) -> Shapes:
+        """Return the obstacles of one request, as NumPy arrays."""
+        count = int(self.count[row])
+        parts = (on_host(getattr(self, field.name)[row][:count]) for field in fields(Shapes))
+        return Shapes(*map(np.ascontiguousarray, parts))
+
+
+@dataclass(frozen=True)
+class NearObstacles:
+    """The obstacles within reach, batch last: per axis (K, B); axes[j][i] is entry (j, i) of the rotations.
+
+    Attributes:
+        used (K, B): whether the slot holds an obstacle. slot (K, B): its index among the request's obstacles.
+        away (K, B) [m]: distance from the measured position, less the obstacle's margin.
+    """
+
+    center: Axes
+    axes: list[Axes]
+    half: Axes
+    rho: Array
+    round: Axes
+    margin: Array
+    used: Array
+    slot: Array
+    away: Array
+
+    def take(self, xp: Any, lanes: Array) -> NearObstacles:
+        """Return the obstacles of the lanes with these indices."""
+        return self._each(lambda part: xp.take(part, lanes, axis=-1))
+
+    def first(self, most: int) -> NearObstacles:
+        """Return the first `most` slots."""
+        return self._each(lambda part: part[:most])
+
+    def nearest(self, xp: Any, slots: Array, most: int) -> NearObstacles:
+        """Return the first `most` of the slots in the order `slots` (K, B)."""
+        return self._each(lambda part: xp.take_along_axis(part, slots[:most], axis=0))
+
+    def _each(self, change: Any) -> NearObstacles:
+        def through(part: Any) -> Any:
+            return [through(one) for one in part] if isinstance(part, list) else change(part)
+
+        return NearObstacles(*(through(getattr(self, field.name)) for field in fields(self)))
+
+
+def within_reach(xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array) -> tuple[NearObstacles, Array]:
+    """Return the obstacles within reach (B,) of positions `start` (per axis, (B,)), and the distance to the next one.
+
+    The distance (B,) [m] is that of the nearest obstacle beyond reach, or infinity.
+    """
+    d = len(start)
+
+    def last(part: Array) -> Array:
+        return xp.asarray(xp.permute_dims(part, (1, 0)), copy=True)
+
+    parts = [[last(part[..., i]) for i in range(d)] for part in (obstacles.center, obstacles.half, obstacles.round)]
+    axes = [[last(obstacles.axes[..., j, i]) for i in range(d)] for j in range(d)]
+    rho, margin = last(obstacles.rho), last(obstacles.margin)
+    slot = xp.broadcast_to(xp.arange(rho.shape[0], device=rho.device)[:, None], rho.shape)
+    used = slot < obstacles.count
+    whole = NearObstacles(parts[0], axes, parts[1], rho, parts[2], margin, used, slot, rho)
+    _, distance = towards(xp, whole, [axis[None] for axis in start])
+    away = distance[0] - margin
+    near = used & ~(away > reach)
+    beyond = xp.min(xp.where(used & ~near, away, xp.inf), axis=0) if rho.shape[0] else xp.full_like(reach, xp.inf)
+    most = int(xp.max(xp.sum(xp.astype(near, xp.int64), axis=0))) if rho.shape[0] else 0
+    order = xp.argsort(xp.astype(~near, xp.int8), axis=0, stable=True) if rho.shape[0] else slot
+    whole = NearObstacles(parts[0], axes, parts[1], rho, parts[2], margin, near, slot, away)
+    return whole.nearest(xp, order, most), beyond
+
+
+def towards(xp: Any, near: NearObstacles, points: Axes) -> tuple[Axes, Array]:
+    """Return vectors from points (per axis, (Q, B)) to the closest points of each obstacle, and their lengths.
+
+    Per axis (Q, K, B), and (Q, K, B). Both are zero inside an obstacle.
+    """
+    d = len(points)
+    away = [points[j][:, None] - near.center[j] for j in range(d)]
+    rest, square = [], None
+    for i in range(d):
+        local = _summed([away[j] * near.axes[j][i] for j in range(d)])
+        rest.append(local - xp.minimum(xp.maximum(local, -near.half[i]), near.half[i]))
+    square = _summed([(rest[i] * near.round[i]) ** 2 for i in range(d)])
+    share = near.rho / xp.maximum(xp.sqrt(square), xp.maximum(near.rho, xp.full_like(near.rho, TINY)))
+    rest = [rest[i] - rest[i] * near.round[i] * share for i in range(d)]
+    way = [_summed([-rest[i] * near.axes[j][i] for i in range(d)]) for j in range(d)]
+    return way, xp.sqrt(_summed([part * part for part in way]))
+
+
+def _summed(parts: list[Array]) -> Array:
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total

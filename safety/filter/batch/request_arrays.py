@@ -1,0 +1,163 @@
+"""Requests of many robots of one kind as arrays, with the batch first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from brakeline.errors import BadRequest
+from brakeline.safety.filter.backup_plan import Prediction
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host
+from brakeline.safety.filter.request import FastRequestCheck, Request
+from brakeline.safety.filter.widening import PastWindow
+
+Array = Any  # of any namespace
+
+
+@dataclass(frozen=True)
+class PredictionArrays:
+    """The predicted sets of the measured states: `Prediction` for each robot that has one.
+
+    >>> PredictionArrays(np.zeros((2, 5)), np.full((2, 5), 0.1), np.zeros(2), given=np.array([True, False])).given.sum()
+    np.int64(1)
+
+    Attributes:
+        center, half_width (B, n), heading (B,).
+        given (B,): whether the robot has one; the other rows are ignored.
+    """
+
+    center: Array
+    half_width: Array
+    heading: Array
+    given: Array
+
+
+@dataclass(frozen=True)
+class PastArrays:
+    """The last periods of each robot: `PastWindow` for each robot that has one.
+
+    >>> PastArrays(states=np.zeros((2, 3, 5)), inputs=np.zeros((2, 4, 2)), given=np.ones(2, dtype=bool)).inputs.shape
+    (2, 4, 2)
+
+    Attributes:
+        states (B, N, n), inputs (B, N + 1, m).
+        given (B,): whether the robot has one; the other rows are ignored.
+    """
+
+    states: Array
+    inputs: Array
+    given: Array
+
+
+@dataclass(frozen=True)
+class RequestArrays:
+    """Requests of B robots of one kind, as `Request` has them; every array is of one namespace and on one device.
+
+    A batch describes surroundings by obstacles that stand still. A request with a scan, moving obstacles or
+    reservations has no place in it: `Filter.decide_all` decides such requests singly.
+
+    >>> from brakeline import Request, Shapes
+    >>> stand = np.zeros((3, 2))
+    >>> request = Request(np.zeros(5), [0.2, 0.0], stand[0], stand, Shapes.of([], dim=2), known_free=True)
+    >>> requests = RequestArrays.of([request] * 3)
+    >>> len(requests), requests.plan.shape, requests.row(2).action.tolist()
+    (3, (3, 3, 2), [0.2, 0.0])
+
+    Attributes:
+        state (B, n), action (B, m), input_in_force (B, m), plan (B, N, m): float64.
+        obstacles: at least those within `Filter.reach`.
+        known_free (B,): all space within reach is free, apart from the obstacles; bool.
+        widening (B,): factor on every set, at least 1. None: 1 for all.
+        model: version of the model set that verified the plan, for each robot or for all of them.
+        predicted, past: None if no robot has one.
+    """
+
+    state: Array
+    action: Array
+    input_in_force: Array
+    plan: Array
+    obstacles: ObstacleArrays
+    known_free: Array
+    widening: Array | None = None
+    model: Sequence[str] | str = ""
+    predicted: PredictionArrays | None = None
+    past: PastArrays | None = None
+
+    def __len__(self) -> int:
+        return int(self.state.shape[0])
+
+    @staticmethod
+    def fits(request: Request, check: FastRequestCheck) -> bool:
+        """Return whether a request has a place in a batch. `check`: the robot's own check of all numbers."""
+        others = request.movers, request.scan, request.reservation, request.other_reservations
+        return all(other is None for other in others) and check(request)
+
+    @staticmethod
+    def of(requests: Sequence[Request]) -> RequestArrays:
+        """Pack requests that fit, of one kind of robot, as NumPy arrays.
+
+        Raises:
+            BadRequest: an array has not the shape that the others have.
+        """
+        given = np.array([request.predicted is not None for request in requests])
+        center, half_width, heading = _packed(requests, "predicted", ("center", "half_width", "heading"))
+        windows = np.array([request.past is not None for request in requests])
+        states, inputs = _packed(requests, "past", ("states", "inputs"))
+        state, action, input_in_force, plan = (_stacked(name, requests) for name in _ARRAYS)
+        return RequestArrays(
+            state,
+            action,
+            input_in_force,
+            plan,
+            obstacles=ObstacleArrays.of([request.obstacles for request in requests]),
+            known_free=np.array([request.known_free for request in requests], dtype=bool),
+            widening=np.array([request.widening for request in requests], dtype=float),
+            model=[request.model for request in requests],
+            predicted=PredictionArrays(center, half_width, heading, given) if given.any() else None,
+            past=PastArrays(states, inputs, windows) if windows.any() else None,
+        )
+
+    def row(self, index: int) -> Request:
+        """Return the request of one robot, as NumPy arrays."""
+        predicted, past = None, None
+        if (sets := self.predicted) is not None and bool(sets.given[index]):
+            center, half_width = on_host(sets.center[index]), on_host(sets.half_width[index])
+            predicted = Prediction(center, half_width, float(sets.heading[index]))
+        if (windows := self.past) is not None and bool(windows.given[index]):
+            past = PastWindow(on_host(windows.states[index]), on_host(windows.inputs[index]))
+        state, action, input_in_force, plan = (on_host(getattr(self, name)[index]) for name in _ARRAYS)
+        return Request(
+            state,
+            action,
+            input_in_force,
+            plan,
+            obstacles=self.obstacles.of_row(index),
+            model=self.model if isinstance(self.model, str) else self.model[index],
+            predicted=predicted,
+            known_free=bool(self.known_free[index]),
+            widening=1.0 if self.widening is None else float(self.widening[index]),
+            past=past,
+        )
+
+
+_ARRAYS = ("state", "action", "input_in_force", "plan")
+
+
+def _stacked(name: str, owners: Sequence[Any]) -> Array:
+    """Stack an attribute of requests. Raises BadRequest, with its name, if the shapes differ."""
+    try:
+        return np.array([getattr(owner, name) for owner in owners], dtype=float)
+    except ValueError as error:
+        raise BadRequest(name, f"{name} has not the same shape in all requests of a batch") from error
+
+
+def _packed(requests: Sequence[Request], field: str, names: tuple[str, ...]) -> list[Array]:
+    """Stack the parts of an optional field. A request without it gets those of another one; nothing reads them."""
+    owners = [getattr(request, field) for request in requests]
+    some = next((owner for owner in owners if owner is not None), None)
+    if some is None:
+        return [np.zeros(0)] * len(names)
+    return [_stacked(name, [some if owner is None else owner for owner in owners]) for name in names]

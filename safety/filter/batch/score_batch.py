@@ -1,0 +1,56 @@
+"""The scores of a batch of windows that have ended: `WindowScore` for many robots (docs/method.md §15)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from brakeline.safety.filter.batch.batch_tube import RolloutBatch
+from brakeline.safety.model.model_set import ModelSet, scored_coordinates
+
+Array = Any  # of any namespace
+
+
+class ScoreBatch:
+    """Scores windows by the sets that a model set of mode one-step states for them, without widening."""
+
+    def __init__(self, model: ModelSet, rollout: RolloutBatch, constant: Any, xp: Any) -> None:
+        n, robot = model.robot.state_dim, model.robot
+        self._xp, self._rollout, self._n, self._d = xp, rollout, n, robot.position_dim
+        self._heading, self._regressor = robot.heading, list(robot.regressor)
+        kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
+        self._W, self._M, self._kappa = (
+            constant(model.first.W),
+            constant(M.reshape(-1, M.shape[2])),
+            constant(kappa.reshape(-1, kappa.shape[2])),
+        )
+        self._w = constant(w[..., None])
+        counts = np.zeros(w.shape[:2])
+        counts[0], counts[:, scored_coordinates(robot)] = 1.0, 1.0
+        self._counts = constant(counts[..., None])
+
+    def __call__(self, states: Array, inputs: Array, state: Array) -> Array:
+        """Return the largest ratio of an error to its set (B,), NaN if one is NaN.
+
+        states (N, n, B), inputs (N + 1, m, B): of the past periods. state (n, B): measured now.
+        """
+        xp, n, d = self._xp, self._n, self._d
+        N, first = states.shape[0], states[0]
+        speeds = xp.stack([first[i] for i in self._regressor])
+        window = xp.concat([speeds, xp.reshape(inputs, (-1, inputs.shape[2]))])
+        rows, stretch = self._rollout.windows(window)
+        predicted = xp.stack([xp.stack(row[:n]) for row in rows])  # (N, n, B)
+        after = xp.concat([states[1:], state[None]])
+        moved = [after[:, i] - first[i] if i < d else after[:, i] for i in range(n)]
+        if self._heading is not None:
+            cos, sin = xp.cos(first[self._heading]), xp.sin(first[self._heading])
+            moved[0], moved[1] = cos * moved[0] + sin * moved[1], cos * moved[1] - sin * moved[0]
+            turned = moved[self._heading] - first[self._heading]
+            moved[self._heading] = xp.remainder(turned + math.pi, math.tau) - math.pi
+        off = xp.abs(xp.stack(moved, axis=1) - predicted)
+        width = self._M @ xp.abs(self._W @ window) + self._kappa @ xp.abs(window)
+        width = (xp.reshape(width, (N, n, -1)) + self._w) * stretch[:, None]
+        share = xp.where((off != 0.0) & (self._counts > 0.0), off / width, 0.0)
+        return xp.max(xp.reshape(share, (N * n, -1)), axis=0)

@@ -1,0 +1,375 @@
+"""Batches decide as the single path does: the same kinds, the same inputs, and nothing verified that it would not."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brakeline.errors import BadRequest
+from brakeline.messaging.moving_obstacles import split_moving
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle_motion import Motion
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
+from brakeline.safety.filter.batch import plane_batch, qp_batch, search_batch
+from brakeline.safety.filter.batch.batch_filter import BatchFilter
+from brakeline.safety.filter.batch.decision_arrays import KINDS
+from brakeline.safety.filter.batch.dual_active_set import solve_batch
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
+from brakeline.safety.filter.qp_solver import solve
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
+from brakeline.safety.filter.widening import PastWindow
+from brakeline.safety.service.in_process import InProcess
+from tests.safety.test_one_step import ready as one_step
+from tests.safety.test_qp_solver import crowded
+
+SAME = 1e-6
+FORMS = ("ground direct", "ground recursion", "one-step", "quadrotor direct")
+
+
+@pytest.fixture
+def filters(models):
+    made = {"one-step": one_step, "ground recursion": lambda: Filter(models["residual", "recursion"])}
+    return lambda form: made[form]() if form in made else Filter.load(form.split()[0])
+
+
+def shape(rng, at, d):
+    """An obstacle of any kind at a point."""
+    size, kind = tuple(rng.uniform(0.05, 0.3, 3)), rng.choice(["box", "cylinder", "sphere", "wall"])
+    sizes = {"box": size[:d], "cylinder": size[: d - 1], "sphere": size[:1], "wall": ()}[kind]
+    return Obstacle(kind, tuple(at), sizes, rng.uniform(-3, 3), rng.uniform(-0.05, 0.05))
+
+
+def scene(rng, ready, crowd=0.5):
+    """A request of a robot that moves or stands among up to five obstacles; some with widenings and predicted sets."""
+    robot, d, scale = ready.robot, ready.robot.position_dim, min(ready.reach, 2.5)
+    share = rng.choice([0.0, 0.3, 1.0])
+    before = share * rng.uniform(robot.low(), robot.high())
+    state = robot.state_at_inputs(before) + rng.uniform(-1, 1, robot.state_dim) * np.array(robot.measurement_bound)
+    state[:d] = rng.uniform(-50, 50, d)
+    if robot.heading is not None:
+        state[robot.heading] = rng.uniform(-3, 3)
+    near = []
+    for _ in range(int(rng.integers(0, 6)) if rng.random() < crowd else 0):
+        way = rng.normal(size=d)
+        way *= (robot.footprint + rng.uniform(0.15, 2.0) * scale + 0.2) / np.linalg.norm(way)
+        near.append(shape(rng, state[:d] + way, d))
+    braking = np.vstack([before * share for share in robot.stop_profile()])
+    predicted = ready.decide(plain(ready, state, before, before, braking)).predicted if rng.random() < 0.5 else None
+    return replace(
+        plain(ready, state, rng.uniform(robot.low(), robot.high()), before, braking),
+        obstacles=Shapes.of(near, d),
+        model=rng.choice([ready.version, UNVERIFIED, "other"]) if share else "",
+        predicted=predicted,
+        widening=float(rng.choice([1.0, 1.0, 1.3])),
+    )
+
+
+def plain(ready, state, action, before, plan):
+    return Request(state, action, before, plan, Shapes.of([], ready.robot.position_dim), known_free=True)
+
+
+def apart(one, other):
+    """Return the largest difference of two decisions' numbers."""
+    parts = [(one.plan, other.plan), (one.tube_center, other.tube_center), (one.margin, other.margin)]
+    parts += [(one.tube_half_width, other.tube_half_width), (one.predicted.center, other.predicted.center)]
+    parts += [(one.predicted.half_width, other.predicted.half_width), (one.predicted.heading, other.predicted.heading)]
+    parts += [] if one.score is None else [(one.score, other.score)]
+    if other.blocked_by is not None and len(other.blocked_by.normal):
+        parts += [(one.blocked_by.normal, other.blocked_by.normal), (one.blocked_by.at, other.blocked_by.at)]
+        parts += [(one.blocked_by.room, other.blocked_by.room)]
+    return max(float(np.abs(np.asarray(a) - b).max(initial=0.0)) for a, b in parts)
+
+
+def check_same(ready, requests, answers):
+    """Check that the answers are those of the single path."""
+    for row, request in enumerate(requests):
+        batch, single = answers.row(row), ready.decide(request)
+        for name in (
+            "kind",
+            "verified",
+            "at_least",
+            "contained",
+            "compared",
+            "for_clearance",
+            "model",
+            "bound",
+            "judges",
+        ):
+            assert getattr(batch, name) == getattr(single, name), (row, name)
+        assert (batch.score is None) == (single.score is None)
+        assert (batch.blocked_by and batch.blocked_by.by) == (single.blocked_by and single.blocked_by.by)
+        assert apart(batch, single) < SAME, row
+        assert batch.reason == single.reason
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_batch_decides_as_the_single_path(filters, form):
+    ready, rng = filters(form), np.random.default_rng(0)
+    requests = [scene(rng, ready, crowd=0.8) for _ in range(250)]
+    answers = ready.decide_batch(RequestArrays.of(requests))
+    check_same(ready, requests, answers)
+    kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
+    assert {ALLOWED, ADJUSTED} <= kinds <= {ALLOWED, ADJUSTED, FAILSAFE}
+    assert len(answers.singly) < 0.5 * len(requests)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
+def test_any_scenes_are_decided_as_the_single_path_decides_them(seed, count):
+    rng, ready = np.random.default_rng(seed), ground()
+    requests = [scene(rng, ready, crowd=1.0) for _ in range(count)]
+    check_same(ready, requests, ready.decide_batch(RequestArrays.of(requests)))
+
+
+@cache
+def ground():
+    return Filter.load("ground")
+
+
+def test_past_windows_are_scored(filters):
+    ready, rng = one_step(), np.random.default_rng(3)
+    robot = ready.robot
+    requests = []
+    for request in (scene(rng, ready) for _ in range(40)):
+        states = np.tile(request.state, (robot.horizon, 1)) + 0.01 * rng.normal(size=(robot.horizon, robot.state_dim))
+        past = PastWindow(states, np.tile(request.input_in_force, (robot.horizon + 1, 1)))
+        requests.append(replace(request, past=past if rng.random() < 0.5 else None))
+    answers = ready.decide_batch(RequestArrays.of(requests))
+    check_same(ready, requests, answers)
+    assert 5 < sum(bool(scored) for scored in answers.scored) < 35
+
+
+def test_torch_gives_the_same_answers_in_its_own_tensors():
+    torch = pytest.importorskip("torch")
+    ready, rng = ground(), np.random.default_rng(5)
+    requests = RequestArrays.of([scene(rng, ready, crowd=0.9) for _ in range(120)])
+    theirs, ours = ready.decide_batch(moved(requests, torch.asarray)), ready.decide_batch(requests)
+    assert isinstance(theirs.plan, torch.Tensor) and set(theirs.singly) == set(ours.singly)
+    assert theirs.kind.tolist() == ours.kind.tolist()
+    for name in ("plan", "margin", "tube_center", "tube_half_width", "predicted_center", "predicted_half_width"):
+        assert np.abs(np.asarray(getattr(theirs, name)) - getattr(ours, name)).max() < SAME
+    assert theirs.row(0).kind == ours.row(0).kind
+
+
+def moved(requests, change):
+    """Return requests with all arrays changed."""
+
+    def one(value):
+        if isinstance(value, np.ndarray):
+            return change(value)
+        if hasattr(value, "__dataclass_fields__"):
+            return type(value)(**{name: one(part) for name, part in vars(value).items()})
+        return value
+
+    return one(requests)
+
+
+def test_obstacles_may_have_empty_slots_with_any_numbers():
+    ready, rng = ground(), np.random.default_rng(6)
+    requests = [scene(rng, ready, crowd=0.9) for _ in range(60)]
+    arrays = RequestArrays.of(requests)
+    empty = np.arange(arrays.obstacles.rho.shape[1]) >= arrays.obstacles.count[:, None]
+    assert empty.any()
+    arrays.obstacles.center[empty] = 1e3
+    arrays.obstacles.rho[empty] = 7.0
+    check_same(ready, requests, ready.decide_batch(arrays))
+    arrays.obstacles.center[empty] = arrays.state[:, None, :2].repeat(empty.shape[1], axis=1)[empty]
+    check_same(ready, requests, ready.decide_batch(arrays))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_verify_nothing(value):
+    ready, rng = ground(), np.random.default_rng(7)
+    requests = RequestArrays.of([replace(scene(rng, ready), model=ready.version) for _ in range(20)])
+    requests.action[3, 0] = value
+    answers = ready.decide_batch(requests)
+    assert KINDS[answers.kind[3]] == FAILSAFE and 3 in answers.singly
+    check_same(ready, [requests.row(row) for row in range(20)], answers)
+    requests.state[5, 3] = value
+    with pytest.raises(BadRequest, match="row 5"):
+        ready.decide_batch(requests)
+
+
+@pytest.mark.parametrize("part", ["center", "rho", "half", "margin", "axes"])
+def test_an_obstacle_that_is_not_finite_is_no_free_space(part):
+    ready = ground()
+    post = Shapes.of([Obstacle("cylinder", (0.26, 0.0), (0.1,))], 2)
+    one = plain(ready, np.zeros(5), np.array([0.25, 0.0]), np.zeros(2), np.zeros((3, 2)))
+    requests = RequestArrays.of([replace(one, obstacles=post) for _ in range(4)])
+    getattr(requests.obstacles, part)[2] = np.nan
+    answers = ready.decide_batch(requests)
+    assert 2 in answers.singly and KINDS[answers.kind[2]] in (FAILSAFE, RECOVERING)
+    assert {KINDS[kind] for kind in answers.kind[[0, 1, 3]]} == {ADJUSTED}
+
+
+def invalid():
+    ready, rng = ground(), np.random.default_rng(9)
+    arrays = RequestArrays.of([scene(rng, ready, crowd=1.0) for _ in range(4)])
+    yield "state", replace(arrays, state=arrays.state[:, :4])
+    yield "plan", replace(arrays, plan=arrays.plan[:3])
+    yield (
+        "obstacles.margin",
+        replace(arrays, obstacles=replace(arrays.obstacles, margin=arrays.obstacles.margin[:, :0])),
+    )
+    yield "obstacles.count", replace(arrays, obstacles=replace(arrays.obstacles, count=arrays.obstacles.count + 9))
+    yield "model", replace(arrays, model=["a"])
+    yield "widening", replace(arrays, widening=np.array([1.0, 1.0, 0.9, 1.0]))
+    yield "plan", replace(arrays, plan=arrays.plan + 0.1)
+    none = replace(arrays.obstacles, count=np.zeros(4, dtype=int))
+    yield "obstacles", replace(arrays, obstacles=none, known_free=np.zeros(4, dtype=bool))
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_an_invalid_batch_is_refused_with_the_fields_name(number):
+    name, arrays = list(invalid())[number]
+    with pytest.raises(BadRequest) as refusal:
+        ground().decide_batch(arrays)
+    assert refusal.value.field == name
+
+
+# --- what the batch does not decide itself -------------------------------------------------------------------------
+
+
+def test_a_row_that_the_batch_does_not_cover_is_decided_singly():
+    ready = ground()
+    stand = plain(ready, np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), np.zeros((3, 2)))
+    outside = replace(stand, state=np.array([0.0, 0.0, 0.0, 5.0, 0.0]))
+    turning = replace(stand, action=np.array([0.0, 0.4]))
+    answers = ready.decide_batch(RequestArrays.of([stand, outside, turning]))
+    assert sorted(answers.singly) == [1, 2]
+    check_same(ready, [stand, outside, turning], answers)
+
+
+def test_a_robot_that_batches_do_not_cover_is_decided_singly(monkeypatch):
+    ready, rng = ground(), np.random.default_rng(10)
+    requests = [scene(rng, ready) for _ in range(5)]
+    batch = BatchFilter(ready)
+    assert batch.covers
+    monkeypatch.setattr(batch, "covers", False)
+    answers = batch.decide(RequestArrays.of(requests))
+    assert len(answers.singly) == 5
+    check_same(ready, requests, answers)
+
+
+def test_decide_all_keeps_the_order_and_decides_singly_what_does_not_fit():
+    ready, rng = ground(), np.random.default_rng(11)
+    requests = [scene(rng, ready) for _ in range(WORTH_A_BATCH + 10)]
+    mover = Obstacle("cylinder", (3.0, 0.0), (0.1,), motion=Motion(velocity=(0.0, 0.1), position_error=0.01, speed=0.2))
+    requests[4] = replace(requests[4], movers=split_moving([mover], 2)[1])
+    decisions = ready.decide_all(requests)
+    assert [one.kind for one in decisions] == [ready.decide(request).kind for request in requests]
+    assert all(apart(one, ready.decide(request)) < SAME for one, request in zip(decisions, requests, strict=True))
+    assert len(ready.decide_all(requests[:3])) == 3
+    with pytest.raises(BadRequest, match="obstacles"):
+        ready.decide_all([*requests, replace(requests[0], obstacles=Shapes.of([], 2), known_free=False)])
+
+
+def test_a_client_in_process_asks_for_many_at_once(monkeypatch):
+    ready, rng, asked = ground(), np.random.default_rng(12), []
+    monkeypatch.setattr(
+        ready, "decide_batch", lambda arrays, of=ready.decide_batch: asked.append(len(arrays)) or of(arrays)
+    )
+    client = InProcess(ready)
+    plans = [BackupPlan(ready.robot) for _ in range(WORTH_A_BATCH)]
+    actions = rng.uniform([0.0, -0.5], [0.25, 0.5], (len(plans), 2))
+    requests = [
+        client.request(plan, np.zeros(5), action, known_free=True) for plan, action in zip(plans, actions, strict=True)
+    ]
+    answers = client.decide_all(plans, requests)
+    assert asked == [len(plans)]
+    assert all((answer.plan[0] == plan.input_in_force).all() for answer, plan in zip(answers, plans, strict=True))
+
+
+# --- nothing is believed -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["ground direct", "one-step"])
+def test_a_wrong_answer_of_the_solver_is_not_verified(filters, form, monkeypatch):
+    """The solver returns the proposal as the solution of every QP."""
+    ready, rng = filters(form), np.random.default_rng(13)
+    requests = [scene(rng, ready, crowd=1.0) for _ in range(120)]
+
+    def wrong(self, rows, z_0, proposal):
+        everywhere = np.ones(proposal.shape[1], dtype=bool)
+        return np.tile(proposal, (self.free // len(proposal), 1)), everywhere, ~everywhere, np.zeros(proposal.shape[1])
+
+    monkeypatch.setattr(qp_batch.QPBatch, "solve", wrong)
+    answers = BatchFilter(ready).decide(RequestArrays.of(requests))
+    for row, request in enumerate(requests):
+        single = ready.decide(request)
+        assert row in answers.singly or KINDS[answers.kind[row]] == single.kind or single.kind in (ADJUSTED, ALLOWED)
+        assert single.verified or not answers.verified[row]
+        if row not in answers.singly and KINDS[answers.kind[row]] == ADJUSTED:
+            assert exact_margin(ready, request, answers.plan[row][0]) >= 0.0
+
+
+def exact_margin(ready, request, first):
+    """Return the margin of an input, then braking, by the single path's own constraints."""
+    robot = ready.robot
+    z_0 = np.concatenate([request.state[list(robot.regressor)], request.input_in_force])
+    reachable = ready.builder.reachable(request.input_in_force)
+    around = ready.constraints.local_map(request, z_0, reachable)
+    z = ready.inputs.regressors(z_0, np.ascontiguousarray(first))
+    return ready.constraints_for(z, request.widening).margin_in(around, z)
+
+
+def test_an_unsure_comparison_goes_to_the_single_path(monkeypatch):
+    ready, rng = ground(), np.random.default_rng(14)
+    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
+    monkeypatch.setattr(search_batch, "ROUNDING", np.inf)
+    answers = BatchFilter(ready).decide(RequestArrays.of(requests))
+    assert len(answers.singly) > 40
+    check_same(ready, requests, answers)
+
+
+def test_the_solver_solves_exactly_or_proves_that_there_is_no_solution():
+    programs = [crowded(np.random.default_rng(seed)) for seed in range(150)]
+    h = programs[0].h[:, None]
+    g, A, b = (np.stack([getattr(one, name) for one in programs], axis=-1) for name in ("g", "A", "b"))
+    solution = solve_batch(np, h, g, A, b, np.zeros((0, len(programs)), dtype=int))
+    for lane, program in enumerate(programs):
+        single = solve(program)
+        assert not (solution.solved[lane] and not single.found) and not (solution.infeasible[lane] and single.found)
+        if solution.solved[lane]:
+            assert np.abs(solution.x[:, lane] - single.x).max() < 1e-7
+    assert 0.9 * len(programs) < (solution.solved | solution.infeasible).sum()
+    assert solution.solved.sum() > 10 and solution.infeasible.sum() > 10
+
+
+def test_a_wrong_guess_of_the_solvers_active_rows_changes_no_solution():
+    programs = [crowded(np.random.default_rng(seed)) for seed in range(150)]
+    h = programs[0].h[:, None]
+    g, A, b = (np.stack([getattr(one, name) for one in programs], axis=-1) for name in ("g", "A", "b"))
+    guess = np.random.default_rng(0).integers(0, A.shape[0], (3, len(programs)))
+    cold = solve_batch(np, h, g, A, b, np.zeros((0, len(programs)), dtype=int))
+    with np.errstate(all="ignore"):  # guessed rows may depend on each other
+        warm = solve_batch(np, h, g, A, b, guess)
+    both = cold.solved & warm.solved
+    assert both.sum() > 10 and (cold.solved == warm.solved).mean() > 0.95
+    assert np.abs(cold.x - warm.x)[:, both].max() < 1e-8
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_problem_that_is_not_finite_is_not_solved(value):
+    A, b = np.array([[1.0], [value]])[..., None], np.array([[0.5], [0.5]])
+    with np.errstate(all="ignore"):
+        solution = solve_batch(np, np.ones((1, 1)), -np.ones((1, 1)), A, b, np.zeros((0, 1), dtype=int))
+    assert not solution.solved[0]
+
+
+def test_a_broken_half_space_is_seen_by_these_tests(monkeypatch):
+    """A planted fault: half-spaces that do not keep off the body."""
+    ready, rng = ground(), np.random.default_rng(15)
+    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
+    monkeypatch.setattr(
+        "brakeline.safety.filter.batch.constraint_batch.planes_beside",
+        lambda xp, near, start, nominal, turn, keep_off, measured: plane_batch.planes_beside(
+            xp, near, start, nominal, turn, 0.5 * keep_off, measured
+        ),
+    )
+    with pytest.raises(AssertionError):
+        check_same(ready, requests, BatchFilter(ready).decide(RequestArrays.of(requests)))
