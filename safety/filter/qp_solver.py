@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TOLERANCE = 1e-10  # by which the answer may violate a row; the filter's rows have unit length in scaled variables
+TOLERANCE = 1e-12  # by which the answer may violate a row; the filter's rows have unit length in scaled variables
 UNBOUNDED = -1e30  # lower bound of rows that have none
 SOLVED = "solved"
 STATUS = {1: SOLVED, -1: "infeasible", -2: "cycled", -3: "unbounded", -4: "too many iterations"}  # by DAQP's exit flag

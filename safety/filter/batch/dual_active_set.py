@@ -20,7 +20,7 @@ from typing import Any
 Array = Any  # of any namespace
 
 MOST_STEPS = 60  # a lane that has not ended then counts as not solved
-TOLERANCE = 1e-10  # of unit rows in scaled variables, and of their multipliers
+TOLERANCE = 1e-12  # of unit rows in scaled variables, and of their multipliers
 LARGEST = (
     1e3  # multiplier: with a larger one, rounding of the rows moves the solution by more than a solver's tolerance
 )
