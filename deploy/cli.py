@@ -8,6 +8,7 @@ once.
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import os
 import sys
@@ -162,6 +163,16 @@ def parse(name: str, arguments: list[str]) -> Any:
     return tyro.cli(command, **defaults, prog=f"brakeline {name}", description=description, args=words)
 
 
+def reason(error: Exception) -> str:
+    """Return the message of an error; for a place that may not be written to, also what to do."""
+    if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        return (
+            f"{error}. Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for data sets and "
+            "model sets, --out for a run or a file"
+        )
+    return str(error)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command. Returns the exit status.
 
@@ -200,7 +211,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         if not isinstance(error, BusError | LogError | ValueError | OSError | RuntimeError):
             raise  # the message of another exception does not tell the user enough
-        errors.print(f"[red]brakeline {name}:[/] {escape(str(error))}", soft_wrap=True)
+        errors.print(f"[red]brakeline {name}:[/] {escape(reason(error))}", soft_wrap=True)
         return 1
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import Message
 
-from brakeline.errors import UnknownRobot
+from brakeline.errors import Implausible, UnknownRobot
 from brakeline.logs import foxglove_scene
 from brakeline.logs.reader import Record
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -34,6 +34,7 @@ log = logging.getLogger("brakeline.foxglove")
 
 ROOT = "foxglove"
 RATE = 10.0  # Hz per actor, wall time; interventions are always drawn
+MOST_ACTORS = 500  # more are not drawn
 GAP = 1.2  # distance between the centers of neighbouring arenas, in edges of an arena
 
 Decode = Callable[[], Any]
@@ -117,6 +118,8 @@ class FoxgloveConverter:
         robot, name = self._robots.named(episode.robot), episode.actor
         if robot is None:
             raise UnknownRobot(f"no robot is called {episode.robot!r}")
+        if _source(key) not in self._actors and len(self._actors) >= MOST_ACTORS:
+            raise Implausible(f"{name} is not drawn: there are already {MOST_ACTORS} actors")
         site = self._layout.position(robot.name, name, 2.0 * foxglove_scene.half_width(episode))
         actor = self._actors.setdefault(_source(key), _Actor(robot, name, site))
         actor.waiting = None

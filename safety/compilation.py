@@ -6,12 +6,15 @@ it is needed, not at the top of a file: Numba takes 0.1 s to load.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from functools import cache
 from typing import TypeVar, cast
 
 from numba import njit
 
 F = TypeVar("F", bound=Callable[..., object])
+log = logging.getLogger(__name__)
 
 
 def compiled(signature: str) -> Callable[[F], F]:
@@ -24,7 +27,18 @@ def compiled(signature: str) -> Callable[[F], F]:
     def decorate(function: F) -> F:
         try:
             return cast(F, njit(signature, cache=True, error_model="numpy")(function))
-        except RuntimeError:  # no folder for the cache: each process compiles anew
+        except RuntimeError:  # no folder for the cache
+            _say_that_nothing_is_stored()
             return cast(F, njit(signature, error_model="numpy")(function))
 
     return decorate
+
+
+@cache
+def _say_that_nothing_is_stored() -> None:
+    """Log, once in a process, that the compiled code cannot be stored."""
+    log.warning(
+        "Numba can store compiled code neither beside %s nor in your cache folder, so each process compiles for half a "
+        "minute: set NUMBA_CACHE_DIR to a folder in which you may write",
+        __file__,
+    )

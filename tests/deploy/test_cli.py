@@ -1,13 +1,16 @@
 """Test the command line: help, errors and JSON."""
 
+import errno
 import io
 import json
+import os
 import re
 import shlex
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +30,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
 from brakeline.safety.model.validation import ValidationReport
+from tests.deploy.data.porter import FILE, drive, write_csv
 
 SHARED = {
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
@@ -137,6 +141,53 @@ def test_an_impossible_command_fails_with_one_line_that_says_why(
     status, out, err = command(*words.format(folder=tmp_path).split())
     assert (status, out) == (1, "") and said in err and err.startswith("brakeline ")
     assert err.count("\n") == 1 and not (tmp_path / "run" / "logs").exists()
+
+
+@pytest.fixture
+def read_only(monkeypatch):
+    """`read_only(folder)`: as if the file system of a folder were mounted read-only; root may write anywhere else."""
+
+    def protect(folder):
+        def protected(function, writes):
+            def call(path, *words, **more):
+                if not isinstance(path, int) and writes(*words, **more):
+                    inside = Path(os.fsdecode(path)).absolute().is_relative_to(folder)
+                    if inside and not Path(path).is_char_device():
+                        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+                return function(path, *words, **more)
+
+            return call
+
+        changes = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+        monkeypatch.setattr(os, "mkdir", protected(os.mkdir, lambda *_, **__: True))
+        monkeypatch.setattr(os, "open", protected(os.open, lambda flags, *_, **__: bool(flags & changes)))
+        monkeypatch.setattr(io, "open", protected(io.open, lambda mode="r", *_, **__: mode[0] != "r" or "+" in mode))
+
+    return protect
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "robot new my.toml",
+        "import {log} --robot {robot}",
+        "collect ground",
+        "certify --robot ground",
+        "keys keys router",
+        "train ground --steps 100",
+    ],
+)
+def test_a_read_only_folder_is_an_error_that_says_where_to_write(command, monkeypatch, tmp_path, read_only, words):
+    monkeypatch.delenv("BRAKELINE_DATA", raising=False)
+    log, folder = tmp_path / "drive.csv", tmp_path / "checkout"
+    folder.mkdir()
+    if "{log}" in words:
+        write_csv(log, *drive(seconds=30.0))
+    monkeypatch.chdir(folder)
+    read_only(folder)
+    status, out, err = command(*words.format(log=log, robot=FILE).split())
+    assert status == 1 and "Read-only file system" in err, out + err
+    assert "folder in which you may write" in err and "BRAKELINE_DATA" in err and not [*folder.iterdir()]
 
 
 @pytest.mark.parametrize("words", ["train --method prayer", "evaluate --certificate hope", "certify --mode loud"])

@@ -4,27 +4,32 @@ import json
 import math
 import struct
 import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import lz4.frame
 import pytest
 import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from brakeline.deploy.commands.watch_command import show_received
-from brakeline.logs.foxglove import FoxgloveConverter
+from brakeline.logs.foxglove import MOST_ACTORS, FoxgloveConverter
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
 from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.logs.segment import MOST_CHANNELS, Entry
 from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.foxglove_server import FoxgloveServer
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, STEP, Topic
+from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, RECORDED, STEP, Topic
+from tests.fuzz.message_fuzzer import MessageFuzzer
 from tests.logs.conftest import Say
 
 
@@ -105,6 +110,36 @@ def test_watch_skips_malformed_messages(malformed: Sample, say: Say) -> None:
     show_received(inbox, board, None, rejected)
     shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
     assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
+
+
+def test_watch_and_foxglove_go_on_after_hostile_messages(say: Say) -> None:
+    fuzzer, board, rejected, inbox = MessageFuzzer(0), Dashboard(), RejectedMessages(), Inbox()
+    drawn = [fuzzer.sample(topic) for _ in range(60) for topic in RECORDED]
+    good = say("step/ground/b", pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0], index=1))
+    with FoxgloveServer() as live:
+        for frame in (b"\xff" * 1000, "[" * 50_000, '{"op": "subscribe", "subscriptions": [{"id": -1}]}', ""):
+            with suppress(ConnectionClosed), connect(live.url, subprotocols=["foxglove.sdk.v1"]) as visit:  # type: ignore
+                visit.send(frame)
+                visit.recv(timeout=10.0)
+        for one in (*HOSTILE, *MALFORMED, *drawn, good):
+            inbox.put(one)
+            show_received(inbox, board, live, rejected)
+        with connect(live.url, subprotocols=["foxglove.sdk.v1"]) as visit:  # type: ignore
+            assert json.loads(visit.recv(timeout=10.0))["op"] == "serverInfo"
+            channels = json.loads(visit.recv(timeout=10.0))["channels"]
+    assert good.key in {channel["topic"] for channel in channels}
+    shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
+    assert shown["b"]["pose"] == [1.0, 0.0, 0.0] and rejected.count > 0
+
+
+def test_a_crowd_of_actors_is_drawn_up_to_a_bound() -> None:
+    converter = FoxgloveConverter()
+    names = [f"a{number}" for number in range(MOST_ACTORS + 50)]
+    episodes = [
+        sample(EPISODE, pb.Episode(robot="ground", actor=name, goal=[1.0] * 2, start=[0.0] * 5), name) for name in names
+    ]
+    drawn = [bool(converter.from_sample(episode)) for episode in (*episodes, episodes[0])]
+    assert drawn == [True] * MOST_ACTORS + [False] * 50 + [True] and converter.failures == 50
 
 
 def test_an_analysis_counts_malformed_messages_and_goes_on(say: Say, tmp_path: Path) -> None:

@@ -1,20 +1,25 @@
 """Only the service can prove that it verified a plan: neither a forged token nor another plan's token does."""
 
+from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from brakeline.errors import BadKeys
+from brakeline.errors import BadKeys, NoReply
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Robot
+from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.model.model_set import ModelSet
-from brakeline.safety.service.client import read_reply, request_message
+from brakeline.safety.service.client import SafetyClient, read_reply, request_message
 from brakeline.safety.service.filter_client import Answer, accept
 from brakeline.safety.service.plan_token import SIZE, PlanAuthenticator, write_key
 from brakeline.safety.service.wire import decision_of
+from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.served import Service
 
@@ -164,3 +169,27 @@ def test_a_token_is_of_use_to_the_asker_that_got_it(model: ModelSet) -> None:
     assert not ask("actor-0", later).token_rejected and not ask("actor-0.3", later).token_rejected
     for thief in ("actor-1", "actor-00", "client", ""):
         assert ask(thief, later).token_rejected, thief
+
+
+def test_over_a_live_bus_a_stolen_plan_counts_as_unverified(join, endpoint, model: ModelSet) -> None:  # noqa: F811
+    """The thief has read all messages of another client, and asks in its name."""
+    service = Service(model, key=KEY)
+    join("safety", listen=True).serve(DECIDE, service.answer)
+
+    def decide(client: SafetyClient, *words: Any, **more: Any) -> Answer:
+        while True:
+            with suppress(NoReply):  # the service is not yet known on this side
+                return client.decide(*words, **more)
+
+    with (
+        SafetyClient.open(endpoint, "ground", 5.0, name="actor-0") as owner,
+        SafetyClient.open(endpoint, "ground", 5.0, name="actor-1") as thief,
+    ):
+        assert decide(owner, np.zeros(5), [0.25, 0.1], known_free=True, actor="actor-0").verified
+        state = np.array(owner.backup_plan.predicted.center)
+        thief.backup_plan = deepcopy(owner.backup_plan)
+        assert len(thief.backup_plan.plan_token) == SIZE
+        for client, verified in ((thief, False), (owner, True)):
+            answer = decide(client, state, [0.25, 0.0], [WALL], actor="actor-0")
+            assert (answer.kind, answer.verified, answer.token_rejected) == ("failsafe", verified, not verified)
+    assert service.counts.token_rejected == 1
