@@ -21,13 +21,14 @@ from brakeline.deploy.progress import console, under_way
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.model.driving_kinds import JUMPING, START
 from brakeline.safety.model.model_config import ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.sim.scripted_policies import Observation, Policy
 
 ROBOTS = ("ground", "quadrotor")
 PLANS = 2500  # of each group
-JUMPING, FIRST = "jumping inputs", "first period after a reset"
+FIRST = "first period after a reset"
 GROUPS = {"random": "random", "adversary": "adversary", "trained": "trained", JUMPING: "random", FIRST: "random"}
 SEED = 7
 MOST_HELD = 3  # periods between two jumps
@@ -69,14 +70,18 @@ class Containment:
         self.steps += 1
         self.steps_outside += not contained
 
-    def figures(self, model: ModelSet) -> dict[str, float]:
-        """Return the shares [%] beside the stated bounds, and what the counts show with confidence."""
+    def figures(self, model: ModelSet, kind: str = "") -> dict[str, float]:
+        """Return the shares [%] beside the stated bounds, and what the counts show with confidence.
+
+        kind: the kind of driving whose row states the bound of plans; by default that of all driving.
+        """
+        stated = float(model.about[f"bound_plan {kind}".strip()])
         return {
             "plans": self.plans,
             "plans outside": self.plans_outside,
             "plans [%]": 100.0 * self.plans_outside / max(self.plans, 1),
             "plans, at least [%]": 100.0 * lower_bound(self.plans_outside, self.plans),
-            "plans, stated at most [%]": 100.0 * float(model.about["bound_plan"]),
+            "plans, stated at most [%]": 100.0 * stated,
             "steps": self.steps,
             "steps outside": self.steps_outside,
             "steps [%]": 100.0 * self.steps_outside / max(self.steps, 1),
@@ -135,6 +140,7 @@ def run(plans: int = PLANS) -> Figures:
         for group in GROUPS:
             with under_way(f"{name}: {group}"):
                 counts = contained(robot, model, group, plans)
-            rows[f"{name}: {group}"] = counts.figures(model)
+            kind = {JUMPING: JUMPING, FIRST: START}.get(group, "")
+            rows[f"{name}: {group}"] = counts.figures(model, kind)
             console.print(f"{name}: {group}: {counts.plans_outside} of {counts.plans} plans outside", markup=False)
     return rows

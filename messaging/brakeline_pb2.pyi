@@ -444,6 +444,7 @@ class Request(_message.Message):
     WIDENING_FIELD_NUMBER: _builtins.int
     PAST_STATES_FIELD_NUMBER: _builtins.int
     PAST_INPUTS_FIELD_NUMBER: _builtins.int
+    PAST_FROM_START_FIELD_NUMBER: _builtins.int
     SLOW_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -461,6 +462,8 @@ class Request(_message.Message):
     """Nothing but `obstacles` is near: all other space within reach is free. Needed without obstacles, scan and image."""
     widening: _builtins.float
     """factor on every set of the tube, at least 1; 0: not given, so 1"""
+    past_from_start: _builtins.bool
+    """that window began within `horizon` periods of the episode's start, or of a gap"""
     slow: _builtins.float
     """For the log: the share of the inputs' bounds that the robot's actor limits its proposals to, because more plans
     left their tubes than stated; 0: no limit.
@@ -546,11 +549,12 @@ class Request(_message.Message):
         widening: _builtins.float = ...,
         past_states: _abc.Iterable[_builtins.float] | None = ...,
         past_inputs: _abc.Iterable[_builtins.float] | None = ...,
+        past_from_start: _builtins.bool = ...,
         slow: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "widening", b"widening"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -75,6 +75,7 @@ class Filter:
         clearance_margin [m]: distance to obstacles that the QP keeps.
         reach [m]: an obstacle farther away cannot decide anything.
         bound: the share of plans outside their tubes that the model set states.
+        start: factor on the sets of a request without past window (see `OneStep.start`).
     """
 
     observed = 0  # the filter reads no observation
@@ -105,6 +106,7 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self._score = None if model.one_step is None else WindowScore(model, model.one_step)
+        self.start = 1.0 if model.one_step is None else model.one_step.start
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
     @classmethod
@@ -163,6 +165,8 @@ class Filter:
             check_surroundings(self.robot, request)
         else:
             check_for_filter(self.robot, request)
+        if self.start > 1.0 and request.past is None:  # an episode has begun
+            request = replace(request, widening=request.widening * self.start)
         record.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         record.broken = 0 if request.movers is None else int((~request.movers.consistent).sum())
         blind = "" if not record.broken else BROKEN
@@ -380,7 +384,7 @@ class Filter:
         """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        start, constraints = state[: self.robot.position_dim], self.constraints_for(z)
+        start, constraints = state[: self.robot.position_dim], self.constraints_for(z, self.start)
         return self._reserve(constraints, start, *constraints.sets(start, constraints.turn(heading), z), z)
 
     def _reserve(

@@ -30,10 +30,13 @@ class PastWindow:
     Attributes:
         states (N, n): measured states at the periods' starts.
         inputs (N + 1, m): the input in force before the first period, then the executed inputs.
+        from_start: it began within a plan's length of an episode's start, or of a gap in the measurements. No request
+            held a window then.
     """
 
     states: Array
     inputs: Array
+    from_start: bool = False
 
 
 class Widening:
@@ -62,7 +65,7 @@ class Widening:
         self._states: deque[Array] = deque(maxlen=self.robot.horizon)
         self._inputs: deque[Array] = deque(maxlen=self.robot.horizon + 1)
         self._factors: deque[float] = deque(maxlen=self.robot.horizon)  # of the requests at the periods' starts
-        self._uncounted = 0
+        self._uncounted = self._periods = 0
 
     def executed(self, state: Array, before: Array, action: Array) -> None:
         """Add a period: the measured state (n,) at its start, the input before it and its own input (m,)."""
@@ -73,13 +76,14 @@ class Widening:
         self._factors.append(self._asked)
         self._asked = self.factor
         self._uncounted += 1
+        self._periods += 1
 
     @property
     def past(self) -> PastWindow | None:
         """The window that ends at the next measurement; None before a plan's length has passed."""
-        if len(self._states) < self.robot.horizon:
+        if (N := self.robot.horizon) > len(self._states):
             return None
-        return PastWindow(np.array(self._states), np.array(self._inputs))
+        return PastWindow(np.array(self._states), np.array(self._inputs), self._periods < 2 * N)
 
     def judge(self, score: float) -> None:
         """Add the score of a window that has ended. A score that is no number counts as infinite."""

@@ -24,8 +24,10 @@ class WindowScore:
 
         self._score, self._predictor = rollout_kernels.score, one_step.stretch_arguments(robot)
         self._sets = W, M, kappa, w, scored
+        self._start = one_step.start
 
     def __call__(self, past: PastWindow, state: Array) -> float:
         """Return the largest ratio of an error to its set in the window that ends in a measured state (n,)."""
         states = np.concatenate([past.states, state[None]])
-        return self._score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)
+        score = self._score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)
+        return score / self._start if past.from_start else score

@@ -10,9 +10,9 @@ from brakeline.safety.model.error_causes import REGIMES, regimes
 
 Array = NDArray[np.float64]
 
-START, RESTLESS = "first period of an episode", "restless inputs"
+START, RESTLESS, JUMPING = "start of an episode", "restless inputs", "jumping inputs"
 JUMP = 0.5  # share of the largest change that range and slew allow; a change that differs by more is a jump
-RESTLESS_SHARE = 0.3  # of a plan's periods with a jump
+RESTLESS_SHARE, JUMPING_SHARE = 0.3, 0.5  # of a plan's periods with a jump
 
 
 def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
@@ -21,11 +21,14 @@ def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str,
     Args:
         robot: the robot.
         z (T, r + m + N·m): regressors with all inputs.
-        start (T, 2): trajectory and first period.
+        start (T, 2): trajectory and first period. The start of an episode are the plans that begin in its first
+            `horizon` periods, as long as the robot has no past window to send along.
     """
     inputs = z[:, len(robot.regressor) :].reshape(len(z), -1, robot.action_dim)
     changes = np.diff(inputs, axis=1) / np.minimum(robot.high() - robot.low(), np.asarray(robot.action_slew))
     bends = np.abs(np.diff(changes, axis=1, prepend=0.0))  # a steady ramp changes its input but does not jump
-    kinds = {START: start[:, 1] == 0, RESTLESS: (bends.max(2) > JUMP).mean(1) > RESTLESS_SHARE}
+    jumps = (bends.max(2) > JUMP).mean(1)
+    kinds = {START: start[:, 1] < robot.horizon, JUMPING: jumps > JUMPING_SHARE}
+    kinds |= {RESTLESS: (jumps > RESTLESS_SHARE) & ~kinds[JUMPING]}
     driving = regimes(robot, z)
     return kinds | {name: driving == name for name in REGIMES}

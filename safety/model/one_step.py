@@ -85,18 +85,23 @@ class OneStep:
         features: φ.
         root (F, F): inverse of the lower Cholesky factor of the features' second moment in the data.
         weight: how much the sets grow with the leverage of a plan (docs/method.md §14).
+        start: factor on all sets of plans within a plan's length of an episode's start, at least 1. There a robot's
+            estimate of its state is often worse than later.
     """
 
     C: Array
     features: Features
     root: Array
     weight: float = 0.0
+    start: float = 1.0
 
     def tensors(self) -> dict[str, Array]:
         """Return the arrays of the predictor by their names in a model set's file."""
         f = self.features
         named = {"C": self.C, "scale": f.scale, "saturations": f.saturations, "terms": f.terms.astype(float)}
         named |= {"root": self.root, "weight": np.array([self.weight])}
+        if self.start != 1.0:  # files of before have none, and a version is a hash of the content
+            named["start"] = np.array([self.start])
         return {TENSOR + name: value for name, value in named.items()}
 
     @staticmethod
@@ -104,7 +109,8 @@ class OneStep:
         """Return the predictor that a model set's file holds; KeyError without one."""
         names = "C", "scale", "saturations", "terms", "root", "weight"
         C, scale, saturations, terms, root, weight = (tensors[TENSOR + name] for name in names)
-        return OneStep(C, Features(scale, saturations, terms.astype(np.int64)), root, float(weight[0]))
+        start = float(tensors[TENSOR + "start"][0]) if TENSOR + "start" in tensors else 1.0
+        return OneStep(C, Features(scale, saturations, terms.astype(np.int64)), root, float(weight[0]), start)
 
     def check(self, robot: Robot) -> None:
         """Check the sizes and indices of a predictor that comes from a file.
@@ -120,7 +126,7 @@ class OneStep:
         good = good and f.terms.min() >= 0 and f.terms.max() < primitives
         pairs = f.saturations[:, :2]
         good = good and bool((pairs >= 0).all() and (pairs < variables).all() and (f.saturations[:, 2] > 0.0).all())
-        if not good or self.root.shape != (len(f.terms),) * 2 or not self.weight >= 0.0:
+        if not good or self.root.shape != (len(f.terms),) * 2 or not (self.weight >= 0.0 and self.start >= 1.0):
             raise BadModel(f"the predictor of one period does not fit {robot.name}")
 
     def rollouts(self, robot: Robot, z: Array) -> Array:

@@ -6,7 +6,6 @@ cut into folds, and a predictor that did not see a fold predicts the windows in 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
@@ -24,7 +23,15 @@ from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import Features, OneStep, features_for
-from brakeline.safety.model.set_shape import MOST_FOR_SHAPE, Shape, plans_from, shape_with_chords, spread_features
+from brakeline.safety.model.set_factors import SetFactors
+from brakeline.safety.model.set_shape import (
+    Shape,
+    plans_from,
+    shape_with_chords,
+    shares,
+    spread_features,
+    stop_from_full_speed,
+)
 from brakeline.safety.model.windows import displacement, predicted_outputs, way_after_rest, ways
 
 Array = NDArray[np.float64]
@@ -38,6 +45,7 @@ DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
 FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
 SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
+MOST_FOR_WEIGHT = 6000  # windows by which the weight is chosen
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
@@ -223,8 +231,8 @@ class Calibration:
     Attributes:
         chosen, candidates: the choice, and all candidates from the best to the worst.
         factor: factor on the final shape of positions and chord deviations, from the out-of-fold scores.
-        scores (T,): the score of every window, relative to the factor; above 1, the window is outside its sets.
-        first_scores (T,): the same for the predicted state after one period, which has a factor of its own.
+        scores (T,): how much of its sets every window used; above 1, a part of the window is outside.
+        first_scores (T,): the same for the predicted state after one period alone.
         samples: the recorded driving.
         smallest_singular, condition: of the chosen features, each scaled to its root mean square.
     """
@@ -258,17 +266,18 @@ def fit_one_step(
     chosen, candidates, regression = choose(robot, s, progress)
     progress(CHOSEN)
     weight, speeds = _weight_and_speeds(robot, s, regression, chosen.ridge, model_config.outside)
-    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, speeds, progress)
+    scores, positions, others = _scores(
+        robot, s, regression, chosen.ridge, weight, speeds, model_config.outside, progress
+    )
     kinds = driving_kinds(robot, s.z, s.start)
-    factor, first = (_factor(each, kinds, model_config.outside) for each in (scores, others))
-    if not robot.position_dim:  # the limited coordinates are scored with the plan
-        first = max(factor, first)
-    one_step = regression.fit(chosen.ridge, weight=weight)
+    joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
+    factors = SetFactors.of(scores, others, kinds, model_config.outside, one=joint_space)
+    one_step = replace(regression.fit(chosen.ridge, weight=weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds, model_config.outside)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
-    scale = np.full(n, factor)
-    first_scale = np.where(np.arange(n) < d, factor, first)
+    scale = np.full(n, factors.plan)
+    first_scale = np.where(np.arange(n) < d, factors.plan, factors.first)
     steps = tuple(shape.bound(robot, k, slice(n), scale if k > 1 else first_scale) for k in range(1, N + 1))
     chords = [shape.bound(robot, k, slice(n, n + 1), scale[:1]) for k in range(1, N + 1)]
     measured = len(robot.regressor)
@@ -284,21 +293,8 @@ def fit_one_step(
         data.about | {"data": data.digest(), "periods": str(data.periods)},
         one_step=one_step,
     )
-    relative = scores / factor, np.maximum(positions / factor, others / first)
-    return model, Calibration(chosen, tuple(candidates), factor, *relative, s, *regression.quality())
-
-
-def _factor(scores: Array, kinds: dict[str, NDArray[np.bool_]], outside: float) -> float:
-    """Return the least factor that leaves at most a share `outside` of the windows of every kind outside, at least 1.
-
-    This is the ⌈(n + 1)(1 - outside)⌉-th score of n windows, and the largest one if they are few (docs/method.md §14).
-    """
-    found = [1.0]
-    for kind in (np.ones(len(scores), dtype=bool), *kinds.values()):
-        ordered = np.sort(scores[kind])
-        if len(ordered):
-            found.append(float(ordered[min(math.ceil((len(ordered) + 1) * (1.0 - outside)), len(ordered)) - 1]))
-    return max(found)
+    used, used_first = (factors.shares(part, others, kinds) for part in (scores, positions))
+    return model, Calibration(chosen, tuple(candidates), factors.plan, used, used_first, s, *regression.quality())
 
 
 def _stacked(bounds: list[ErrorBound]) -> ErrorBound:
@@ -329,33 +325,42 @@ def _weight_and_speeds(
 ) -> tuple[float, bool]:
     """Return the weight of the leverage, and whether half-widths grow with the speeds, for the narrowest sets of plans.
 
-    Of several nearly as narrow (of the last sets, on average), take the largest weight, then a shape without speeds.
+    What counts are the last sets, on average of plans and of a stop from full speed. Of several nearly as narrow, take
+    the largest weight, then a shape without speeds.
     Without the leverage, one factor widens all sets because some windows at the edge of the data are predicted badly,
     and sets outside of the data are as narrow as within. Minutes of driving may hold few errors at a large speed that
     the inputs do not announce, such as the sway of a boat: then a slope on that speed is mostly noise.
     """
-    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
+    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_WEIGHT)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, pairs = plans_from(robot, z), [*product(WEIGHTS, (True, False))]
+    plans, full, pairs = plans_from(robot, z), stop_from_full_speed(robot), [*product(WEIGHTS, (True, False))]
     scores, sums = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
     for i in range(len(regression.gram)):
         one_step, held = regression.fit(ridge, i), fold == i
         off = after - one_step.rollouts(robot, z)[:, -1:][..., used]
-        leverages, of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans))
+        leverages, *of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
         for p, (weight, speeds) in enumerate(pairs):
             errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
-            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds)
-            scores[p, held] = _shares(np.abs(errors[held]), shape.widths(robot, z[held], last=True)).max((1, 2))
-            wide = shape.widths(robot, plans, last=True)[:, 0] * np.sqrt(1.0 + weight * of_plans)
-            sums[p] += wide.mean()
+            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds, outside=outside)
+            scores[p, held] = shape.scores(robot, z[held], errors[held], last=True)
+            for some_plans, leverage in zip((plans, full), of_plans, strict=True):
+                wide = shape.widths(robot, some_plans, last=True)[:, 0] * np.sqrt(1.0 + weight * leverage)
+                sums[p] += wide.mean()
     found = dict(zip(pairs, np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * sums, strict=True))
     good = [pair for pair, width in found.items() if width <= SIMPLER * min(found.values())]
     return max(good, key=lambda pair: (pair[0], not pair[1]))
 
 
 def _scores(
-    robot: Robot, s: Samples, regression: _Regression, ridge: float, weight: float, speeds: bool, progress: Progress
+    robot: Robot,
+    s: Samples,
+    regression: _Regression,
+    ridge: float,
+    weight: float,
+    speeds: bool,
+    outside: float,
+    progress: Progress,
 ) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
 
@@ -364,22 +369,16 @@ def _scores(
         after one period; and that of the other coordinates after one period.
     """
     d, scores = robot.position_dim, np.zeros((3, len(s.z)))
-    used = [*range(d), *extra_coordinates(robot), -1]
+    for_plan = [*range(d), *extra_coordinates(robot), -1]
     for i in range(len(regression.gram)):
         progress(WEIGHED + (SCORED - WEIGHED) * i / len(regression.gram))
         held = s.fold == i
         one_step = regression.fit(ridge, i, weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds)
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds, outside)
         widths = shape.widths(robot, s.z[held])
-        shares = _shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
-        scores[0, held] = shares[..., used].max((1, 2))
-        scores[1, held] = shares[:, 0, :d].max(1, initial=0.0)
-        scores[2, held] = shares[:, 0, d:-1].max(1, initial=0.0)
+        used = shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
+        scores[0, held] = used[..., for_plan].max((1, 2))
+        scores[1, held] = used[:, 0, :d].max(1, initial=0.0)
+        scores[2, held] = used[:, 0, d:-1].max(1, initial=0.0)
     return scores[0], scores[1], scores[2]
-
-
-def _shares(errors: Array, widths: Array) -> Array:
-    """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(errors > 0.0, errors / widths, 0.0)

@@ -13,7 +13,8 @@ from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
-MOST_FOR_SHAPE = 6000  # windows; more do not change a shape of so few parameters
+FULL_SPEED = 0.25  # weight of a stop from full speed among the plans for which a shape is tightest
+MOST_FOR_SHAPE = 20_000  # windows
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 
@@ -21,13 +22,14 @@ LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millim
 def spread_features(robot: Robot, z: Array, k: int) -> Array:
     """Return what the half-widths after k periods grow with (T, q), for regressors z (T, r + m + N·m).
 
-    These are the speeds, the input in force, and the means of the k inputs and of their changes, each without its sign:
-    with a slope for each input, minutes of driving would not determine a half-width.
+    These are the speeds, the input in force, and the means of the k inputs and of their jumps, each without its sign:
+    with a slope for each input, minutes of driving would not determine a half-width. A jump is the first change, or the
+    difference of a change from the one before: a steady ramp, such as braking, does not jump.
     """
     known, m = robot.regressor_dim, robot.action_dim
     inputs = z[:, known - m :].reshape(len(z), -1, m)[:, : k + 1]  # from the input in force on
-    changes = np.abs(np.diff(inputs, axis=1)).mean(1)
-    return np.hstack([np.abs(z[:, :known]), np.abs(inputs[:, 1:]).mean(1), changes])
+    jumps = np.diff(np.diff(inputs, axis=1), axis=1, prepend=0.0)
+    return np.hstack([np.abs(z[:, :known]), np.abs(inputs[:, 1:]).mean(1), np.abs(jumps).mean(1)])
 
 
 def plans_from(robot: Robot, z: Array) -> Array:
@@ -36,6 +38,15 @@ def plans_from(robot: Robot, z: Array) -> Array:
     firsts = z[:, known : known + m], np.broadcast_to(robot.zero_input(), (len(z), m))
     plans = [np.hstack([z[:, :known], np.tile(first, robot.free_steps)]) for first in firsts]
     return np.asarray(np.vstack(plans) @ plan_regressor_map(robot).T)
+
+
+def stop_from_full_speed(robot: Robot) -> Array:
+    """Return the regressors (1, nz) of a plan from all inputs at their upper bounds."""
+    high = np.asarray(robot.high())
+    speeds = robot.state_at_inputs(high)[list(robot.regressor)]
+    return np.asarray(
+        np.concatenate([speeds, high, np.tile(high, robot.free_steps)])[None] @ plan_regressor_map(robot).T
+    )
 
 
 @dataclass(frozen=True)
@@ -55,13 +66,24 @@ class Shape:
         parts = [spread_features(robot, z, first + k) @ slopes.T for k, slopes in enumerate(self.slopes)]
         return np.asarray(np.stack(parts, axis=1) + self.w)
 
+    def scores(self, robot: Robot, z: Array, errors: Array, last: bool = False) -> Array:
+        """Return the largest ratio (T,) of the errors (T, N, n') to the half-widths."""
+        return np.asarray(shares(np.abs(errors), self.widths(robot, z, last)).max((1, 2)))
+
     @staticmethod
     def around(
-        robot: Robot, z: Array, errors: Array, inflation: float = 1.0, last: bool = False, speeds: bool = True
+        robot: Robot,
+        z: Array,
+        errors: Array,
+        inflation: float = 1.0,
+        last: bool = False,
+        speeds: bool = True,
+        outside: float = 0.0,
     ) -> Shape:
-        """Return the shape that holds all errors (T, N, n') and is tightest, on average, for plans as the filter has.
+        """Return the shape that holds the errors (T, N, n') and is tightest, on average, for plans as the filter has.
 
-        Driving that was recorded holds large inputs to the end of a window; plans brake.
+        Driving that was recorded holds large inputs to the end of a window; plans brake. A stop from full speed counts
+        as much as `FULL_SPEED` of the recorded plans: those are fewest, and need the most room.
 
         Args:
             robot: the robot.
@@ -70,15 +92,26 @@ class Shape:
             inflation: factor on the shape.
             last: the errors (T, 1, n') are those after the last period.
             speeds: whether half-widths grow with the measured speeds too, besides the inputs.
+            outside: share of the windows that the shape need not hold: those that most exceed the others' trend. Their
+                errors would decide about all sets, and such a share of windows may leave its sets anyway.
         """
+        shape = Shape._holding(robot, z, errors, inflation, last, speeds)
+        if not (dropped := int(outside * len(z))):
+            return shape
+        held = np.argsort(shape.scores(robot, z, errors, last))[:-dropped]
+        return Shape._holding(robot, z[held], errors[held], inflation, last, speeds)
+
+    @staticmethod
+    def _holding(robot: Robot, z: Array, errors: Array, inflation: float, last: bool, speeds: bool) -> Shape:
         _, N, n = errors.shape
-        found, plans = [], plans_from(robot, z)
+        found, plans, full = [], plans_from(robot, z), stop_from_full_speed(robot)
         for k in range(N):
             period = robot.horizon if last else k + 1
-            used, typical = spread_features(robot, z, period), spread_features(robot, plans, period)
+            used, typical = spread_features(robot, z, period), spread_features(robot, plans, period).mean(0)
+            typical += FULL_SPEED * (spread_features(robot, full, period)[0] - typical)
             if not speeds:
-                used[:, : len(robot.regressor)] = typical[:, : len(robot.regressor)] = 0.0
-            found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical) for i in range(n)]
+                used[:, : len(robot.regressor)] = typical[: len(robot.regressor)] = 0.0
+            found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical[None]) for i in range(n)]
         slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
         if not speeds:
             slopes[:, : len(robot.regressor)] = 0.0
@@ -87,23 +120,31 @@ class Shape:
     def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
         """Return the error bound of some coordinates after k periods, each times its factor; without a predictor.
 
-        The rows of W are the changes of the inputs.
+        The rows of W are the jumps of the inputs (`spread_features`).
         """
         known, m, N = robot.regressor_dim, robot.action_dim, robot.horizon
         nz = known + N * m
         changes = np.eye(N * m, nz, known) - np.eye(N * m, nz, known - m)
+        jumps = changes - np.vstack([np.zeros((m, nz)), changes[:-m]])
         slopes, w = factor[:, None] * self.slopes[k - 1, coordinates], factor * self.w[k - 1, coordinates]
         kappa, M = np.zeros((len(w), nz)), np.zeros((len(w), N * m))
         kappa[:, :known] = slopes[:, :known]
         kappa[:, known : known + k * m] = np.tile(slopes[:, known : known + m] / k, k)
         M[:, : k * m] = np.tile(slopes[:, known + m :] / k, k)
-        return ErrorBound(np.zeros_like(kappa), changes, M, kappa, w, np.eye(len(w)))
+        return ErrorBound(np.zeros_like(kappa), jumps, M, kappa, w, np.eye(len(w)))
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool) -> Shape:
-    """Return the shape of the errors, and of the chord deviations as a further coordinate."""
+def shares(errors: Array, widths: Array) -> Array:
+    """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(errors > 0.0, errors / widths, 0.0)
+
+
+def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool, outside: float) -> Shape:
+    """Return the shape of the errors but a share `outside`, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
-    shape = Shape.around(robot, z[some], np.concatenate([errors[some], chords[some, :, None]], axis=2), speeds=speeds)
+    both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
+    shape = Shape.around(robot, z[some], both, speeds=speeds, outside=outside)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()

@@ -75,6 +75,7 @@ def request_message(
     if (past := backup_plan.past) is not None:
         message.past_states.extend(past.states.ravel().tolist())
         message.past_inputs.extend(past.inputs.ravel().tolist())
+        message.past_from_start = past.from_start
     set_measurement(message, scan_in(scan))
     if backup_plan.predicted is not None:
         message.predicted_center.extend(backup_plan.predicted.center.tolist())

@@ -144,7 +144,7 @@ def _past_of(message: pb.Request, robot: Robot) -> PastWindow | None:
     states, inputs, N = array_of(message.past_states), array_of(message.past_inputs), robot.horizon
     if (states.size, inputs.size) != (N * robot.state_dim, (N + 1) * robot.action_dim):
         raise BadRequest("past", f"past holds {N} states and {N + 1} inputs of {robot.name}")
-    return PastWindow(states.reshape(N, -1), inputs.reshape(N + 1, -1))
+    return PastWindow(states.reshape(N, -1), inputs.reshape(N + 1, -1), message.past_from_start)
 
 
 def array_of(field: Collection[float]) -> NDArray[np.float64]:

@@ -50,6 +50,31 @@ def test_a_window_holds_the_last_periods_without_a_gap():
     assert widening.past is None
 
 
+def test_sets_are_wider_at_an_episodes_start_and_windows_from_there_are_judged_by_those():
+    model = certified()[0]
+    safety = Filter(replace(model, one_step=replace(model.one_step, start=1.5)))
+    ask = request(np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), POSTS)
+    past = PastWindow(np.zeros((ROBOT.horizon, 5)), np.full((ROBOT.horizon + 1, 2), 0.01))
+    at_start, later = safety.decide(ask), safety.decide(replace(ask, past=past))
+    noise = np.array(ROBOT.measurement_bound[:2])
+    assert at_start.tube_half_width - noise == pytest.approx(1.5 * (later.tube_half_width - noise))
+    assert at_start.margin < later.margin
+    assert safety.score(replace(ask, past=replace(past, from_start=True))) == pytest.approx(later.score / 1.5)
+
+
+def test_a_window_knows_whether_its_plan_was_decided_without_a_past_window():
+    widening, N, without = Widening(ROBOT), ROBOT.horizon, []
+    for k in range(4 * N):
+        without.append(widening.past is None)  # the request at the start of period k
+        if (past := widening.past) is not None:
+            assert past.from_start == without[k - N]
+        widening.executed(np.zeros(5), np.zeros(2), np.zeros(2))
+    widening.interrupt()
+    for _ in range(N):
+        widening.executed(np.zeros(5), np.zeros(2), np.zeros(2))
+    assert widening.past.from_start
+
+
 @pytest.mark.parametrize("factor", [0.99, 0.0, -1.0, np.nan, np.inf])
 def test_a_factor_below_one_or_without_a_value_is_refused(factor):
     ask = replace(request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS), widening=factor)
@@ -91,6 +116,7 @@ def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_sco
     question = request_of(request_message(plan, robot.measure(), np.zeros(2), known_free=True), ROBOT)
     assert question.widening == pytest.approx(2.0 * RESERVE)
     assert (question.past.states == plan.past.states).all() and (question.past.inputs == plan.past.inputs).all()
+    assert question.past.from_start and plan.past.from_start
     sent = decision_reply(answer, 0.0).decision
     assert decision_of(sent, ROBOT).score == answer.score and decision_of(sent, ROBOT).judges
     plan.accept(answer.plan, "another", answer.predicted, True, judges=True, score=5.0)

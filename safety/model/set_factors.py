@@ -1,0 +1,63 @@
+"""The factors that scale the shape of the sets, from the scores of calibrating windows (docs/method.md §14)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.safety.model.driving_kinds import JUMPING, START
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SetFactors:
+    """Factors on the shape, for each part of a plan's sets.
+
+    Attributes:
+        plan: on positions, coordinates that a limit needs and chord deviations.
+        first: on the other coordinates after one period.
+        start: further factor on all of them within a plan's length of an episode's start, at least 1.
+    """
+
+    plan: float
+    first: float
+    start: float
+
+    @staticmethod
+    def of(plan: Array, first: Array, kinds: dict[str, Mask], outside: float, one: bool = False) -> SetFactors:
+        """Return the least factors that leave at most a share `outside` of the windows of every kind outside.
+
+        Inputs that jump in most periods stir up what no state shows, such as a quadrotor's attitude: `plan` would have
+        to be several times as large for all driving. No plan of the filter jumps like this, so only `first` covers it.
+
+        Args:
+            plan (T,), first (T,): scores of the windows, for both parts.
+            kinds: the windows (T,) of each kind of driving.
+            outside: the share.
+            one: both parts have the same factor.
+        """
+        begun = ~kinds[START]
+        others = [np.ones(len(plan), dtype=bool), *(kind for name, kind in kinds.items() if name != START)]
+        for_plan = max(_quantile(plan[kind & begun & ~kinds[JUMPING]], outside) for kind in others)
+        for_first = max(_quantile(first[kind & begun], outside) for kind in others)
+        if one:
+            for_plan = for_first = max(for_plan, for_first)
+        at_start = _quantile(plan[~begun], outside) / for_plan, _quantile(first[~begun], outside) / for_first
+        return SetFactors(for_plan, for_first, max(1.0, *at_start))
+
+    def shares(self, plan: Array, first: Array, kinds: dict[str, Mask]) -> Array:
+        """Return how much of its sets each window used (T,), from its scores; above 1, it is outside."""
+        both = np.maximum(plan / self.plan, first / self.first)
+        return np.asarray(both / np.where(kinds[START], self.start, 1.0))
+
+
+def _quantile(scores: Array, outside: float) -> float:
+    """Return the ⌈(n + 1)(1 - outside)⌉-th of n scores, and the largest one if they are few; at least 1."""
+    if not len(scores):
+        return 1.0
+    return max(1.0, float(np.sort(scores)[min(math.ceil((len(scores) + 1) * (1.0 - outside)), len(scores)) - 1]))
