@@ -334,7 +334,7 @@ def _weight_and_speeds(
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_WEIGHT)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, full, pairs = plans_from(robot, z), stop_from_full_speed(robot), [*product(WEIGHTS, (True, False))]
+    plans, full, pairs = plans_from(robot, z), stop_from_full_speed(robot, z), [*product(WEIGHTS, (True, False))]
     scores, sums = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
     for i in range(len(regression.gram)):
         one_step, held = regression.fit(ridge, i), fold == i

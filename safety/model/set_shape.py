@@ -40,13 +40,18 @@ def plans_from(robot: Robot, z: Array) -> Array:
     return np.asarray(np.vstack(plans) @ plan_regressor_map(robot).T)
 
 
-def stop_from_full_speed(robot: Robot) -> Array:
-    """Return the regressors (1, nz) of a plan from all inputs at their upper bounds."""
-    high = np.asarray(robot.high())
-    speeds = robot.state_at_inputs(high)[list(robot.regressor)]
-    return np.asarray(
-        np.concatenate([speeds, high, np.tile(high, robot.free_steps)])[None] @ plan_regressor_map(robot).T
+def stop_from_full_speed(robot: Robot, z: Array) -> Array:
+    """Return the regressors (1, nz) of a plan from all inputs at their upper bounds.
+
+    Speeds that follow no input, such as a boat's sway, have the median of the recorded periods z (T, nz).
+    """
+    high, measured = np.asarray(robot.high()), list(robot.regressor)
+    follows = np.isin(measured, robot.follows)
+    speeds = np.where(
+        follows, robot.state_at_inputs(high)[measured], np.quantile(np.abs(z[:, : len(measured)]), 0.5, 0)
     )
+    plan = np.concatenate([speeds, high, np.tile(high, robot.free_steps)])
+    return np.asarray(plan[None] @ plan_regressor_map(robot).T)
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,7 @@ class Shape:
     @staticmethod
     def _holding(robot: Robot, z: Array, errors: Array, inflation: float, last: bool, speeds: bool) -> Shape:
         _, N, n = errors.shape
-        found, plans, full = [], plans_from(robot, z), stop_from_full_speed(robot)
+        found, plans, full = [], plans_from(robot, z), stop_from_full_speed(robot, z)
         for k in range(N):
             period = robot.horizon if last else k + 1
             used, typical = spread_features(robot, z, period), spread_features(robot, plans, period).mean(0)
