@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.robot import Disc
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.batch import plane_batch, qp_batch, search_batch
 from brakeline.safety.filter.batch.batch_filter import BatchFilter
@@ -22,17 +24,27 @@ from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
 from brakeline.safety.filter.qp_solver import solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
 from brakeline.safety.filter.widening import PastWindow
+from brakeline.safety.model.fitting import fit_model_set
+from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
+from tests.safety.test_one_step import CONFIG, ROBOT, driven
 from tests.safety.test_one_step import ready as one_step
 from tests.safety.test_qp_solver import crowded
 
 SAME = 1e-6
-FORMS = ("ground direct", "ground recursion", "one-step", "quadrotor direct")
+FORMS = ("ground direct", "ground recursion", "two discs", "one-step", "real time", "quadrotor direct")
+LONG = Disc((0.08, 0.02), 0.07), Disc((-0.08, 0.0), 0.09)
 
 
 @pytest.fixture
-def filters(models):
-    made = {"one-step": one_step, "ground recursion": lambda: Filter(models["residual", "recursion"])}
+def filters(models, data):
+    """Return a filter by its form."""
+    made = {
+        "ground recursion": lambda: Filter(models["residual", "recursion"]),
+        "two discs": lambda: Filter(fit_model_set(replace(data, robot=replace(data.robot, body=LONG)), ModelConfig())),
+        "one-step": one_step,
+        "real time": lambda: Filter(certify(replace(driven(), robot=ROBOT.in_real_time()), CONFIG)[0]),
+    }
     return lambda form: made[form]() if form in made else Filter.load(form.split()[0])
 
 
