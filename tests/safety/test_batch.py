@@ -15,7 +15,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Disc
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
-from brakeline.safety.filter.batch import plane_batch, qp_batch, search_batch
+from brakeline.safety.filter.batch import lane_decisions, plane_batch, qp_batch, search_batch
 from brakeline.safety.filter.batch.batch_filter import BatchFilter
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.dual_active_set import solve_batch
@@ -127,6 +127,14 @@ def test_a_batch_decides_as_the_single_path(filters, form):
     kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
     assert {ALLOWED, ADJUSTED} <= kinds <= {ALLOWED, ADJUSTED, FAILSAFE}
     assert len(answers.singly) < 0.5 * len(requests)
+
+
+@pytest.mark.parametrize("lanes", [7, 1 << 16])
+def test_the_number_of_lanes_at_once_changes_no_decision(lanes, monkeypatch):
+    ready, rng = ground(), np.random.default_rng(2)
+    requests = [scene(rng, ready, crowd=0.8) for _ in range(100)]
+    monkeypatch.setattr(lane_decisions, "LANES", lanes)
+    check_same(ready, requests, BatchFilter(ready).decide(RequestArrays.of(requests)))
 
 
 @settings(max_examples=15, deadline=None)

@@ -10,6 +10,7 @@ import numpy as np
 from brakeline.safety.filter.batch.batch_tube import PathBatch, TubeBatch
 from brakeline.safety.filter.batch.obstacle_arrays import Axes, NearObstacles
 from brakeline.safety.filter.batch.plane_batch import EndBatch, PlaneBatch, planes_beside
+from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.constraints import TubeConstraints
 
 Array = Any  # of any namespace
@@ -20,7 +21,7 @@ class SceneBatch:
     """The surroundings of each robot of a batch: `LocalMap` for obstacles that stand still.
 
     Attributes:
-        start: per axis (B,), world. turn: turn[j][i] (B,), entry (j, i) of the rotation from the robot's frame.
+        start: per axis (B,), world. turn: the rotations from the robots' frames to the world.
         near: the obstacles within reach.
         beyond (B,) [m]: the distance below which the request names no further obstacle, at most the sensor's range.
         widening, reach (B,): factor on every set, and radius of the map [m].
@@ -28,7 +29,7 @@ class SceneBatch:
     """
 
     start: Axes
-    turn: list[Axes]
+    turn: TurnBatch
     near: NearObstacles
     beyond: Array
     widening: Array
@@ -39,7 +40,7 @@ class SceneBatch:
         def picked(part: Array) -> Array:
             return xp.take(part, lanes, axis=-1)
 
-        start, turn = [picked(axis) for axis in self.start], [[picked(part) for part in row] for row in self.turn]
+        start, turn = [picked(axis) for axis in self.start], self.turn.take(xp, lanes)
         rest = (picked(part) for part in (self.beyond, self.widening, self.reach, self.far))
         return SceneBatch(start, turn, self.near.take(xp, lanes), *rest)
 
@@ -101,10 +102,10 @@ class ConstraintBatch:
         found = []
         for at, radius, measured, first, _ in self.discs:
             centers = [path.outputs[:, first + i] for i in range(self.d)]
-            nominal = [sum(scene.turn[j][i] * centers[i] for i in range(self.d)) for j in range(self.d)]
+            nominal = scene.turn.to_world(centers)
             start = scene.start
             if at is not None:
-                start = [start[j] + sum(scene.turn[j][i] * at[i] for i in range(self.d)) for j in range(self.d)]
+                start = [a + b for a, b in zip(start, scene.turn.to_world(at), strict=True)]
             found.append(planes_beside(self._xp, scene.near, start, nominal, scene.turn, radius, measured))
         return found
 
@@ -136,11 +137,11 @@ class ConstraintBatch:
         """Return centers and half-widths (N, d, B), world, of boxes of the true positions at the periods' ends."""
         xp, d, L = self._xp, self.d, self.L
         path, sizes = plan.path, plan.sizes[:L]
-        centers, half = [], []
-        for j in range(d):
-            centers.append(scene.start[j] + sum(scene.turn[j][i] * path.outputs[:, i] for i in range(d)))
-            along = sum(scene.turn[j][i] * self._directions[i] for i in range(d))  # (N, L, B)
-            half.append(self.measured[j] + xp.sum(xp.abs(along) * sizes, axis=1) * path.stretch)
+        moved = scene.turn.to_world([path.outputs[:, i] for i in range(d)])
+        centers = [a + b for a, b in zip(scene.start, moved, strict=True)]
+        half = []
+        for measured, along in zip(self.measured, scene.turn.to_world(self._directions), strict=True):  # (N, L, B)
+            half.append(measured + xp.sum(xp.abs(along) * sizes, axis=1) * path.stretch)
         return xp.stack(centers, axis=1), xp.stack(half, axis=1)
 
     def surface(
@@ -169,14 +170,14 @@ class ConstraintBatch:
             level = one(planes.offsets) + kept + sum(abs(own[i]) * measured[i] for i in range(self.d))
             path = xp.concat([xp.zeros_like(plan.path.outputs[:1]), plan.path.outputs])
             moved = [xp.take_along_axis(path[:, first + i], when[None], axis=0)[0] for i in range(self.d)]
-            there = [sum(scene.turn[j][i] * moved[i] for i in range(self.d)) for j in range(self.d)]
+            there = scene.turn.to_world(moved)
             gap = level - sum(own[i] * there[i] for i in range(self.d))
+            start = scene.start
+            if offset is not None:
+                start = [a + b for a, b in zip(start, scene.turn.to_world(offset), strict=True)]
             for j in range(self.d):
-                start = scene.start[j]
-                if offset is not None:
-                    start = start + sum(scene.turn[j][i] * offset[i] for i in range(self.d))
                 normal[j] = xp.where(disc == number, own[j], normal[j])
-                at[j] = xp.where(disc == number, start + there[j] + own[j] * gap, at[j])
+                at[j] = xp.where(disc == number, start[j] + there[j] + own[j] * gap, at[j])
         return normal, at
 
     def clear(self, scene: SceneBatch, plan: PlanBatch, margin: Array, empty: Array) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_hos
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.batch.score_batch import ScoreBatch
 from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
+from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
 
@@ -118,15 +119,11 @@ class LaneDecisions:
         scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
 
-    def _turn(self, state: Array) -> list[list[Array]]:
-        """Return the rotations from the robots' frames to the world, entry by entry."""
-        xp, d = self._xp, self._robot.position_dim
-        one, zero = xp.ones_like(state[0]), xp.zeros_like(state[0])
-        turn = [[one if i == j else zero for i in range(d)] for j in range(d)]
-        if self._robot.heading is not None:
-            cos, sin = xp.cos(state[self._robot.heading]), xp.sin(state[self._robot.heading])
-            turn[0][0], turn[0][1], turn[1][0], turn[1][1] = cos, -sin, sin, cos
-        return turn
+    def _turn(self, state: Array) -> TurnBatch:
+        """Return the rotations from the robots' frames to the world."""
+        if (heading := self._robot.heading) is None:
+            return TurnBatch(None, None)
+        return TurnBatch(self._xp.cos(state[heading]), self._xp.sin(state[heading]))
 
     def _sorted(self, lanes: LaneBatch) -> Any:
         """Yield lanes with about the same number of near obstacles, and their indices."""
@@ -244,11 +241,9 @@ class LaneDecisions:
         if predicted is None:
             return xp.ones_like(rows, dtype=xp.bool)
         center, half, turned, given = (xp.take(part, rows, axis=0) for part in vars(predicted).values())
-        away = state - center
-        off = [away[:, i] for i in range(away.shape[1])]
+        off = [state[:, i] - center[:, i] for i in range(state.shape[1])]
         if heading is not None:
-            cos, sin = xp.cos(turned), xp.sin(turned)
-            off[0], off[1] = cos * off[0] + sin * off[1], cos * off[1] - sin * off[0]
+            off = TurnBatch(xp.cos(turned), xp.sin(turned)).to_robot(off)
             off[heading] = xp.remainder(off[heading] + math.pi, math.tau) - math.pi
         return xp.all(xp.abs(xp.stack(off, axis=1)) <= half + SAME_SET, axis=1) | ~given
 
@@ -320,8 +315,8 @@ class _NextState:
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
         half = (self._widths @ sizes) * (scene.widening * plan.path.stretch[0])
         center = plan.path.first + self._C @ window
-        moved = [scene.start[j] + sum(scene.turn[j][i] * center[i] for i in range(d)) for j in range(d)]
-        center[:d] = xp.stack(moved)
+        moved = scene.turn.to_world([center[i] for i in range(d)])
+        center[:d] = xp.stack([a + b for a, b in zip(scene.start, moved, strict=True)])
         return center, half
 
 

@@ -19,8 +19,9 @@ TINY = 1e-300
 
 
 def on_host(array: Array) -> NDArray[Any]:
-    """Return an array of any namespace and device as NumPy's own."""
-    return array if isinstance(array, np.ndarray) else np.from_dlpack(array_api_compat.to_device(array, "cpu")).copy()
+    """Return a copy of an array of any namespace and device as NumPy's own."""
+    numbers = array if isinstance(array, np.ndarray) else np.from_dlpack(array_api_compat.to_device(array, "cpu"))
+    return np.array(numbers)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brakeline.safety.filter.batch.obstacle_arrays import Axes, NearObstacles, towards
+from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 Array = Any  # of any namespace
@@ -31,14 +32,14 @@ class PlaneBatch(NamedTuple):
 
 
 def planes_beside(
-    xp: Any, near: NearObstacles, start: Axes, nominal: Axes, turn: list[Axes], keep_off: float, measured: Axes
+    xp: Any, near: NearObstacles, start: Axes, nominal: Axes, turn: TurnBatch, keep_off: float, measured: Axes
 ) -> PlaneBatch:
     """Return the half-spaces for nominal paths.
 
     Args:
         xp: the namespace. near: the obstacles.
         start: per axis (B,), world. nominal: per axis (N, B), the way from the start to the periods' ends, world.
-        turn: turn[j][i] (B,) is entry (j, i) of the rotation from the robot's frame to the world.
+        turn: the rotations from the robots' frames to the world.
         keep_off [m], measured: per axis [m].
     """
     d, N = len(start), nominal[0].shape[0]
@@ -73,8 +74,7 @@ def planes_beside(
     offsets = offsets - kept - sum(abs(normals[i]) * measured[i] for i in range(d))
     normals = [xp.where(near.used, part, 0.0) for part in normals]
     offsets = xp.where(near.used, offsets, UNUSED)
-    turned = [sum(normals[j] * turn[j][i] for j in range(d)) for i in range(d)]
-    return PlaneBatch(normals, turned, offsets)
+    return PlaneBatch(normals, turn.to_robot(normals), offsets)
 
 
 def _stay_in_force(xp: Any, chosen: list[Array], parts: list[Array], blocked: Array) -> None:

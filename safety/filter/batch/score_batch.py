@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.safety.filter.batch.batch_tube import RolloutBatch
+from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.model.model_set import ModelSet, scored_coordinates
 
 Array = Any  # of any namespace
@@ -45,8 +46,7 @@ class ScoreBatch:
         after = xp.concat([states[1:], state[None]])
         moved = [after[:, i] - first[i] if i < d else after[:, i] for i in range(n)]
         if self._heading is not None:
-            cos, sin = xp.cos(first[self._heading]), xp.sin(first[self._heading])
-            moved[0], moved[1] = cos * moved[0] + sin * moved[1], cos * moved[1] - sin * moved[0]
+            moved = TurnBatch(xp.cos(first[self._heading]), xp.sin(first[self._heading])).to_robot(moved)
             turned = moved[self._heading] - first[self._heading]
             moved[self._heading] = xp.remainder(turned + math.pi, math.tau) - math.pi
         off = xp.abs(xp.stack(moved, axis=1) - predicted)
