@@ -167,8 +167,8 @@ def reason(error: Exception) -> str:
     """Return the message of an error; for a place that may not be written to, also what to do."""
     if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
         return (
-            f"{error}. Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for data sets and "
-            "model sets, --out for a run or a file"
+            f"{error}. Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for data sets "
+            "and model sets, --out for a run or a file"
         )
     return str(error)
 

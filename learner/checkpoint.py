@@ -138,8 +138,20 @@ def _write_parts(folder: Path, parts: dict[str, PartState], about: dict[str, Any
 
 
 def _manifest(place: Path) -> dict[str, Any]:
-    """Return the manifest, which is parsed only if its hash is right. Raises DamagedPart."""
-    text, stated = _read(place, MANIFEST, MANIFEST), _read(place, MANIFEST_HASH, MANIFEST)
+    """Return the manifest, which is parsed only if its hash is right.
+
+    Raises:
+        CheckpointError: an earlier version of Brakeline wrote it, without a hash.
+        DamagedPart: it is damaged, or of another version.
+    """
+    text = _read(place, MANIFEST, MANIFEST)
+    if not (place / MANIFEST_HASH).exists() and b'"format": 1,' in text:
+        raise CheckpointError(
+            f"{place}: an earlier version of Brakeline wrote this checkpoint (format 1); this version reads format "
+            f"{FORMAT}, which has a hash. End the run with the earlier version; or move {place.parent} away, and learn "
+            "again from the log: `brakeline train --resume RUN --from-logs RUN`"
+        )
+    stated = _read(place, MANIFEST_HASH, MANIFEST)
     if stated != f"{_hash(text)}  {MANIFEST}\n".encode():
         raise DamagedPart(MANIFEST, place, f"damaged: its hash is not the one in {MANIFEST_HASH}")
     manifest = parse_json(text)

@@ -210,7 +210,8 @@ class Metrics:
     def _add_learner(self, metrics: pb.LearnerMetrics) -> None:
         _get_or_create(self.learners, metrics.robot, pb.LearnerMetrics)
         self.learners[metrics.robot] = metrics
-        self.admission.learner(metrics)
+        for step in self.admission.learner(metrics):
+            self._step(step)
 
     def _health(self, health: pb.Health) -> None:
         process = _get_or_create(self.processes, health.process, ProcessFigures)

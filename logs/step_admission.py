@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.flow_limits import AHEAD
 
+MOST_WAITING = 1000  # steps of each robot
+
 
 @dataclass(slots=True)
 class LastStep:
@@ -19,19 +21,27 @@ class LastStep:
 class StepAdmission:
     """Refuses steps that are repeated, that go back, or that no learner permitted.
 
-    Attributes:
-        refused: number of refused steps.
+    A log may lack a learner's latest permission, because its recorder was killed or cut off. Steps beyond the known
+    permission wait for the next one. Until then they are refused.
     """
 
     def __init__(self) -> None:
-        self.refused = 0
+        self._refused = 0
         self._limits: dict[str, dict[str, int]] = {}  # by robot and actor: the learner's latest
         self._last: dict[tuple[str, int], LastStep] = {}
+        self._waiting: dict[str, list[pb.Step]] = {}  # by robot
 
-    def learner(self, metrics: pb.LearnerMetrics) -> None:
-        """Note up to which step each actor may go."""
-        if metrics.limit:
-            self._limits[metrics.robot] = dict(metrics.limit)
+    @property
+    def refused(self) -> int:
+        """Number of refused steps."""
+        return self._refused + sum(map(len, self._waiting.values()))
+
+    def learner(self, metrics: pb.LearnerMetrics) -> list[pb.Step]:
+        """Note up to which step each actor may go. Returns the steps that waited for it, and that count now."""
+        if not metrics.limit:
+            return []
+        self._limits[metrics.robot] = dict(metrics.limit)
+        return [step for step in self._waiting.pop(metrics.robot, []) if self.admit(step)]
 
     def admit(self, step: pb.Step) -> bool:
         """Return whether the step counts. Call it once a step, in the order of publication."""
@@ -39,8 +49,12 @@ class StepAdmission:
         place = step.episode, step.step
         goes_on = step.index == 0 or (step.index > last.index and place > last.place)  # old logs have no index
         limits = self._limits.get(step.robot)
-        if not goes_on or (limits is not None and not 0 < step.index <= limits.get(step.actor, 0) + AHEAD):
-            self.refused += 1
-            return False
-        last.index, last.place = step.index, place
-        return True
+        if goes_on and (limits is None or 0 < step.index <= limits.get(step.actor, 0) + AHEAD):
+            last.index, last.place = step.index, place
+            return True
+        waiting = self._waiting.setdefault(step.robot, [])
+        if goes_on and step.index > 0 and len(waiting) < MOST_WAITING:
+            waiting.append(step)
+        else:
+            self._refused += 1
+        return False

@@ -22,6 +22,7 @@ from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 FULL = 100.0  # %
+MOST_TEXTS, MOST_PARAMETERS = 50, 4000  # that are kept: ArduPilot has 1,400 parameters
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
 SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
@@ -53,11 +54,12 @@ class MavlinkDecoder:
         self.velocity = np.zeros(3)  # m/s
         self.path: list[tuple[float, Array]] = []  # times and positions since the caller last emptied the list
         self.truth: GeoPosition | None = None  # ground truth of the autopilot's simulator
-        self.texts: list[str] = []
+        self.texts: list[str] = []  # the latest ones
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
         self.battery: float | None = None  # %; None: unknown
         self.outside = ""  # the side of its geofence that it has crossed; empty: none
-        self.answers: list[tuple[int, int]] = []  # ns, from TIMESYNC: our clock when we asked, the autopilot's then
+        # ns, from TIMESYNC: our clock when we asked, the autopilot's then
+        self.answers: deque[tuple[int, int]] = deque(maxlen=MOST_TEXTS)
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
         self.received = self.missed = 0  # frames, by their sequence numbers
         self._sequence: int | None = None
@@ -157,7 +159,7 @@ class MavlinkDecoder:
             case "STATUSTEXT":
                 if self._say is not None and self.texts[-1:] != [message.text]:
                     self._say(message.text)
-                self.texts.append(message.text)
+                self.texts = [*self.texts[1 - MOST_TEXTS :], message.text]
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
                 self.estimator = message.flags
             case "SYS_STATUS" if 0 <= message.battery_remaining <= FULL:
@@ -169,10 +171,16 @@ class MavlinkDecoder:
                 value = message.param_value
                 if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # the integer's bits
                     value = struct.unpack("<i", struct.pack("<f", value))[0]
-                self._parameters[message.param_id] = float(value)
-                self._types[message.param_id] = message.param_type
+                self._note_parameter(message.param_id, float(value), message.param_type)
             case "TIMESYNC" if message.tc1 != 0:  # 0: the autopilot asks for our clock
                 self.answers.append((message.ts1, message.tc1))
+
+    def _note_parameter(self, name: str, value: float, type: int) -> None:
+        """Store a parameter, and forget the oldest one if there are too many."""
+        self._parameters.pop(name, None)
+        self._parameters[name], self._types[name] = value, type
+        if len(self._parameters) > MOST_PARAMETERS:
+            del self._types[oldest := next(iter(self._parameters))], self._parameters[oldest]
 
 
 SENDERS: dict[str, list[tuple[str, int]]] = {}  # by message: the quantities in it, each with its index in SOURCES

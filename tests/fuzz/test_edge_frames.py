@@ -12,7 +12,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.frame_log import decode_frame
-from brakeline.actors.mavlink.mavlink_decoder import AUTOPILOT, SENDERS, MavlinkDecoder
+from brakeline.actors.mavlink.mavlink_decoder import AUTOPILOT, MOST_PARAMETERS, MOST_TEXTS, SENDERS, MavlinkDecoder
 from brakeline.deploy.run.mavlink_json import frames_as_json
 from brakeline.errors import Malformed
 from brakeline.messaging import brakeline_pb2 as pb
@@ -119,6 +119,21 @@ def test_whatever_an_autopilot_sends_the_decoder_goes_on() -> None:
     for value in (decoder.position, decoder.velocity):
         assert value is None or np.isfinite(value).all(), "no position or velocity is NaN or infinite"
     assert math.isfinite(decoder.time)
+
+
+def test_a_talkative_autopilot_fills_no_memory() -> None:
+    """Texts, parameters and time stamps without end: the decoder has the latest ones, among them the one asked for."""
+    decoder, sender = MavlinkDecoder(lambda data: None), mavlink.MAVLink(None, srcSystem=1, srcComponent=AUTOPILOT)
+    for number in range(MOST_PARAMETERS + 200):
+        for message in (
+            sender.statustext_encode(6, f"text {number}".encode()),
+            sender.param_value_encode(f"P{number}".encode(), float(number), 9, 1, 0),
+            sender.timesync_encode(number + 1, number),
+        ):
+            decoder.feed(message.pack(sender))
+    assert decoder.texts[-1] == f"text {MOST_PARAMETERS + 199}" and len(decoder.texts) == MOST_TEXTS
+    assert len(decoder._parameters) == len(decoder._types) == MOST_PARAMETERS and len(decoder.answers) <= MOST_TEXTS
+    assert decoder._parameters[f"P{MOST_PARAMETERS + 199}"] == MOST_PARAMETERS + 199 and "P0" not in decoder._parameters
 
 
 def test_hostile_frames_in_a_message_cost_the_log_nothing() -> None:

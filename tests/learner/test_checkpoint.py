@@ -8,6 +8,7 @@ from random import Random
 import numpy as np
 import pytest
 
+from brakeline.errors import CheckpointError
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint_state import PartState
 from tests.faults.failing_calls import Died, failing, full
@@ -34,6 +35,16 @@ def number_in(root: Path) -> int:
 
 def save(root: Path, number: int) -> Path:
     return checkpoint.save(root, parts(number), {"robot": "toy"})
+
+
+def test_a_checkpoint_of_an_earlier_version_says_so_and_what_to_do(tmp_path):
+    """Its manifest had no hash."""
+    folder = save(tmp_path, 3)
+    text = (folder / "manifest.json").read_text().replace('"format": 2', '"format": 1')
+    (folder / "manifest.json").write_text(text)
+    (folder / "manifest.sha256").unlink()
+    with pytest.raises(CheckpointError, match=r"earlier version of Brakeline.*format 1.*--from-logs RUN"):
+        number_in(tmp_path)
 
 
 def test_round_trip_and_only_the_latest_stays(tmp_path):

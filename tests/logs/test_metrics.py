@@ -210,3 +210,27 @@ def test_times_that_are_none_warn_nobody() -> None:
     decision = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
     decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=decision)))
     assert merge_decisions([decisions]).figures()["latency_ms"]["allowed"]["network"] is None
+
+
+def test_steps_after_a_gap_of_the_log_count_once_the_learners_permission_is_known() -> None:
+    """A recorder that was killed hears the actor before it hears the learner; what nobody permits never counts."""
+    metrics = Metrics()
+
+    def step(index: int) -> None:
+        message = pb.Step(robot="ground", actor="actor-0", episode=1, step=index, index=index)
+        metrics.add("step/ground/actor-0", message)
+
+    def learner(limit: int) -> None:
+        metrics.add("learner/ground", pb.LearnerMetrics(robot="ground", limit={"actor-0": limit}))
+
+    learner(20)
+    for index in (1, 2, 3, *range(4036, 4046)):
+        step(index)
+    assert (metrics.figures()["steps"], metrics.figures()["refused"]) == (3, 10)
+    learner(4050)
+    assert (metrics.figures()["steps"], metrics.figures()["refused"]) == (13, 0)
+    for index in (4046, 4046, *range(9_000, 15_000)):
+        step(index)
+    learner(4060)
+    figures = metrics.figures()
+    assert (figures["steps"], figures["refused"]) == (14, 6001)
