@@ -156,7 +156,7 @@ def test_past_windows_are_scored(filters):
     requests = []
     for request in (scene(rng, ready) for _ in range(40)):
         states = np.tile(request.state, (robot.horizon, 1)) + 0.01 * rng.normal(size=(robot.horizon, robot.state_dim))
-        past = PastWindow(states, np.tile(request.input_in_force, (robot.horizon + 1, 1)))
+        past = PastWindow(states, np.tile(request.input_in_force, (robot.horizon + 1, 1)), bool(rng.random() < 0.5))
         requests.append(replace(request, past=past if rng.random() < 0.5 else None))
     answers = ready.decide_batch(RequestArrays.of(requests))
     check_same(ready, requests, answers)
@@ -237,13 +237,15 @@ def invalid():
     )
     yield "obstacles.count", replace(arrays, obstacles=replace(arrays.obstacles, count=arrays.obstacles.count + 9))
     yield "model", replace(arrays, model=["a"])
+    yield "state", replace(arrays, state=arrays.state.astype(np.float32))
+    yield "known_free", replace(arrays, known_free=np.ones(4))
     yield "widening", replace(arrays, widening=np.array([1.0, 1.0, 0.9, 1.0]))
     yield "plan", replace(arrays, plan=arrays.plan + 0.1)
     none = replace(arrays.obstacles, count=np.zeros(4, dtype=int))
     yield "obstacles", replace(arrays, obstacles=none, known_free=np.zeros(4, dtype=bool))
 
 
-@pytest.mark.parametrize("number", range(8))
+@pytest.mark.parametrize("number", range(10))
 def test_an_invalid_batch_is_refused_with_the_fields_name(number):
     name, arrays = list(invalid())[number]
     with pytest.raises(BadRequest) as refusal:

@@ -10,6 +10,7 @@ a plan that turns in place, a failsafe, a recovery, and every comparison that ro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import array_api_compat
 import numpy as np
 
 from brakeline.errors import BadRequest
+from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.batch.decision_arrays import KINDS, BlockingArrays, DecisionArrays
 from brakeline.safety.filter.batch.lane_decisions import LaneDecisions
 from brakeline.safety.filter.batch.obstacle_arrays import on_host
@@ -48,7 +50,7 @@ class BatchFilter:
         """Decide on a batch of requests: see `Filter.decide_batch`."""
         started = perf_counter_ns()
         xp, device = array_api_compat.array_namespace(requests.state), array_api_compat.device(requests.state)
-        self._check_shapes(requests)
+        _check_arrays(self.safety.robot, requests, xp)
         answers = _blank(self.safety, requests, xp, device)
         decided = xp.zeros(len(requests), dtype=xp.bool, device=device)
         if self.covers and len(requests):
@@ -65,51 +67,61 @@ class BatchFilter:
                 raise BadRequest(error.field, f"row {row}: {error}") from error
             _write(answers, row, singly[row], xp, device)
         time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
-        about = self.safety.version, self.safety.bound, self.safety.model.one_step is not None
-        return DecisionArrays(**answers, singly=singly, obstacles=requests.obstacles, **_about(about), time_ms=time_ms)
-
-    def _check_shapes(self, requests: RequestArrays) -> None:
-        """Check the shapes of all arrays. Raises BadRequest with the field's name."""
-        robot, B = self.safety.robot, len(requests)
-        n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
-        obstacles, K = requests.obstacles, requests.obstacles.rho.shape[1]
-        expected = {
-            "state": (requests.state, (B, n)),
-            "action": (requests.action, (B, m)),
-            "input_in_force": (requests.input_in_force, (B, m)),
-            "plan": (requests.plan, (B, N, m)),
-            "known_free": (requests.known_free, (B,)),
-            "obstacles": (obstacles.center, (B, K, d)),
-            "obstacles.axes": (obstacles.axes, (B, K, d, d)),
-            "obstacles.half": (obstacles.half, (B, K, d)),
-            "obstacles.round": (obstacles.round, (B, K, d)),
-            "obstacles.rho": (obstacles.rho, (B, K)),
-            "obstacles.margin": (obstacles.margin, (B, K)),
-            "obstacles.count": (obstacles.count, (B,)),
-        }
-        if requests.widening is not None:
-            expected["widening"] = requests.widening, (B,)
-        if (predicted := requests.predicted) is not None:
-            expected["predicted_center"] = predicted.center, (B, n)
-            expected["predicted_half_width"] = predicted.half_width, (B, n)
-            expected["predicted_heading"] = predicted.heading, (B,)
-            expected["predicted"] = predicted.given, (B,)
-        if (past := requests.past) is not None:
-            expected["past"] = past.states, (B, N, n)
-            expected["past.inputs"] = past.inputs, (B, N + 1, m)
-            expected["past.given"] = past.given, (B,)
-        for name, (value, shape) in expected.items():
-            if tuple(value.shape) != shape:
-                raise BadRequest(name, f"{name} has shape {tuple(value.shape)}, a batch of {B} requests has {shape}")
-        counts = on_host(obstacles.count)
-        if counts.size and not (counts.min() >= 0 and counts.max() <= K):
-            raise BadRequest("obstacles.count", f"a row has from 0 to {K} obstacles")
-        if not isinstance(requests.model, str) and len(requests.model) != B:
-            raise BadRequest("model", f"model has {len(requests.model)} versions, a batch of {B} requests has {B}")
+        return DecisionArrays(
+            **answers,
+            singly=singly,
+            obstacles=requests.obstacles,
+            model=self.safety.version,
+            bound=self.safety.bound,
+            judges=self.safety.model.one_step is not None,
+            time_ms=time_ms,
+        )
 
 
-def _about(about: tuple[str, float | None, bool]) -> dict[str, Any]:
-    return dict(zip(("model", "bound", "judges"), about, strict=True))
+def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:
+    """Check the shapes and types of all arrays. Raises BadRequest with the field's name."""
+    B, K = len(requests), requests.obstacles.rho.shape[1]
+    types = {"b": xp.bool, "f": xp.float64}
+    for name, value, kind, shape in _expected(robot, requests):
+        if tuple(value.shape) != (B, *shape):
+            raise BadRequest(name, f"{name} has shape {tuple(value.shape)}, a batch of {B} requests has {(B, *shape)}")
+        if kind in types and value.dtype != types[kind]:
+            raise BadRequest(name, f"{name} has the type {value.dtype}, not {types[kind]}")
+    counts = on_host(requests.obstacles.count)
+    if counts.size and not (counts.dtype.kind == "i" and counts.min() >= 0 and counts.max() <= K):
+        raise BadRequest("obstacles.count", f"obstacles.count holds integers from 0 to {K}, the number of slots")
+    if not isinstance(requests.model, str) and len(requests.model) != B:
+        raise BadRequest("model", f"model has {len(requests.model)} versions, a batch of {B} requests has {B}")
+
+
+def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Array, str, tuple[int, ...]]]:
+    """Yield the name of each array, the array, its type (f: float64, b: bool) and the shape of its rows."""
+    n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
+    obstacles, K = requests.obstacles, requests.obstacles.rho.shape[1]
+    yield "state", requests.state, "f", (n,)
+    yield "action", requests.action, "f", (m,)
+    yield "input_in_force", requests.input_in_force, "f", (m,)
+    yield "plan", requests.plan, "f", (N, m)
+    yield "known_free", requests.known_free, "b", ()
+    yield "obstacles", obstacles.center, "f", (K, d)
+    yield "obstacles.axes", obstacles.axes, "f", (K, d, d)
+    yield "obstacles.half", obstacles.half, "f", (K, d)
+    yield "obstacles.round", obstacles.round, "f", (K, d)
+    yield "obstacles.rho", obstacles.rho, "f", (K,)
+    yield "obstacles.margin", obstacles.margin, "f", (K,)
+    yield "obstacles.count", obstacles.count, "i", ()
+    if requests.widening is not None:
+        yield "widening", requests.widening, "f", ()
+    if (predicted := requests.predicted) is not None:
+        yield "predicted_center", predicted.center, "f", (n,)
+        yield "predicted_half_width", predicted.half_width, "f", (n,)
+        yield "predicted_heading", predicted.heading, "f", ()
+        yield "predicted", predicted.given, "b", ()
+    if (past := requests.past) is not None:
+        yield "past", past.states, "f", (N, n)
+        yield "past.inputs", past.inputs, "f", (N + 1, m)
+        yield "past.from_start", past.from_start, "b", ()
+        yield "past.given", past.given, "b", ()
 
 
 def _blank(safety: Filter, requests: RequestArrays, xp: Any, device: Any) -> dict[str, Any]:

@@ -39,6 +39,7 @@ class LaneDecisions:
         self._search = SearchBatch(safety, constant, xp)
         self._constraints = self._search.constraints
         self._clearance, self._reach = safety.clearance_margin, base.reach
+        self._start = safety.start
         self._furthest = max(robot.sight, base.reach)
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
@@ -109,7 +110,7 @@ class LaneDecisions:
         given = robot.committed_steps * m
         z_0 = xp.concat([xp.take(state, self._regressor, axis=0), before, plan[:given]])
         proposal = self._search.limited(action, z_0[z_0.shape[0] - m :])
-        widening = xp.ones_like(state[0]) if requests.widening is None else xp.take(requests.widening, rows, axis=0)
+        widening = self._widening(requests, rows)
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
         obstacles = ObstacleArrays(*(xp.take(part, rows, axis=0) for part in vars(requests.obstacles).values()))
@@ -118,6 +119,15 @@ class LaneDecisions:
         far = (widening > 1.0) | self._constraints.base_far
         scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
+
+    def _widening(self, requests: RequestArrays, rows: Array) -> Array:
+        """Return the factors (B,) on the sets of rows: larger where an episode has begun, as in `Filter.decide`."""
+        xp, past = self._xp, requests.past
+        factor = xp.ones_like(rows, dtype=xp.float64)
+        if requests.widening is not None:
+            factor = xp.take(requests.widening, rows, axis=0)
+        begun = xp.ones_like(rows, dtype=xp.bool) if past is None else ~xp.take(past.given, rows, axis=0)
+        return xp.where(begun, factor * self._start, factor)
 
     def _turn(self, state: Array) -> TurnBatch:
         """Return the rotations from the robots' frames to the world."""
@@ -261,7 +271,9 @@ class LaneDecisions:
             for part in (past.states, past.inputs)
         )
         now = xp.asarray(xp.permute_dims(xp.take(state, given, axis=0), (1, 0)), copy=True)
-        answers["score"][to], answers["scored"][to] = self._score(states, inputs, now), True
+        score = self._score(states, inputs, now)
+        begun = xp.take(past.from_start, to, axis=0)
+        answers["score"][to], answers["scored"][to] = xp.where(begun, score / self._start, score), True
 
     def _blocking(self, plan: PlanBatch, scene: SceneBatch, margin: Array) -> dict[str, Array]:
         """Return the arrays of a `BlockingArrays` for proposals: `TubeConstraints.worst_of`."""

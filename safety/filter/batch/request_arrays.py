@@ -39,16 +39,18 @@ class PredictionArrays:
 class PastArrays:
     """The last periods of each robot: `PastWindow` for each robot that has one.
 
-    >>> PastArrays(states=np.zeros((2, 3, 5)), inputs=np.zeros((2, 4, 2)), given=np.ones(2, dtype=bool)).inputs.shape
+    >>> both = np.ones(2, dtype=bool)
+    >>> PastArrays(np.zeros((2, 3, 5)), np.zeros((2, 4, 2)), from_start=~both, given=both).inputs.shape
     (2, 4, 2)
 
     Attributes:
-        states (B, N, n), inputs (B, N + 1, m).
+        states (B, N, n), inputs (B, N + 1, m), from_start (B,).
         given (B,): whether the robot has one; the other rows are ignored.
     """
 
     states: Array
     inputs: Array
+    from_start: Array
     given: Array
 
 
@@ -105,7 +107,7 @@ class RequestArrays:
         given = np.array([request.predicted is not None for request in requests])
         center, half_width, heading = _packed(requests, "predicted", ("center", "half_width", "heading"))
         windows = np.array([request.past is not None for request in requests])
-        states, inputs = _packed(requests, "past", ("states", "inputs"))
+        states, inputs, from_start = _packed(requests, "past", ("states", "inputs", "from_start"))
         state, action, input_in_force, plan = (_stacked(name, requests) for name in _ARRAYS)
         return RequestArrays(
             state,
@@ -117,7 +119,7 @@ class RequestArrays:
             widening=np.array([request.widening for request in requests], dtype=float),
             model=[request.model for request in requests],
             predicted=PredictionArrays(center, half_width, heading, given) if given.any() else None,
-            past=PastArrays(states, inputs, windows) if windows.any() else None,
+            past=PastArrays(states, inputs, from_start > 0.0, windows) if windows.any() else None,
         )
 
     def row(self, index: int) -> Request:
@@ -127,7 +129,8 @@ class RequestArrays:
             center, half_width = on_host(sets.center[index]), on_host(sets.half_width[index])
             predicted = Prediction(center, half_width, float(sets.heading[index]))
         if (windows := self.past) is not None and bool(windows.given[index]):
-            past = PastWindow(on_host(windows.states[index]), on_host(windows.inputs[index]))
+            parts = on_host(windows.states[index]), on_host(windows.inputs[index])
+            past = PastWindow(*parts, bool(windows.from_start[index]))
         state, action, input_in_force, plan = (on_host(getattr(self, name)[index]) for name in _ARRAYS)
         return Request(
             state,
