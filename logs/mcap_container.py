@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -95,6 +95,7 @@ class LogChannel:
     Attributes:
         decode: None for an unknown message type.
         robot, actor: the second and third part of the key, e.g. "ground" and "actor-0".
+        names: the names in the key of one of our topics, by field.
         sequence: of the message that was read last.
     """
 
@@ -105,6 +106,7 @@ class LogChannel:
     channel: Channel | None = None
     robot: str = ""
     actor: str = ""
+    names: dict[str, str] = field(default_factory=dict)
     sequence: int = 0
 
     def __post_init__(self) -> None:

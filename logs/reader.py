@@ -22,13 +22,15 @@ from brakeline.logs.mcap_contents import is_ros
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.run_clock import RunClock
 from brakeline.logs.segment import ABOUT, CLOCK, STEADY, being_written, name_of, number_of
+from brakeline.messaging.bus.stated_names import check_names
+from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import check
 from brakeline.messaging.topics import TOPICS
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 TYPES: dict[str, type[Message]] = {topic.message.DESCRIPTOR.full_name: topic.message for topic in TOPICS}
-NAMES: dict[str, str] = {topic.key.split("/", 1)[0]: topic.name for topic in TOPICS}
+ROOTS = {topic.key.split("/", 1)[0]: topic for topic in TOPICS}
 
 
 class Record(NamedTuple):
@@ -103,11 +105,15 @@ class Log:
             yield Record(series.topic, series.key, message, log_time, publish_time)
 
     def decoded(self) -> Iterator[tuple[LogChannel, Any, int, int]]:
-        """Yield (channel, message, log_time, publish_time) for each valid message: faster than iterating."""
+        """Yield (channel, message, log_time, publish_time) for each valid message: faster than iterating.
+
+        A message that names another robot or process than its key is not valid, as for the processes that received it.
+        """
         for series, log_time, publish_time, payload in self.rows():
             try:
                 message = series.decode(payload)
                 check(message)
+                check_names(series.names, message)
             except (DecodeError, Implausible):
                 self.malformed += 1
                 continue
@@ -155,7 +161,10 @@ class Log:
     @staticmethod
     def _channel(key: str, schema: str) -> LogChannel:
         kind, root = TYPES.get(schema), key.split("/", 1)[0]
-        return LogChannel(NAMES.get(root, root), key, None if kind is None else kind.FromString)
+        topic = ROOTS.get(root)
+        names = {} if topic is None else names_of(topic, key)
+        name = root if topic is None else topic.name
+        return LogChannel(name, key, None if kind is None else kind.FromString, names=names)
 
 
 def find(paths: Paths) -> tuple[Path, ...]:

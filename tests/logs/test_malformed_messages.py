@@ -28,7 +28,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, LOG, RECORDED, STEP, Topic
+from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, HEALTH, LOG, RECORDED, STEP, Topic
 from tests.fuzz.message_fuzzer import MessageFuzzer
 from tests.logs.conftest import Say
 
@@ -150,6 +150,18 @@ def test_an_analysis_counts_malformed_messages_and_goes_on(say: Say, tmp_path: P
     figures = analysed.figures()
     assert figures["actors"]["b"]["episodes"] == 1 and figures["malformed"] >= 5
     analysed.by_label()
+
+
+def test_a_message_that_names_another_process_than_its_key_counts_for_nobody(say: Say, tmp_path: Path) -> None:
+    """The recorder stores the bytes that it receives, also those that every other process refuses."""
+    step = pb.Step(robot="ground", actor="b", state=[0.0] * 5)
+    forged = pb.Step(robot="ground", actor="b", state=[0.0] * 5, step=1, collision=True, truncated=True)
+    life = pb.Health(process="b", last=True)
+    others = [sample(STEP, forged), sample(STEP, pb.Step(robot="quadrotor", actor="a")), sample(HEALTH, life)]
+    record(tmp_path / "run.mcap", [say("step/ground/b", step), *others])
+    figures = analyse_runs(tmp_path, AnalysisOptions()).figures()
+    assert (figures["steps"], figures["collisions"], figures["malformed"]) == (1, 0, 3)
+    assert list(figures["actors"]) == ["b"] and not figures["processes"]
 
 
 def chunk_of(size: int, compression: str, frame: bytes) -> bytes:
