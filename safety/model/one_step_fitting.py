@@ -25,6 +25,7 @@ from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import Features, OneStep, features_for
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import (
+    MOST_FOR_SHAPE,
     Shape,
     plans_from,
     shape_with_chords,
@@ -45,7 +46,7 @@ DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
 FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
 SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
-MOST_FOR_WEIGHT = 6000  # windows by which the weight is chosen
+WORTH_SPEEDS = 1.05  # half-widths grow with the speeds too if sets are this much wider otherwise
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
@@ -326,12 +327,12 @@ def _weight_and_speeds(
     """Return the weight of the leverage, and whether half-widths grow with the speeds, for the narrowest sets of plans.
 
     What counts are the last sets, on average of plans and of a stop from full speed. Of several nearly as narrow, take
-    the largest weight, then a shape without speeds.
+    the largest weight. Slopes on the speeds must be worth it.
     Without the leverage, one factor widens all sets because some windows at the edge of the data are predicted badly,
     and sets outside of the data are as narrow as within. Minutes of driving may hold few errors at a large speed that
     the inputs do not announce, such as the sway of a boat: then a slope on that speed is mostly noise.
     """
-    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_WEIGHT)).astype(int)
+    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
     plans, full, pairs = plans_from(robot, z), stop_from_full_speed(robot, z), [*product(WEIGHTS, (True, False))]
@@ -348,8 +349,9 @@ def _weight_and_speeds(
                 wide = shape.widths(robot, some_plans, last=True)[:, 0] * np.sqrt(1.0 + weight * leverage)
                 sums[p] += wide.mean()
     found = dict(zip(pairs, np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * sums, strict=True))
-    good = [pair for pair, width in found.items() if width <= SIMPLER * min(found.values())]
-    return max(good, key=lambda pair: (pair[0], not pair[1]))
+    least = {speeds: min(width for pair, width in found.items() if pair[1] == speeds) for speeds in (True, False)}
+    speeds = bool(least[False] > WORTH_SPEEDS * least[True])
+    return max(w for w in WEIGHTS if found[w, speeds] <= SIMPLER * least[speeds]), speeds
 
 
 def _scores(
