@@ -26,6 +26,7 @@ from brakeline.safety.model.one_step import Features, OneStep, features_for
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import (
     MOST_FOR_SHAPE,
+    RARE,
     Shape,
     plans_from,
     shape_with_chords,
@@ -46,7 +47,6 @@ DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
 FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
 SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
-WORTH_SPEEDS = 1.05  # half-widths grow with the speeds too if sets are this much wider otherwise
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
@@ -267,15 +267,13 @@ def fit_one_step(
     chosen, candidates, regression = choose(robot, s, progress)
     progress(CHOSEN)
     weight, speeds = _weight_and_speeds(robot, s, regression, chosen.ridge, model_config.outside)
-    scores, positions, others = _scores(
-        robot, s, regression, chosen.ridge, weight, speeds, model_config.outside, progress
-    )
+    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, speeds, progress)
     kinds = driving_kinds(robot, s.z, s.start)
     joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
     factors = SetFactors.of(scores, others, kinds, model_config.outside, one=joint_space)
     one_step = replace(regression.fit(chosen.ridge, weight=weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds, model_config.outside)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factors.plan)
     first_scale = np.where(np.arange(n) < d, factors.plan, factors.first)
@@ -343,14 +341,14 @@ def _weight_and_speeds(
         leverages, *of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
         for p, (weight, speeds) in enumerate(pairs):
             errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
-            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds, outside=outside)
+            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds, outside=RARE)
             scores[p, held] = shape.scores(robot, z[held], errors[held], last=True)
             for some_plans, leverage in zip((plans, full), of_plans, strict=True):
                 wide = shape.widths(robot, some_plans, last=True)[:, 0] * np.sqrt(1.0 + weight * leverage)
                 sums[p] += wide.mean()
     found = dict(zip(pairs, np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * sums, strict=True))
     least = {speeds: min(width for pair, width in found.items() if pair[1] == speeds) for speeds in (True, False)}
-    speeds = bool(least[False] > WORTH_SPEEDS * least[True])
+    speeds = bool(least[False] > SIMPLER * least[True])
     return max(w for w in WEIGHTS if found[w, speeds] <= SIMPLER * least[speeds]), speeds
 
 
@@ -361,7 +359,6 @@ def _scores(
     ridge: float,
     weight: float,
     speeds: bool,
-    outside: float,
     progress: Progress,
 ) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
@@ -377,7 +374,7 @@ def _scores(
         held = s.fold == i
         one_step = regression.fit(ridge, i, weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds, outside)
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds)
         widths = shape.widths(robot, s.z[held])
         used = shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = used[..., for_plan].max((1, 2))

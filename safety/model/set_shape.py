@@ -13,7 +13,8 @@ from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
-FULL_SPEED = 0.25  # weight of a stop from full speed among the plans for which a shape is tightest
+FULL_SPEED = 0.1  # weight of a stop from full speed among the plans for which a shape is tightest
+RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
@@ -145,11 +146,11 @@ def shares(errors: Array, widths: Array) -> Array:
         return np.where(errors > 0.0, errors / widths, 0.0)
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool, outside: float) -> Shape:
-    """Return the shape of the errors but a share `outside`, and of the chord deviations as a further coordinate."""
+def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool) -> Shape:
+    """Return the shape of all errors but rare ones, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
-    shape = Shape.around(robot, z[some], both, speeds=speeds, outside=outside)
+    shape = Shape.around(robot, z[some], both, speeds=speeds, outside=RARE)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
