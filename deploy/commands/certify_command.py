@@ -40,11 +40,11 @@ class CertifyCommand:
     """The options of `brakeline certify`."""
 
     data: Annotated[Path | None, tyro.conf.Positional] = None
-    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use of
-    --robot."""
+    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use
+    of --robot."""
     certificates: tuple[str, ...] = ()
-    """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you give
-    --mode direct or recursion."""
+    """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you
+    give --mode direct or recursion."""
     mode: Literal["one-step", "direct", "recursion"] | None = None
     """Validate this prediction mode; one-step rolls out one learned period. Defaults to one-step, or to direct and
     recursion if you give --certificates. A robot that stops by feedback has no mode one-step."""
@@ -52,8 +52,8 @@ class CertifyCommand:
     """Fit and validate on this driving: plan for plans as the filter makes them, free for any, auto for any if there
     are too few plans."""
     few: bool = False
-    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled by 1.5
-    instead of 1.15, as after `collect --url`."""
+    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled
+    by 1.5 instead of 1.15, as after `collect --url`."""
     outside: float = ModelConfig.outside
     """Share of the recorded plans that may leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""
@@ -67,8 +67,8 @@ class CertifyCommand:
     """Write the model sets to where the other commands load them from."""
     accept_bound: options.AcceptBound = None
     publish: bool = False
-    """Replace the model set of running safety services by the first of --certificates, in direct mode unless you give
-    --mode."""
+    """Replace the model set of running safety services by the first of --certificates, in direct mode unless you
+    give --mode."""
     endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
     verbose: bool = False
     """Show also the conditions of the recording: sensor errors, wind, payload."""

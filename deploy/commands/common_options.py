@@ -84,8 +84,8 @@ class FilterOptions:
     """Use a model set with this error bound (see docs/certificates.md)."""
     mode: Mode = "auto"
     """Predict in this mode: one-step rolls out one learned period, direct uses one linear predictor for each period of
-    the plan, recursion repeats the paper's linear model, and auto takes the model set that was last put to use
-    (one-step or direct)."""
+    the plan, recursion repeats the paper's linear model, and auto takes the model set that was last put to
+    use (one-step or direct)."""
 
     def model_config(self) -> ModelConfig:
         """Return the configuration of the model set that the options select."""
@@ -118,8 +118,8 @@ class PhysicsOptions:
     gust: float = 0.0
     """Let the wind vary on each axis with this standard deviation [m/s]."""
     perception: Literal["map", "scan"] = "map"
-    """Take free space from this source: the arena's map, or the scan of a sensor (360 beams on the ground, 90 rings of
-    180 beams in the air)."""
+    """Take free space from this source: the arena's map, or the scan of a sensor (360 beams on the ground, 90 rings
+    of 180 beams in the air)."""
     dropped: float = 0.0
     """Let this share of the beams of a scan return nothing."""
     false_far: float = 0.0

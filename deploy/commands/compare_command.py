@@ -60,8 +60,8 @@ class CompareCommand:
     conservatism: bool = True
     """Make also the table of error bounds and modes, with the stored policy."""
     penalty: float = 1.0
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Give another
-    --results folder if you change it or --td3."""
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Give
+    another --results folder if you change it or --td3."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     """Store the tables and figures in this folder."""

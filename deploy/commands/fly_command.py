@@ -32,8 +32,8 @@ class FlyCommand:
     minutes: float = 10.0
     """Fly for this long [min]."""
     policy: str = "astar"
-    """Let this policy fly: trained, untrained, random, greedy, adversary, astar, careful or a weights file. With
-    `learn`, learn a policy from the flight."""
+    """Let this policy fly: trained, untrained, random, greedy, adversary, astar, careful or a weights file.
+    With `learn`, learn a policy from the flight."""
     url: tuple[str, ...] = ()
     """Fly the vehicles behind these links: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. Each vehicle flies alone
     on its own map, and all share one safety service. Without a link the command simulates the vehicles."""

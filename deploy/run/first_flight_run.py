@@ -35,8 +35,8 @@ class FirstFlightSettings:
     """Raise the parameters of the vehicle that limit it below its description: speeds, accelerations, tilt."""
     lead: bool = False
     """Send position targets instead of velocities. When setpoints stop, the vehicle then stays at the last target; an
-    ArduCopter without GUID_TIMEOUT would fly on for 3 s. The vehicle flies differently then: use the option with both
-    `collect` and `fly`."""
+    ArduCopter without GUID_TIMEOUT would fly on for 3 s. The vehicle flies differently then: use the option with
+    both `collect` and `fly`."""
 
 
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> FirstFlightResult:
