@@ -118,6 +118,8 @@ def test_a_crowd_before_the_foxglove_server_keeps_nobody_out(
 def test_the_one_that_waited_longest_gives_way_and_one_that_is_served_does_not() -> None:
     slots, pairs = ConnectionSlots(2), [socket.socketpair() for _ in range(4)]
     first, second, third, fourth = (pair[0] for pair in pairs)
+    for _, client in pairs:
+        client.settimeout(10.0)  # s: of a client that is not cut off
     assert slots.enter(first) and slots.enter(second)
     slots.serve(first)
     assert slots.enter(third), "in the place of the second"
