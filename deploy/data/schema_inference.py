@@ -16,16 +16,18 @@ import numpy as np
 
 from brakeline.deploy.data.aligned_log import AlignedLog, align, joined
 from brakeline.deploy.data.glitches import without_glitches
-from brakeline.deploy.data.input_delay import estimate_delay
+from brakeline.deploy.data.input_response import (
+    braking_per_period,
+    delay_of,
+    followers_of_inputs,
+    largest_change,
+    moves_alone,
+)
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
 from brakeline.deploy.data.message_columns import FIELDS
 from brakeline.deploy.data.message_columns import HEADING as HEADING_NAME
 from brakeline.deploy.data.motion_check import (
-    FEWEST_SPANS,
-    MAX_LAG,
     SAME_CORRELATION,
-    SPAN,
-    agreement,
     heading_contradiction,
     heading_unit,
     same_gain,
@@ -57,7 +59,6 @@ SPACE = FLYING | {f"acceleration.{axis}": (f"a{axis}", "m/s2") for axis in AXES}
 INPUTS = STATES | {"steering": ("steering", "rad"), "acceleration": ("acceleration", "m/s2")}
 JUMP = 0.8  # share of an input's range: an input that changes more in one period has no slew limit
 HELD = 0.5  # share of rows that repeat the row before: only inputs, which are held, repeat this often
-FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
 MOST_UNKNOWN = 3  # columns of a file that nothing is known of; more are left out
 FLAT = 1e-3  # m: a standard deviation of z below it is noise of a robot in the plane
 CHOSEN_PERIOD = 0.1  # s, where the log shows no beat
@@ -123,7 +124,7 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
         notes += _find_heading(log)
         _find_speeds(log, options)
     others = [n for n in log.columns if n not in (*log.positions, log.heading, *log.inputs)]
-    pairs = _followers(log, others)
+    pairs = followers_of_inputs(log, others)
     for name, follower in pairs.items():
         log.units.setdefault(name, log.units.get(follower, ""))
     known = {*pairs.values(), *options.fields, *FIELDS, HEADING_NAME}
@@ -200,15 +201,20 @@ def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> li
     states = [_column(log, name, role="position", unit="m") for name in log.positions]
     states += [_column(log, log.heading, role="heading", unit="rad")] if log.heading in log.columns else []
     return states + [
-        _column(log, n, follows=_plain(leader[n], log), change=_braking(log, n), delay=_delay(log, leader[n], n))
+        _column(
+            log, n, follows=_plain(leader[n], log), change=braking_per_period(log, n), delay=delay_of(log, leader[n], n)
+        )
         if n in leader
-        else _column(log, n, change=_braking(log, n))
+        else _column(log, n, change=braking_per_period(log, n))
         for n in others
     ]
 
 
 def _inputs(log: AlignedLog) -> list[InferredColumn]:
-    return [_column(log, n, name=_plain(n, log), change=_slew(log, n), moves=_moves(log, n)) for n in log.inputs]
+    return [
+        _column(log, n, name=_plain(n, log), change=largest_change(log, n), moves=moves_alone(log, n))
+        for n in log.inputs
+    ]
 
 
 def _column(log: AlignedLog, column: str, name: str = "", unit: str = "", **more: Any) -> InferredColumn:
@@ -364,68 +370,3 @@ def _find_speeds(log: AlignedLog, options: LogOptions) -> None:
             problems.append(problem)
     if problems:
         raise NoSource("\n".join((*problems, "If a column is no speed, give it --unit NAME=1")))
-
-
-def _followers(log: AlignedLog, others: Sequence[str]) -> dict[str, str]:
-    """Return for each input the coordinate that follows it."""
-    # NAME follows `command NAME` by definition, however slowly.
-    named = {name: name.removeprefix(f"{COMMAND} ") for name in log.inputs}
-    pairs = {name: other for name, other in named.items() if other in others}
-    fits = [
-        (_lagged_correlation(log, name, other), name, other)
-        for name in log.inputs
-        for other in others
-        if log.units.get(name, "") in ("", log.units.get(other, "")) or not log.units.get(other)
-    ]
-    for score, name, other in sorted(fits, reverse=True):
-        if score > FOLLOWS_CORRELATION and name not in pairs and other not in pairs.values():
-            pairs[name] = other
-    return pairs
-
-
-def _lagged_correlation(log: AlignedLog, name: str, other: str) -> float:
-    """Return the best correlation of an input with a coordinate up to `MAX_LAG` later; 0 if the gain is not near 1."""
-    lags = np.arange(0.0, MAX_LAG, max(log.step, 0.025))
-    pairs = (log.rows_apart(round(lag / log.step)) for lag in lags)
-    return max(_near_correlation(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
-
-
-def _near_correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 if the gain is not near 1."""
-    value, gain = agreement(one, other)
-    return value if same_gain(gain) else 0.0
-
-
-def _delay(log: AlignedLog, name: str, follower: str) -> float | None:
-    """Return the delay in s from an input to the coordinate that follows it, or None if nothing moved."""
-    series = [(log.time[r], log.columns[name][r], log.columns[follower][r]) for r in log.runs()]
-    recordings = [((t, u), (t, values), float(t[0]), float(t[-1])) for t, u, values in series]
-    return estimate_delay(recordings, log.period)
-
-
-def _slew(log: AlignedLog, name: str) -> float:
-    """Return the largest change of an input over one period."""
-    return float(np.abs(log.change(name, *log.spans(log.period))).max())
-
-
-def _braking(log: AlignedLog, name: str) -> float:
-    """Return the 95 % quantile of the decrease of a coordinate's magnitude per period, without noise."""
-    i, j = log.spans(log.period)
-    size = np.abs(log.columns[name])
-    decrease = size[i] - size[j]
-    decrease = decrease[decrease > 0.02 * size.max()]
-    return float(np.quantile(decrease, 0.95)) if len(decrease) >= FEWEST_SPANS else 0.0
-
-
-def _moves(log: AlignedLog, name: str) -> bool | None:
-    """Return whether the input moves the robot while all others are zero; None if that was never recorded."""
-    i, j = log.spans(max(2.0 * log.period, SPAN))
-    way = np.linalg.norm([log.change(p, i, j) for p in log.positions], axis=0)
-    sizes = {n: np.abs(log.columns[n]) / np.abs(log.columns[n]).max() for n in log.inputs}
-    alone = np.all([size > 0.2 if n == name else size <= 0.05 for n, size in sizes.items()], axis=0)
-    count = np.concatenate([[0], np.cumsum(alone)])
-    before = np.maximum(i - (j - i), 0)  # and for as long before, so that earlier motion has ended
-    isolated = way[count[j + 1] - count[before] == j + 1 - before]
-    if len(isolated) < FEWEST_SPANS:
-        return None
-    return bool(np.quantile(isolated, 0.5) > 0.1 * np.quantile(way, 0.9))

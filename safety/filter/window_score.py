@@ -20,9 +20,9 @@ class WindowScore:
         kappa, M, w = (np.array([getattr(step, name)[:n] for step in model.steps]) for name in ("kappa", "M", "w"))
         scored = np.array(scored_coordinates(robot), dtype=np.int64)
         W = np.ascontiguousarray(model.first.W)  # the same for all periods
-        from brakeline.safety.filter.kernels import rollout_kernels
+        from brakeline.safety.filter.kernels import window_kernels
 
-        self._score, self._predictor = rollout_kernels.score, one_step.stretch_arguments(robot)
+        self._score, self._predictor = window_kernels.score, one_step.stretch_arguments(robot)
         self._sets = W, M, kappa, w, scored
         self._start = one_step.start
 

@@ -197,7 +197,7 @@ def score(
     w,
     scored,
 ):
-    """`rollout_kernels.score`."""
+    """`window_kernels.score`."""
     window = np.concatenate([states[0, others], executed.ravel()])
     parts = C, scale, saturations, terms, others, heading, arms, d, inputs
     after, turn = states[1:].copy(), np.eye(d)

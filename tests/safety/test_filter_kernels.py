@@ -10,12 +10,13 @@ from brakeline.safety.filter.kernels import (
     rollout_kernels,
     shape_kernels,
     tube_kernels,
+    window_kernels,
 )
 from tests.safety import kernel_twins
 
 N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors, free inputs
 MAGNITUDES = L + N + 1
-MODULES = halfspace_kernels, tube_kernels, plan_inputs, rollout_kernels, shape_kernels
+MODULES = halfspace_kernels, tube_kernels, plan_inputs, rollout_kernels, shape_kernels, window_kernels
 
 
 def turned(rng, d):

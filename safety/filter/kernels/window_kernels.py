@@ -1,0 +1,73 @@
+"""Compiled score of a window that has ended (docs/method.md §15); arguments as in `rollout_kernels`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from brakeline.safety.compilation import compiled
+from brakeline.safety.filter.kernels.rollout_kernels import SHARED, Array, Index, rollouts, stretches
+
+
+@compiled(f"f8({SHARED}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1])")
+def score(
+    C: Array,
+    scale: Array,
+    saturations: Array,
+    terms: Index,
+    others: Index,
+    heading: int,
+    arms: Array,
+    d: int,
+    inputs: int,
+    root: Array,
+    weight: float,
+    states: Array,
+    executed: Array,
+    W: Array,
+    M: Array,
+    kappa: Array,
+    w: Array,
+    scored: Index,
+) -> float:
+    """Return the largest ratio of an error to its set in a window that has ended, or NaN if one is NaN.
+
+    Args:
+        states (N + 1, n): measured states. executed (N + 1, m): the input in force before, and the inputs.
+        W (q, nz), M (N, n, q), kappa (N, n, nz), w (N, n): the sets' half-widths, M |W z| + kappa |z| + w.
+        scored: indices of the coordinates that count after every period. After the first, all count.
+    """
+    shared, r = (C, scale, saturations, terms, others, heading, arms, d, inputs), len(others)
+    z = np.empty((1, r + executed.size))
+    window = z[0]
+    for i in range(r):
+        window[i] = states[0, others[i]]
+    window[r:] = executed.ravel()
+    predicted, stretch = rollouts(*shared, z)[0], stretches(*shared, root, weight, z)[0]
+    atoms, first, largest = np.zeros(len(W)), states[0], 0.0
+    for i in range(len(W)):
+        for j in range(len(window)):
+            atoms[i] += W[i, j] * window[j]
+    atoms = np.abs(atoms)
+    cos, sin = (math.cos(first[heading]), math.sin(first[heading])) if heading >= 0 else (1.0, 0.0)
+    for k in range(len(w)):
+        after = states[k + 1].copy()
+        for axis in range(d):
+            after[axis] -= first[axis]
+        if heading >= 0:
+            east, north = after[0], after[1]
+            after[0], after[1] = cos * east + sin * north, cos * north - sin * east
+            after[heading] = (after[heading] - first[heading] + math.pi) % math.tau - math.pi
+        for at in range(len(after) if k == 0 else len(scored)):
+            i = at if k == 0 else scored[at]
+            off, width = abs(after[i] - predicted[k, i]), w[k, i]
+            for j in range(len(window)):
+                width += kappa[k, i, j] * abs(window[j])
+            for j in range(len(atoms)):
+                width += M[k, i, j] * atoms[j]
+            share = off / (width * stretch[k]) if off != 0.0 else 0.0
+            if share != share:
+                return share
+            largest = max(largest, share)
+    return largest
