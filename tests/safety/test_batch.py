@@ -163,10 +163,11 @@ def test_past_windows_are_scored(filters):
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
 
 
-def test_torch_gives_the_same_answers_in_its_own_tensors():
+@pytest.mark.parametrize(("crowd", "rows"), [(0.9, 120), (0.0, 5)])
+def test_torch_gives_the_same_answers_in_its_own_tensors(crowd, rows):
     torch = pytest.importorskip("torch")
     ready, rng = ground(), np.random.default_rng(5)
-    requests = RequestArrays.of([scene(rng, ready, crowd=0.9) for _ in range(120)])
+    requests = RequestArrays.of([scene(rng, ready, crowd) for _ in range(rows)])
     theirs, ours = ready.decide_batch(moved(requests, torch.asarray)), ready.decide_batch(requests)
     assert isinstance(theirs.plan, torch.Tensor) and set(theirs.singly) == set(ours.singly)
     assert theirs.kind.tolist() == ours.kind.tolist()
