@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-WORTH_A_BATCH = 64  # requests; fewer are decided sooner one by one
+WORTH_A_BATCH = 20  # requests for each period of a plan; fewer are decided sooner one by one
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -233,7 +233,7 @@ class Filter:
         from brakeline.safety.filter.batch.request_arrays import RequestArrays
 
         fitting = [i for i, request in enumerate(requests) if RequestArrays.fits(request, self.ordinary)]
-        if len(fitting) < WORTH_A_BATCH or not self._batch.covers:
+        if len(fitting) < WORTH_A_BATCH * self.robot.horizon or not self._batch.covers:
             return [self.decide(request) for request in requests]
         for i in fitting:
             check_surroundings(self.robot, requests[i])

@@ -32,6 +32,7 @@ from tests.safety.test_one_step import ready as one_step
 from tests.safety.test_qp_solver import crowded
 
 SAME = 1e-6
+WORTH = 3 * WORTH_A_BATCH  # of the ground robot
 FORMS = ("ground direct", "ground recursion", "two discs", "one-step", "real time", "quadrotor direct")
 LONG = Disc((0.08, 0.02), 0.07), Disc((-0.08, 0.0), 0.09)
 
@@ -116,6 +117,12 @@ def check_same(ready, requests, answers):
         assert (batch.blocked_by and batch.blocked_by.by) == (single.blocked_by and single.blocked_by.by)
         assert apart(batch, single) < SAME, row
         assert batch.reason == single.reason
+
+
+@pytest.fixture(autouse=True)
+def _whole_searches(monkeypatch):
+    """Let no tail of a search go to the single path for its small number of lanes."""
+    monkeypatch.setattr(search_batch, "FEW", 1)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -280,7 +287,7 @@ def test_a_robot_that_batches_do_not_cover_is_decided_singly(monkeypatch):
 
 def test_decide_all_keeps_the_order_and_decides_singly_what_does_not_fit():
     ready, rng = ground(), np.random.default_rng(11)
-    requests = [scene(rng, ready) for _ in range(WORTH_A_BATCH + 10)]
+    requests = [scene(rng, ready) for _ in range(WORTH + 10)]
     mover = Obstacle("cylinder", (3.0, 0.0), (0.1,), motion=Motion(velocity=(0.0, 0.1), position_error=0.01, speed=0.2))
     requests[4] = replace(requests[4], movers=split_moving([mover], 2)[1])
     decisions = ready.decide_all(requests)
@@ -297,7 +304,7 @@ def test_a_client_in_process_asks_for_many_at_once(monkeypatch):
         ready, "decide_batch", lambda arrays, of=ready.decide_batch: asked.append(len(arrays)) or of(arrays)
     )
     client = InProcess(ready)
-    plans = [BackupPlan(ready.robot) for _ in range(WORTH_A_BATCH)]
+    plans = [BackupPlan(ready.robot) for _ in range(WORTH)]
     actions = rng.uniform([0.0, -0.5], [0.25, 0.5], (len(plans), 2))
     requests = [
         client.request(plan, np.zeros(5), action, known_free=True) for plan, action in zip(plans, actions, strict=True)

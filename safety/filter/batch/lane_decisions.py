@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 Array = Any  # of any namespace
 
-LANES = 512  # rows that a processor works on at once, so that they stay in its cache
+LANES, NUMBERS = 512, 1 << 17  # lanes, and their rows of half-spaces, that a processor's cache can hold
+FEWEST = 32  # lanes at once, whatever the number of obstacles
 MANY = 8  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
-LANES_ON_DEVICE = 1 << 16
+LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 16, 1 << 26
 HUGE = 1e100  # a larger number is left to the single path
 
 
@@ -49,7 +50,8 @@ class LaneDecisions:
         self._predicts = _NextState(safety, constant, xp)
         rollout = self._constraints.tube.rollout
         self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
-        self._lanes = LANES if str(device) == "cpu" else LANES_ON_DEVICE
+        at_home = str(device) == "cpu"
+        self._lanes, self._numbers = (LANES, NUMBERS) if at_home else (LANES_ON_DEVICE, NUMBERS_ON_DEVICE)
 
     def decide(self, requests: RequestArrays, answers: dict[str, Any]) -> Array:
         """Write what can be decided into `answers`; return which rows that is (B,)."""
@@ -140,11 +142,13 @@ class LaneDecisions:
         xp, near = self._xp, lanes.scene.near
         count = xp.sum(xp.astype(near.used, xp.int64), axis=0) if near.used.shape[0] else xp.zeros_like(lanes.z_0[0])
         order = xp.argsort(count, stable=True)
-        for first in range(0, order.shape[0], self._lanes):
+        first, rows = 0, rows_per_obstacle(self._constraints.N)
+        while first < order.shape[0]:
             own = order[first : first + self._lanes]
-            part = lanes.take(xp, own)
             most = int(xp.max(xp.take(count, own, axis=0)))
-            yield part.with_slots(most), own
+            own = own[: max(FEWEST, self._numbers // (rows * max(most, 1)))]
+            first += own.shape[0]
+            yield lanes.take(xp, own).with_slots(most), own
 
     def _allow(
         self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]

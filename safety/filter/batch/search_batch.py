@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Array = Any  # of any namespace
 
-FEW = 16  # lanes, below which the single path is faster than a further step of the search
+FEW = 24  # lanes, below which the single path is faster than a further step of the search
 
 
 @dataclass(frozen=True)
