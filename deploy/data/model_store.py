@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from brakeline.deploy.data.build_lock import folder_lock
-from brakeline.deploy.data.data_paths import method_path, model_path
+from brakeline.deploy.data.data_paths import method_path, model_path, record_path
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
@@ -35,6 +35,8 @@ def model_for(
     robot: Robot, model_config: ModelConfig, accept_bound: float | None = None, build: bool = True
 ) -> ModelSet:
     """Load the model set in use. If the file is missing or of another layout, record data and certify first.
+
+    In mode auto, a robot without a recording uses the model set that comes with Brakeline, if there is one.
 
     Args:
         robot: the robot, with its description of today.
@@ -95,6 +97,13 @@ def _existing(path: Path, robot: Robot) -> ModelSet:
 
 
 def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> ModelSet:
+    if model_config.mode == AUTO and not record_path(robot).exists() and (shipped := _shipped(robot)) is not None:
+        console.print(
+            f"{robot.name}: the model set that comes with Brakeline, {shipped.version} "
+            f"(`brakeline collect {robot.kind}` records data for one of your own)"
+        )
+        shipped.save(path)
+        return shipped
     from brakeline.deploy.data.certification import certify
     from brakeline.deploy.data.simulated_recording import data_for, load_or_record
 
@@ -115,6 +124,14 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
     )
     model.save(path)
     return model
+
+
+def _shipped(robot: Robot) -> ModelSet | None:
+    """Return the model set that comes with a robot, or None if there is none for this description."""
+    with suppress(BadModel):
+        model = ModelSet.load(robot.name)
+        return model if model.robot.layout() == robot.layout() else None
+    return None
 
 
 def method_for(

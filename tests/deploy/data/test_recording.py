@@ -18,7 +18,8 @@ from brakeline.errors import BadData
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.driving_kinds import driving_kinds
+from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kinds
+from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import windows
 from brakeline.sim.sim_conditions import Conditions
@@ -74,7 +75,8 @@ def test_restless_driving_jumps_in_its_plans_at_speed_and_with_all_inputs_togeth
     N = robot.horizon
     at = np.arange(0, len(inputs) - N, N)[:, None] + np.arange(N)
     z = np.hstack([np.zeros((len(at), robot.regressor_dim)), inputs[at].reshape(len(at), -1)])
-    restless = driving_kinds(robot, z, np.ones((len(at), 2), dtype=int))["restless inputs"]
+    kinds = driving_kinds(robot, z, np.ones((len(at), 2), dtype=int))
+    restless = kinds[RESTLESS] | kinds[JUMPING]
     assert restless.mean() > 0.2
     assert (np.abs(inputs) == robot.high()).all(1).mean() > 0.05, "all inputs at a bound together"
 
@@ -103,6 +105,20 @@ def elsewhere(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(simulated_recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
+
+
+def test_a_robot_without_a_recording_uses_the_model_set_that_comes_with_it(elsewhere):
+    automatic = ModelConfig(mode=AUTO)
+    model = model_store.model_for(GROUND, automatic)
+    assert model.version == ModelSet.load("ground").version and not elsewhere
+    assert ModelSet.load(data_paths.model_path(GROUND, automatic)).version == model.version
+    late = replace(QUADROTOR, name="another")
+    assert model_store._shipped(late) is None and model_store._shipped(GROUND.in_real_time()) is None
+    data_paths.model_path(GROUND, automatic).unlink()
+    model_store.model_for(GROUND, ModelConfig(), BOUND)  # asked for by its mode, so it is built from data
+    data_paths.model_path(GROUND, automatic).unlink()
+    assert model_store.model_for(GROUND, automatic, BOUND).version != model.version, "there is a recording"
+    assert len(elsewhere) == 1
 
 
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
