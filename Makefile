@@ -34,12 +34,12 @@ types: setup
 kernels: setup
 	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.perception.occluded_regions as s; s.prepare()'
 
-# Real time in one process, real autopilots in another, whole runs in a third, then the rest at a lower priority
+# Real time in one process, real autopilots in another, whole runs in a third, the rest in a fourth at a lower priority
 # (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
 unit: kernels
-	$(BIN)/python -m pytest -m "not long" -n 3 --dist loadscope --no-loadscope-reorder -rs
+	$(BIN)/python -m pytest -m "not long" -n 4 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: export PYTHONDONTWRITEBYTECODE =

@@ -1,5 +1,5 @@
 """A small recording of the ground robot, made once a session, for the tests that need a model set; and who runs what
-where tests run side by side (`pytest -n 3`)."""
+where tests run side by side (`pytest -n 4`)."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ TRAJECTORIES = 55  # the fewest whose held-out plans state the limit of 1 %, lat
 
 
 # What flies or drives in real time mostly waits, as do real autopilots; whole runs keep both cores busy. One of each at
-# a time, and what keeps a core busy by itself beside them only from when one of the lanes is through.
+# a time, and the rest beside them at a lower priority.
 LIVE = (
     *("tests/actors/test_mavlink_vehicle.py", "tests/actors/ros2/", "tests/system/test_fly.py"),
     *("tests/system/test_mavsdk.py", "tests/system/test_hil.py", "tests/system/test_ros2.py"),
