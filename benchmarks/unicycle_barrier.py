@@ -65,7 +65,7 @@ class UnicycleBarrier:
         if (A @ wanted > b + TOLERANCE).any():
             bounds = np.concatenate([robot.high() / scale, -robot.low() / scale])
             A, b = np.vstack([A, np.eye(2), -np.eye(2)]), np.concatenate([b, bounds])
-            solution = solve(QuadraticProgram(np.ones(2), -wanted, A, b))
+            solution = solve(QuadraticProgram(np.ones(2), -wanted, A, b, always=4))
             if not solution.found or solution.residual > TOLERANCE:
                 total = (perf_counter_ns() - started) * 1e-6
                 return braking_decision(robot, request, self.version, "no input meets the barrier", total)

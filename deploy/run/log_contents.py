@@ -33,7 +33,7 @@ def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
     }
     if config.method == DDPC:
         run |= {"certificate": config.model_config.certificate, "mode": config.model_config.mode}
-    packages = ("brakeline", "mujoco", "daqp", "numpy", "torch", "eclipse-zenoh", "mcap")
+    packages = ("brakeline", "mujoco", "proxsuite", "numpy", "torch", "eclipse-zenoh", "mcap")
     groups = {
         "run": run,
         "configuration": {"json": encode(config)},

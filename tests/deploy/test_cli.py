@@ -348,7 +348,7 @@ def test_a_plan_is_shown_with_its_tube_and_without_one_if_there_is_none():
         assert (len(table.columns), table.row_count) == (columns, len(answer.plan))
 
 
-HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "daqp", "google.protobuf", "pydantic")
+HEAVY = ("torch", "mujoco", "zenoh", "scipy", "numpy", "pymavlink", "proxsuite", "google.protobuf", "pydantic")
 
 
 @pytest.mark.parametrize("words, status", [(["train", "--help"], 0), (["train", "--stps", "3"], 2), (["--version"], 0)])

@@ -52,7 +52,7 @@ def last_line(python, script, *words):
 
 def test_a_client_and_a_recorder_need_no_solver_and_no_simulator():
     """The authors' virtual environments have neither."""
-    hide = "import sys; sys.modules |= dict.fromkeys(('daqp', 'scipy', 'torch', 'mcap'))"
+    hide = "import sys; sys.modules |= dict.fromkeys(('proxsuite', 'scipy', 'torch', 'mcap'))"
     needed = "import brakeline.safety.service.client, brakeline.safety.gym, brakeline.deploy.data.environment_episodes"
     subprocess.run([sys.executable, "-c", f"{hide}; {needed}"], check=True, cwd=EXAMPLES.parent)
 

@@ -32,7 +32,7 @@ def test_the_table_of_names_is_complete():
 
 
 def test_a_client_imports_no_simulator_and_no_solver():
-    heavy = ("mujoco", "torch", "daqp", "scipy", "gymnasium", "matplotlib")
+    heavy = ("mujoco", "torch", "proxsuite", "scipy", "gymnasium", "matplotlib")
     code = (
         "import sys; from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground'); "
         f"print([name for name in {heavy} if name in sys.modules])"
@@ -43,7 +43,7 @@ def test_a_client_imports_no_simulator_and_no_solver():
 
 def test_a_launcher_imports_no_simulator_and_no_compiled_kernels():
     """It starts with every run, and loads model sets only to check them."""
-    heavy = ("mujoco", "torch", "daqp", "numba", "scipy", "matplotlib")
+    heavy = ("mujoco", "torch", "proxsuite", "numba", "scipy", "matplotlib")
     code = f"import sys, brakeline.deploy.run.launcher; print([name for name in {heavy} if name in sys.modules])"
     imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert imported.stdout.strip() == "[]"

@@ -65,7 +65,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "pyulog": ("deploy.data.sources.px4_log",),
     "pyarrow": ("deploy.data.sources.parquet_files", "deploy.data.sources.csv_file"),
     "numba": ("safety.compilation",),
-    "daqp": ("safety.filter.qp_solver",),
+    "proxsuite": ("safety.filter.qp_solver",),
     "array_api_compat": ("safety.filter.batch",),
     "mujoco": ("sim",),
     "gymnasium": ("safety", "sim", "deploy.data", "logs.minari_export"),

@@ -105,6 +105,22 @@ def next_state(C, W_t, M_t, kappa_t, w, widths, z, first, widening, start, turn)
     return center, widening * widths @ (magnitudes(W_t, M_t, w, z) + kappa_t.T @ np.abs(z))
 
 
+def hildreth_active_set(h, g, A, b, steps):
+    """`active_set_kernels.hildreth_active_set`."""
+    x, multipliers, chosen = -g / h, np.zeros(len(b)), np.zeros(len(b), dtype=bool)
+    length = (A * A / h).sum(axis=1)
+    for _ in range(steps):
+        step = np.maximum((A @ x - b) / length, -multipliers)
+        gain = np.nan_to_num(step * step * length, nan=-1.0)
+        best = int(gain.argmax())
+        if gain[best] <= 1e-14:
+            break
+        chosen[best] = True
+        multipliers[best] += step[best]
+        x = x - step[best] * A[best] / h
+    return chosen
+
+
 def clip_to_bounds(wanted, before, low, high, slew):
     """`plan_inputs.clip_to_bounds`."""
     return np.minimum(np.maximum(wanted, np.maximum(low, before - slew)), np.minimum(high, before + slew))

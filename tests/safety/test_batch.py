@@ -21,7 +21,7 @@ from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.dual_active_set import solve_batch
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
-from brakeline.safety.filter.qp_solver import solve
+from brakeline.safety.filter.qp_solver import SOLVED, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
 from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.fitting import fit_model_set
@@ -363,7 +363,8 @@ def test_the_solver_solves_exactly_or_proves_that_there_is_no_solution():
     solution = solve_batch(np, h, g, A, b, np.zeros((0, len(programs)), dtype=int))
     for lane, program in enumerate(programs):
         single = solve(program)
-        assert not (solution.solved[lane] and not single.found) and not (solution.infeasible[lane] and single.found)
+        found = single.status == SOLVED
+        assert not (solution.solved[lane] and not found) and not (solution.infeasible[lane] and found)
         if solution.solved[lane]:
             assert np.abs(solution.x[:, lane] - single.x).max() < 1e-7
     assert 0.9 * len(programs) < (solution.solved | solution.infeasible).sum()

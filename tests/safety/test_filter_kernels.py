@@ -6,6 +6,7 @@ import pytest
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.safety.filter import plan_inputs
 from brakeline.safety.filter.kernels import (
+    active_set_kernels,
     halfspace_kernels,
     rollout_kernels,
     shape_kernels,
@@ -16,7 +17,15 @@ from tests.safety import kernel_twins
 
 N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors, free inputs
 MAGNITUDES = L + N + 1
-MODULES = halfspace_kernels, tube_kernels, plan_inputs, rollout_kernels, shape_kernels, window_kernels
+MODULES = (
+    halfspace_kernels,
+    tube_kernels,
+    active_set_kernels,
+    plan_inputs,
+    rollout_kernels,
+    shape_kernels,
+    window_kernels,
+)
 
 
 def turned(rng, d):
@@ -85,6 +94,7 @@ def cases(rng, d):
     plans = np.abs(W_t.T[:, -FREE:]), np.abs(position[..., -FREE:]), np.abs(directions)
     low, high, slew = np.array([-1.0, 0.0]), np.array([1.0, 0.3]), np.array([0.2, np.inf])
     before, bounds = rng.uniform(low, high), np.stack([z - rng.uniform(-0.05, 1.0), z + 1.0])
+    h, g, A, b = rng.uniform(0.1, 1.0, FREE), rng.normal(size=FREE), rng.normal(size=(30, FREE)), rng.normal(size=30)
     step = rng.normal(size=(9, NZ)), W_t, M_t[:, :9], rng.random((NZ, 9)), m_0[:9], rng.random((9, 9))
     predictor, leverage = rollout_parts(rng, d), (np.tril(rng.normal(size=(12, 12))), rng.uniform(0.0, 3.0))
     plan = 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0
@@ -127,6 +137,7 @@ def cases(rng, d):
         "parted": (rng.choice([0.1, 0.5, 0.7, np.nan], 6), 0.6, 0.3),
         "roomiest_planes": (rng.normal(size=(6, 2 * N + 1, d)), rng.normal(size=(6, 2 * N + 1)) + 1.0, path),
         "planes_beside": (*near.parts, near.margin, start, start + path[1:], 0.1, measured),
+        "hildreth_active_set": (h, g, A, b, 20),
         "clip_to_bounds": (rng.normal(size=2), before, low, high, slew),
         "regressors_of_braking": (z, rng.random((3, 2)), rng.normal(size=2)),
     }
