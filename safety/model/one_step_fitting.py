@@ -270,7 +270,7 @@ def fit_one_step(
     scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, speeds, progress)
     kinds = driving_kinds(robot, s.z, s.start)
     joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
-    factors = SetFactors.of(scores, others, kinds, model_config.outside, one=joint_space)
+    factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
     one_step = replace(regression.fit(chosen.ridge, weight=weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
     shape = shape_with_chords(robot, s.z, errors, s.chords, speeds)

@@ -29,7 +29,7 @@ class SetFactors:
     start: float
 
     @staticmethod
-    def of(plan: Array, first: Array, kinds: dict[str, Mask], outside: float, one: bool = False) -> SetFactors:
+    def of(plan: Array, first: Array, kinds: dict[str, Mask], outside: float, same: bool = False) -> SetFactors:
         """Return the least factors that leave at most a share `outside` of the windows of every kind outside.
 
         Inputs that jump in most periods stir up what no state shows, such as a quadrotor's attitude: `plan` would have
@@ -39,13 +39,13 @@ class SetFactors:
             plan (T,), first (T,): scores of the windows, for both parts.
             kinds: the windows (T,) of each kind of driving.
             outside: the share.
-            one: both parts have the same factor.
+            same: whether both parts have the same factor.
         """
         begun = ~kinds[START]
         others = [np.ones(len(plan), dtype=bool), *(kind for name, kind in kinds.items() if name != START)]
         for_plan = max(_quantile(plan[kind & begun & ~kinds[JUMPING]], outside) for kind in others)
         for_first = max(_quantile(first[kind & begun], outside) for kind in others)
-        if one:
+        if same:
             for_plan = for_first = max(for_plan, for_first)
         at_start = _quantile(plan[~begun], outside) / for_plan, _quantile(first[~begun], outside) / for_first
         return SetFactors(for_plan, for_first, max(1.0, *at_start))

@@ -29,6 +29,7 @@ from brakeline.safety.model.error_causes import (
 from brakeline.safety.model.facet_normals import facet_normals
 from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
 from brakeline.safety.model.one_step_fitting import Calibration, Candidate
+from brakeline.safety.model.set_shape import shares as shares_of
 from brakeline.safety.model.turning_in_place import inside
 from brakeline.safety.model.windows import (
     PLAN,
@@ -294,17 +295,11 @@ def _marginal(outside: NDArray[np.bool_]) -> float:
     return (int(outside.sum()) + 1) / (len(outside) + 1)
 
 
-def _share(off: Array, half: Array) -> Array:
-    """Return the ratio of an error to its half-width: 0 without an error, infinite if only the half-width is 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(off > 0.0, off / half, 0.0)
-
-
 def _first_excess(model: ModelSet, w: Windows) -> Array:
     """Return the ratio (T, n) of error to bound for each coordinate of the state after one period."""
     z = w.z if model.model_config.mode == DIRECT else model.first_regressor(w.z)
     half = np.concatenate([model.first.half_widths(z[i : i + CHUNK]) for i in range(0, len(z), CHUNK)])
-    return np.asarray(_share(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
+    return np.asarray(shares_of(np.abs(outputs_of(model, w) - z @ model.first.C.T), half))
 
 
 def outputs_of(model: ModelSet, w: Windows) -> Array:
@@ -333,11 +328,11 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, lis
         away = np.abs((w.y[i : i + CHUNK, :d] - z @ tube.position[k - 1].T) @ normals.T)
         off = np.abs(others[i : i + CHUNK] - z @ tube.more[k - 1].T)
         parts = [
-            _share(away, made @ spread.T),
-            _share(off, made @ np.abs(tube.more_directions[k - 1]).T),
-            _share(w.chord_deviation[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
+            shares_of(away, made @ spread.T),
+            shares_of(off, made @ np.abs(tube.more_directions[k - 1]).T),
+            shares_of(w.chord_deviation[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
         ]
         if k == tube.horizon:
-            parts.append(_share(w.stopping_distance[i : i + CHUNK, None], sizes[:, -1, None]))
+            parts.append(shares_of(w.stopping_distance[i : i + CHUNK, None], sizes[:, -1, None]))
         found[i : i + CHUNK] = np.concatenate(parts, axis=1)
     return found, names

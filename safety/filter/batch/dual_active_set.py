@@ -5,8 +5,8 @@
 The method starts at the minimum under no rows, adds the row that is violated most, and takes steps that keep all
 multipliers at least zero. It ends after finitely many steps at the exact solution, or proves that there is none. All
 lanes step together; lanes that have ended leave. The answer is then computed anew from its active rows, and counts as
-solved only if it meets the optimality conditions of Karush, Kuhn and Tucker to within `TOLERANCE`, with multipliers
-that are not too large.
+solved only if it meets the optimality conditions of Karush, Kuhn and Tucker to within ten times `TOLERANCE`, with
+multipliers that are not too large.
 
 References:
     D. Goldfarb, A. Idnani: A numerically stable dual method for solving strictly convex quadratic programs, 1983.
@@ -21,9 +21,7 @@ Array = Any  # of any namespace
 
 MOST_STEPS = 60  # a lane that has not ended then counts as not solved
 TOLERANCE = 1e-12  # of unit rows in scaled variables, and of their multipliers
-LARGEST = (
-    1e3  # multiplier: with a larger one, rounding of the rows moves the solution by more than a solver's tolerance
-)
+LARGEST = 1e3  # multiplier: with a larger one, the rounding of a row moves the solution by too much
 DEPENDENT = 1e-11  # share of a row's curvature that other rows leave it; below, it counts as their combination
 LEFT = 0.7  # share of running lanes, below which the others are dropped from the arrays
 
