@@ -23,6 +23,7 @@ from benchmarks import (
     askers,
     autopilot_conformance,
     batch_decide,
+    batch_simulation,
     costs,
     decide,
     driving_groups,
@@ -88,6 +89,7 @@ class Benchmark:
 BENCHMARKS = {
     "decide": Benchmark(decide, lambda _: decide.run()),
     "batch": Benchmark(batch_decide, lambda _: batch_decide.run()),
+    "batch-simulation": Benchmark(batch_simulation, lambda _: batch_simulation.run()),
     "perception": Benchmark(perception_cost, lambda _: perception_cost.run()),
     "solvers": Benchmark(solvers, lambda _: solvers.run()),
     "reachability": Benchmark(reachability, lambda _: reachability.run()),

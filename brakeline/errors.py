@@ -221,6 +221,10 @@ class NoFleet(BrakelineError, ValueError):
     """Several robots cannot share a world: their kind, the arena or the conditions do not allow it."""
 
 
+class NoBatch(BrakelineError, ValueError):
+    """Many robots cannot be simulated at once: their kind, the arena or the conditions do not allow it."""
+
+
 class BadInput(BrakelineError, ValueError):
     """The input is not a finite vector with one number for each of the robot's inputs."""
 

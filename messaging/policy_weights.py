@@ -86,6 +86,16 @@ class MLP:
             value = np.add(outputs, bias, out=outputs)
         return np.tanh(value, out=value)
 
+    def of_many(self, observations: NDArray[Any], noise: Array | float = 0.0) -> Array:
+        """Return the actions (B, m) for observations (B, o), clipped to the bounds.
+
+        noise (B, m): added to the normalised actions, such as `noise` times normal numbers.
+        """
+        value = np.asarray(observations, np.float32)
+        for depth, (weight, bias) in enumerate(self.layers):
+            value = (np.maximum(value, 0.0) if depth else value) @ weight.T + bias
+        return np.clip(self._centre + self._half * (np.tanh(value) + noise), self._low, self._high)
+
     def encode(self) -> bytes:
         """Return the bytes of the policy's file."""
         return encode(self.robot, self.layers, self.version, self.noise)

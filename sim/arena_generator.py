@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.errors import NoArena, UnknownName
-from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Array, Obstacle, Shapes
+from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
 from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
@@ -23,6 +23,7 @@ from brakeline.sim.traffic import Crowd
 ATTEMPTS = 1000  # arenas drawn before giving up
 CANDIDATES = 12  # drawn for each obstacle; the first that fits stays
 POINTS = 64  # drawn at once for start, goal and moving obstacles
+CORNERS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (0.0, 0.0)])  # in half edges
 MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the start
 
 
@@ -156,15 +157,16 @@ def _rooms(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> Iterator[
 
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
     """Draw obstacles with gaps between their outlines, then the room's boundary; None if too few obstacles fit."""
-    walls = room_boundary(kind.half_width, None)
-    placed: list[Obstacle] = []
+    placed, outlines = list[Obstacle](), Outlines.of(room_boundary(kind.half_width, None))
     least = 2.0 * robot.footprint + kind.gap
     for shape, (few, many) in ((BOX, kind.boxes), (CYLINDER, kind.cylinders), (SPHERE, kind.spheres)):
         for i in range(int(rng.integers(few, many, endpoint=True))):
-            candidates = [_draw_obstacle(shape, kind, least, rng) for _ in range(CANDIDATES)]
-            fitting = np.flatnonzero(gaps(candidates, (*placed, *walls)) >= least)
+            candidates = _draw_candidates(shape, kind, least, rng)
+            drawn = Outlines.of(candidates)
+            fitting = np.flatnonzero(drawn.gaps(outlines) >= least)
             if len(fitting):
                 placed.append(candidates[fitting[0]])
+                outlines = outlines.joined(drawn.take(fitting[:1]))
             elif i < few:
                 return None
     if kind.height is not None:
@@ -172,18 +174,18 @@ def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obs
     return (*placed, *room_boundary(kind.half_width, kind.height))
 
 
-def _draw_obstacle(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Obstacle:
-    """Draw the outline of an obstacle at least `least` m from the walls; corners of boxes may be nearer."""
-    if shape == BOX:
-        length, width = rng.uniform(*kind.edge, 2)
-        size: tuple[float, ...] = (float(length), float(length if kind.square else width))
-        yaw, extent = float(rng.uniform(-math.pi, math.pi)), 0.5 * min(size)
-    else:
-        size = (float(rng.uniform(*(kind.radius if shape == CYLINDER else kind.ball))),)
-        yaw, extent = 0.0, size[0]
-    within = kind.half_width - least - extent
-    x, y = rng.uniform(-within, within, 2)
-    return Obstacle(shape, (float(x), float(y)), size, yaw)
+def _draw_candidates(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> list[Obstacle]:
+    """Draw outlines of obstacles at least `least` m from the walls; corners of boxes may be nearer."""
+    low, high = kind.edge if shape == BOX else kind.radius if shape == CYLINDER else kind.ball
+    shares = rng.random((CANDIDATES, 5 if shape == BOX else 3))
+    sizes = low + (high - low) * shares[:, : 2 if shape == BOX else 1]
+    yaws = -math.pi + math.tau * shares[:, 2] if shape == BOX else np.zeros(CANDIDATES)
+    if shape == BOX and kind.square:
+        sizes[:, 1] = sizes[:, 0]
+    within = (kind.half_width - least - sizes.min(axis=1) * (0.5 if shape == BOX else 1.0))[:, None]
+    positions = -within + 2.0 * within * shares[:, -2:]
+    columns = positions.tolist(), sizes.tolist(), yaws.tolist()
+    return [Obstacle(shape, tuple(p), tuple(size), yaw) for p, size, yaw in zip(*columns, strict=True)]
 
 
 def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generator) -> Obstacle:
@@ -198,30 +200,55 @@ def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generat
     return Obstacle(BOX, (*plan.position, z), (*plan.size, box_height), plan.yaw)
 
 
-@lru_cache(maxsize=1024)
-def _outline(obstacle: Obstacle) -> tuple[Array, float]:
-    """Return points (5, 2) and a radius: the plan is the convex hull of the points, grown by the radius."""
-    if obstacle.kind != BOX:
-        return np.tile(obstacle.position, (5, 1)), obstacle.size[0]
-    cos, sin = math.cos(obstacle.yaw), math.sin(obstacle.yaw)
-    corners = 0.5 * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)]) * obstacle.size
-    return corners @ np.array([(cos, sin), (-sin, cos)]) + obstacle.position, 0.0
+@dataclass(frozen=True)
+class Outlines:
+    """The plans of k obstacles: rectangles (of a disc: its centre), grown by a radius.
+
+    Attributes:
+        center (k, 2), half (k, 2), radius (k,): m. axes (k, 2, 2): world from local.
+        corners (k, 5, 2): m, the corners and the centre.
+    """
+
+    center: Array
+    axes: Array
+    half: Array
+    radius: Array
+    corners: Array
+
+    @staticmethod
+    def of(obstacles: Sequence[Obstacle]) -> Outlines:
+        """Stack the outlines of obstacles in the plane."""
+        shapes = Shapes.of(obstacles, dim=2)
+        corners = (CORNERS * shapes.half[:, None]) @ shapes.axes.swapaxes(1, 2) + shapes.center[:, None]
+        return Outlines(shapes.center, shapes.axes, shapes.half, shapes.rho, corners)
+
+    def take(self, rows: NDArray[np.intp]) -> Outlines:
+        """Return some of the outlines."""
+        return Outlines(self.center[rows], self.axes[rows], self.half[rows], self.radius[rows], self.corners[rows])
+
+    def joined(self, others: Outlines) -> Outlines:
+        """Return these outlines and others."""
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        return Outlines(*(np.concatenate(pair) for pair in pairs))
+
+    def gaps(self, others: Outlines) -> Array:
+        """Return the distance (k,) [m] from each outline to the nearest other; overlap: <= 0.
+
+        Two disjoint convex polygons are closest at a corner of one of them, so it measures the corners of each.
+        """
+        between = np.minimum(self._from_corners(others), others._from_corners(self).T)
+        return np.asarray((between - self.radius[:, None] - others.radius).min(axis=1))
+
+    def _from_corners(self, others: Outlines) -> Array:
+        """Return the least distance (k, o) [m] from the corners of each outline to the rectangle of each other."""
+        away = (self.corners[:, None] - others.center[:, None]) @ others.axes
+        beyond = np.maximum(np.abs(away) - others.half[:, None], 0.0)
+        return np.asarray(np.sqrt((beyond * beyond).sum(axis=-1)).min(axis=-1))
 
 
 def gaps(candidates: Sequence[Obstacle], others: Sequence[Obstacle]) -> Array:
-    """Return the distance (k,) [m] from each candidate (in the plane, no wall) to the nearest other; overlap: <= 0.
-
-    Two disjoint convex polygons are closest at a corner of one of them, so it measures the corners of each.
-    """
-    mine = [_outline(candidate) for candidate in candidates]
-    points, radii = np.stack([outline[0] for outline in mine]), np.array([outline[1] for outline in mine])
-    least = Shapes.of(others, dim=2).distance(points).min(axis=(0, 2)) - radii
-    theirs = [_outline(other) for other in others if other.kind != WALL]
-    if theirs:
-        corners, grown = np.stack([outline[0] for outline in theirs]), np.array([outline[1] for outline in theirs])
-        back = Shapes.of(candidates, dim=2).distance(corners).min(axis=2) - grown
-        least = np.minimum(least, back.min(axis=1))
-    return np.asarray(least)
+    """Return the distance (k,) [m] from each candidate (in the plane, no wall) to the nearest other; overlap: <= 0."""
+    return Outlines.of(candidates).gaps(Outlines.of(others))
 
 
 def _start_and_goal(

@@ -44,9 +44,8 @@ class ClearanceMap:
         self.shape = tuple(round(width / self.cell) for width in widths)
         axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
-        plan = np.stack(np.meshgrid(*axes[:2], indexing="ij"), axis=-1).reshape(-1, 2)
         shapes = Shapes.of(obstacles, dim=self.dim)
-        self.clearance: Array = nearest_distances(shapes, plan, *axes[2:]).reshape(self.shape)
+        self.clearance: Array = nearest_distances(shapes, *axes).reshape(self.shape)
 
     def index(self, points: Array) -> NDArray[np.intp]:
         """Return the cells (..., d) of points (..., d); points beyond the walls belong to the outermost cells."""
@@ -92,25 +91,25 @@ class ClearanceMap:
         return bool(not to_reach[last])
 
 
-def nearest_distances(shapes: Shapes, plan: Array, heights: Array | None = None) -> Array:
-    """Return the distances (p,) to the nearest shape from points (p, 2), or (p, q) from all points at heights (q,).
+def nearest_distances(shapes: Shapes, x: Array, y: Array, heights: Array | None = None) -> Array:
+    """Return the distances (p·q,) or (p·q, r) to the nearest shape from a grid with x (p,), y (q,) and heights (r,).
 
     This is `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so the distances
     in the plan are the same for all heights.
     """
-    x, y = np.ascontiguousarray(plan.T)
-    least = np.full(len(plan) if heights is None else (len(plan), len(heights)), np.inf)
+    cells = len(x) * len(y)
+    least = np.full(cells if heights is None else (cells, len(heights)), np.inf)
     square = least.copy()  # squared distance to all shapes but balls in space, for one common root
     scratch = np.empty_like(least)
     for center, axes, half, rho, rounded in zip(
         shapes.center, shapes.axes, shapes.half, shapes.rho, shapes.round, strict=True
     ):
-        along = np.abs((x - center[0]) * axes[0, 0] + (y - center[1]) * axes[1, 0]) - half[0]
-        across = np.abs((x - center[0]) * axes[0, 1] + (y - center[1]) * axes[1, 1]) - half[1]
-        beside = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
-        if heights is None:
-            np.minimum(least, beside - rho, out=least)
+        along, across = (_beyond(x - center[0], y - center[1], axes[:, i], half[i]) for i in (0, 1))
+        if heights is None:  # only where the shape may be nearer than those before: a root takes the most time
+            nearer = np.flatnonzero(np.maximum(along, across) - rho < least)
+            least[nearer] = np.minimum(least[nearer], np.hypot(along[nearer], across[nearer]) - rho)
             continue
+        beside = np.hypot(along, across)
         above = np.maximum(np.abs(heights - center[2]) - half[2], 0.0)
         ball = rho > 0.0 and rounded[2] > 0.0
         np.add.outer((beside if ball else np.maximum(beside - rho, 0.0)) ** 2, above**2, out=scratch)
@@ -121,6 +120,14 @@ def nearest_distances(shapes: Shapes, plan: Array, heights: Array | None = None)
     if heights is not None:
         np.minimum(least, np.sqrt(square), out=least)
     return np.asarray(np.maximum(least, 0.0))
+
+
+def _beyond(x: Array, y: Array, axis: Array, half: float) -> Array:
+    """Return how far (p·q,) [m] each point of a grid lies beyond a rectangle along one of its axes."""
+    away = np.add.outer(x * axis[0], y * axis[1]).ravel()
+    np.abs(away, out=away)
+    away -= half
+    return np.asarray(np.maximum(away, 0.0, out=away))
 
 
 class Routes:

@@ -36,6 +36,13 @@ def prefix(number: int) -> str:
     return f"{number} " if number else ""
 
 
+def wheel_speeds(inputs: Array) -> Array:
+    """Return the speeds (..., 2) of the left and the right wheel [rad/s] for inputs (..., 2) [m/s, rad/s]."""
+    speed, turn = inputs[..., 0], inputs[..., 1]
+    left, right = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+    return np.stack((left, right), axis=-1)
+
+
 class TurtleBot(SimulatedVehicle):
     """One TurtleBot3 of a world that somebody else advances.
 
@@ -127,8 +134,7 @@ class TurtleBot(SimulatedVehicle):
 
     def _set_wheels(self, input: Array) -> None:
         """Set the wheels' speeds for an input (speed [m/s], turn rate [rad/s])."""
-        speed, turn = input
-        self._ctrl[:] = (speed - 0.5 * TRACK * turn) / WHEEL_RADIUS, (speed + 0.5 * TRACK * turn) / WHEEL_RADIUS
+        self._ctrl[:] = wheel_speeds(input)
 
     def _wheels(self) -> Array:
         return np.asarray(self._qpos[WHEELS])

@@ -27,7 +27,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
     and floor and ceiling are among them. `MoverBodies` moves the movers, which nothing pushes.
     """
     for i, obstacle in enumerate(arena.obstacles):
-        kind, half, position = _geom(obstacle, arena)
+        kind, half, position = geom_of(obstacle, arena)
         spec.worldbody.add_geom(
             name=f"obstacle {i}",
             type=kind,
@@ -39,7 +39,7 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
         )
     crowd = arena.crowd
     for i, mover in enumerate(() if crowd is None else crowd.obstacles(0.0)):
-        kind, size, position = _geom(mover, arena)
+        kind, size, position = geom_of(mover, arena)
         depth = 0.0 if crowd is None or crowd.pushes else NO_PUSH_DEPTH
         body = spec.worldbody.add_body(name=f"mover {i}", mocap=True, pos=position)
         body.add_geom(
@@ -101,7 +101,7 @@ class MoverBodies:
         return self._pushes and any(self.contacts)
 
 
-def _geom(obstacle: Obstacle, arena: Arena) -> Geom:
+def geom_of(obstacle: Obstacle, arena: Arena) -> Geom:
     """Return the type, MuJoCo's half sizes and the centre of one obstacle."""
     x, y = obstacle.position[:2]
     z, height = 0.5 * HEIGHT, HEIGHT

@@ -1,0 +1,123 @@
+"""Time many simulated robots at once beside single environments and SyncVectorEnv, with the filter and without it.
+
+All ways drive the same arenas with the same policy. Each ratio is of two times of the same block, and the interval is
+of all blocks. The time of the processor counts, over all threads, so other processes disturb little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import process_time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from benchmarks.timing import Figures
+from brakeline.deploy.policy_loading import POLICY_FOLDER
+from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.gym_batch import BatchSafetyWrapper
+from brakeline.safety.gym_vector import VectorSafetyWrapper
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from brakeline.sim.navigation_env import NavigationEnv
+
+SIZES = (1, 4, 16, 64, 256, 1024)
+STEPS, BLOCKS = 1024, 5  # robot steps of a block, at least two periods of a batch
+PLAIN_SIZES, PEERS = (64, 256), 16
+
+Act = Callable[[], None]  # one period of all robots
+
+
+def run() -> Figures:
+    """Return a row for each number of robots at once, with its peer in the same blocks."""
+    figures: Figures = {}
+    robot = robot_with_task("ground")
+    alone, single, vector = _single(robot, filtered=False), _single(robot, filtered=True), _vector(robot, PEERS)
+    for size in SIZES:
+        batch = _filtered(robot, size)
+        figures[f"ground, filtered, {size} robots: beside one"] = beside(size, batch, single)
+        if size in PLAIN_SIZES:
+            figures[f"ground, filtered, {size} robots: beside SyncVectorEnv of {PEERS}"] = beside(
+                size, batch, vector, PEERS
+            )
+            figures[f"ground, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
+    return figures
+
+
+def beside(size: int, batch: Act, peer: Act, peer_size: int = 1) -> dict[str, float]:
+    """Return robot steps a second of processor time of a batch and its peer, and their ratio with its interval."""
+    for act in (batch, batch, peer):
+        act()
+    costs = np.array([(_cost(batch, size), _cost(peer, peer_size)) for _ in range(BLOCKS)])
+    ratios = costs[:, 1] / costs[:, 0]
+    return {
+        "batch steps/s": 1.0 / costs[:, 0].min(),
+        "peer steps/s": 1.0 / costs[:, 1].min(),
+        "ratio": float(np.median(ratios)),
+        "ratio low": float(ratios.min()),
+        "ratio high": float(ratios.max()),
+    }
+
+
+def _cost(act: Act, size: int) -> float:
+    """Return the processor time of one robot step [s]."""
+    periods = max(2, STEPS // (4 if size == 1 else 1) // size)
+    before = process_time()
+    for _ in range(periods):
+        act()
+    return (process_time() - before) / (periods * size)
+
+
+def trained(robot: RobotWithTask) -> MLP:
+    """Return the stored policy of a robot."""
+    return MLP.load(POLICY_FOLDER / robot.name / "trained.safetensors", robot)
+
+
+def _filtered(robot: RobotWithTask, size: int) -> Act:
+    """Return a period of `size` robots of a batch behind the filter."""
+    env = BatchSafetyWrapper(BatchNavigationEnv(robot, size), Filter.load(robot.name))
+    return _driven(env, robot)
+
+
+def _alone(robot: RobotWithTask, size: int) -> Act:
+    """Return a period of `size` robots of a batch without a filter."""
+    return _driven(BatchNavigationEnv(robot, size), robot)
+
+
+def _vector(robot: RobotWithTask, size: int) -> Act:
+    """Return a period of `size` robots of a `SyncVectorEnv` behind the filter."""
+    env = SyncVectorEnv([lambda: NavigationEnv(robot)] * size, autoreset_mode=AutoresetMode.SAME_STEP)
+    return _driven(VectorSafetyWrapper(env, Filter.load(robot.name)), robot)
+
+
+def _driven(env: VectorEnv[Any, Any, Any], robot: RobotWithTask) -> Act:
+    """Return a period of all robots of a vector environment, with the trained policy and exploration."""
+    policy, rng = trained(robot), np.random.default_rng(0)
+    observations, _ = env.reset(seed=0)
+
+    def act() -> None:
+        nonlocal observations
+        noise = 0.1 * rng.standard_normal((env.num_envs, robot.action_dim))
+        observations = env.step(policy.of_many(observations, noise))[0]
+
+    return act
+
+
+def _single(robot: RobotWithTask, filtered: bool) -> Act:
+    """Return a period of one robot in `NavigationEnv`, which begins the next episode at the end of one."""
+    env: gymnasium.Env[Any, Any] = NavigationEnv(robot)
+    env = SafetyWrapper(env, Filter.load(robot.name)) if filtered else env
+    policy, rng = trained(robot), np.random.default_rng(0)
+    observation, _ = env.reset(seed=0)
+
+    def act() -> None:
+        nonlocal observation
+        observation, _, terminated, truncated, _ = env.step(policy.explore(observation, rng))
+        if terminated or truncated:
+            observation, _ = env.reset()
+
+    return act

@@ -1,0 +1,199 @@
+"""The committed backup plans of many robots of one kind as arrays: `BackupPlan` for each row.
+
+plans = BackupPlanBatch(Filter.load("ground"), size=64)
+outcome = plans.decide(states, actions, obstacles)       # once a period; then drive(outcome.inputs)
+plans.reset(ended)                                       # the robots whose episode begins anew
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.errors import BadRequest
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
+from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
+from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
+from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
+
+SAME_INPUT = 1e-9  # rounding allowed in a plan at the bounds of its inputs
+STANDING, VERIFIED, OPEN = range(3)  # of a committed plan: it stands, the model set verified it, nothing did
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """The outcome of one request about B robots.
+
+    Attributes:
+        inputs (B, m): to execute in the coming period.
+        decided (B,): whether the row has a decision; without one, the robot follows its committed plan.
+        answers: the decisions; None: the whole batch has none.
+        failure: why a row has no decision; empty: all have one.
+    """
+
+    inputs: Array
+    decided: Flags
+    answers: DecisionArrays | None
+    failure: str = ""
+
+
+class BackupPlanBatch:
+    """The committed plans of B robots between two decisions, and the requests about them.
+
+    It holds for a robot in lockstep, without feedback and without reservations, in a batch with one filter. A row
+    without a valid decision follows its committed plan. If the filter raises an error, all rows do.
+
+    Attributes:
+        plan (B, N, m), input_in_force (B, m): see `BackupPlan`.
+        predicted: the sets of the next measured states.
+    """
+
+    def __init__(self, safety: Filter, size: int) -> None:
+        """Begin with all robots standing.
+
+        Raises:
+            ValueError: batches do not decide for this kind of robot.
+        """
+        robot = safety.robot
+        if robot.late or robot.feedback or not robot.position_dim:
+            raise ValueError(f"{robot.name} keeps no plans in batches: decide with BackupPlan, one robot at a time")
+        N, n, m = robot.horizon, robot.state_dim, robot.action_dim
+        self.safety, self.robot, self._size = safety, robot, size
+        self.plan, self.input_in_force = np.zeros((size, N, m)), np.zeros((size, m))
+        self.predicted = PredictionArrays(
+            np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
+        )
+        self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
+        self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
+        self._periods = np.zeros(size, dtype=np.int64)
+        self._judged = False
+        self._scores, self._place = np.zeros((size, WINDOWS)), np.zeros(size, dtype=np.int64)
+        self._scored = np.zeros(size, dtype=bool)
+        self.reset(np.ones(size, dtype=bool))
+
+    def reset(self, which: Flags) -> None:
+        """Begin an episode of some robots (B,): they stand. Their scores stay."""
+        zero = self.robot.zero_input()
+        self.input_in_force[which], self.plan[which], self._inputs[which] = zero, zero, zero
+        self._status[which], self._still[which], self._periods[which] = STANDING, self.robot.horizon, 0
+        self.predicted.given[which] = False
+
+    @property
+    def widening(self) -> Array:
+        """The factor (B,) on every set of the next decision."""
+        return np.asarray(np.clip(RESERVE * self._scores.max(axis=1), 1.0, MOST))
+
+    def request(self, states: Array, actions: Array, obstacles: ObstacleArrays) -> RequestArrays:
+        """Return the request about measured states (B, n) and proposals (B, m); all other space is free."""
+        N = self.robot.horizon
+        names = np.array(["", self.safety.version, UNVERIFIED], dtype=object)
+        past = PastArrays(self._states, self._inputs, self._periods < 2 * N, self._periods >= N)
+        return RequestArrays(
+            states,
+            actions,
+            self.input_in_force,
+            self.plan,
+            obstacles=obstacles,
+            known_free=np.ones(self._size, dtype=bool),
+            widening=self.widening,
+            model=names[self._status].tolist(),
+            predicted=self.predicted if self.predicted.given.any() else None,
+            past=past if self._judged and past.given.any() else None,
+        )
+
+    def decide(self, states: Array, actions: Array, obstacles: ObstacleArrays) -> BatchOutcome:
+        """Decide on proposals (B, m), and commit to the plans of the decisions."""
+        finite = np.asarray(np.isfinite(actions).all(axis=1))
+        proposals = np.where(finite[:, None], actions, self.input_in_force)
+        try:
+            answers = self.safety.decide_batch(self.request(states, proposals, obstacles))
+        except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
+            log.exception("no decisions, so all robots brake along their committed plans")
+            failure = f"{type(error).__name__}: {error}"
+            nothing = np.zeros(self._size, dtype=bool)
+            return BatchOutcome(self._follow(states, nothing, None), nothing, None, failure)
+        decided = finite & self._is_possible(answers)
+        failure = "" if decided.all() else "a proposal that is not finite, or a plan that is not possible"
+        return BatchOutcome(self._follow(states, decided, answers), decided, answers, failure)
+
+    def contains(self, states: Array) -> Flags:
+        """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""
+        sets, away = self.predicted, states - self.predicted.center
+        if (heading := self.robot.heading) is not None:
+            cos, sin = np.cos(sets.heading), np.sin(sets.heading)
+            x, y = away[:, 0].copy(), away[:, 1].copy()
+            away[:, 0], away[:, 1] = cos * x + sin * y, cos * y - sin * x
+            away[:, heading] = (away[:, heading] + math.pi) % math.tau - math.pi
+        return np.asarray(sets.given & (np.abs(away) <= sets.half_width + SAME_SET).all(axis=1))
+
+    def _is_possible(self, answers: DecisionArrays) -> Flags:
+        """Return which plans the robot can follow: within the bounds and the slew, and to a stop."""
+        robot, plan = self.robot, answers.plan
+        slew = np.asarray(robot.action_slew)
+        within = (plan >= robot.low() - SAME_INPUT) & (plan <= robot.high() + SAME_INPUT)  # NaN fails too
+        follows = np.abs(plan[:, 0] - self.input_in_force) <= slew + SAME_INPUT
+        return np.asarray(within.all(axis=(1, 2)) & follows.all(axis=1) & robot.is_stop_input(plan[:, -1]))
+
+    def _follow(self, states: Array, decided: Flags, answers: DecisionArrays | None) -> Array:
+        """Commit to the decided plans, keep the others, and return the inputs of the coming period (B, m)."""
+        outside = self.predicted.given & ~self.contains(states)
+        self._status[~decided & outside] = OPEN
+        self.predicted.given[~decided] = False
+        if answers is not None:
+            self._accept(decided, answers)
+        return self._advance(states)
+
+    def _accept(self, rows: Flags, answers: DecisionArrays) -> None:
+        self._judged = answers.judges
+        first = rows & answers.verified & ~self._scored
+        self._scored |= first
+        self._judge(rows & ~first & answers.scored, answers.score)
+        self.plan[rows] = answers.plan[rows]
+        self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
+        sets = self.predicted
+        sets.center[rows], sets.half_width[rows] = answers.predicted_center[rows], answers.predicted_half_width[rows]
+        sets.heading[rows] = answers.predicted_heading[rows]
+        sets.given[rows] = np.isfinite(answers.predicted_center[rows]).all(axis=1)
+
+    def _judge(self, rows: Flags, scores: Array) -> None:
+        """Add the scores of windows that have ended. A score that is no number counts as infinite."""
+        where = np.flatnonzero(rows)
+        self._scores[where, self._place[where]] = np.where(np.isnan(scores[where]), np.inf, scores[where])
+        self._place[where] = (self._place[where] + 1) % WINDOWS
+
+    def _advance(self, states: Array) -> Array:
+        robot, now = self.robot, self.plan[:, 0].copy()
+        self._states = np.concatenate([self._states[:, 1:], states[:, None]], axis=1)
+        self._inputs = np.concatenate([self._inputs[:, 1:], now[:, None]], axis=1)
+        self._periods += 1
+        rests = robot.is_stop_input(now)
+        last = np.where(robot.zero_at_rest, 0.0, self.plan[:, -1])
+        self.plan = np.concatenate([self.plan[:, 1:], last[:, None]], axis=1)
+        self.input_in_force = now
+        self._still = np.where(rests, self._still + 1, 0)
+        stopped = (self._status != OPEN) | (self._still >= robot.horizon)
+        self._status[stopped & rests & robot.is_stop_input(self.plan).all(axis=1)] = STANDING
+        return now.copy()
+
+
+def correction_penalties(robot: Robot, proposed: Array, before: Array, executed: Array, weight: float) -> Array:
+    """Return the penalties (B,) of B corrections: `correction_penalty` for each row."""
+    low, high, slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
+    wanted = np.nan_to_num(proposed, posinf=0.0, neginf=0.0)
+    clipped = np.clip(wanted, np.maximum(low, before - slew), np.minimum(high, before + slew))
+    return np.asarray(weight * np.sqrt((((executed - clipped) / (high - low)) ** 2).sum(axis=1)))

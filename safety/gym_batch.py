@@ -1,0 +1,88 @@
+"""A Gymnasium wrapper that puts the batch filter in front of many simulated robots, all as arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from numpy.typing import NDArray
+
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
+from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
+
+if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
+
+Array = NDArray[np.float64]
+StepBatch = tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+class BatchSafetyWrapper(VectorWrapper):
+    """Replaces the actions of N robots by the filter's decisions on them, and subtracts penalties from the rewards.
+
+    The environment gives `infos["state"]` (N, n) and `infos["obstacles"]`, a dict of the arrays of `ObstacleArrays`,
+    as `brakeline.sim.batch.batch_env.BatchNavigationEnv` does. `VectorSafetyWrapper` takes every other environment.
+
+    `step` adds to `infos`: `outcome` (a `BatchOutcome`), `executed` (N, m), `penalty` (N,), and `compared` and
+    `contained` (N,): whether the filter predicted the new state, and whether the state is in that set.
+    """
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], filter: Filter, penalty: float = 0.0, accept_bound: float | None = None
+    ) -> None:
+        """Wrap an environment; see `SafetyWrapper` for the arguments.
+
+        Raises:
+            TooLoose: the validation report states a larger probability than accepted, or there is no report.
+            ValueError: batches do not decide for this kind of robot.
+        """
+        from brakeline.safety.model.stated_bound import check_bound
+
+        super().__init__(env)
+        check_bound(filter.model, filter.robot, accept_bound)
+        self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs), penalty
+        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self._infos: dict[str, Any] | None = None
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+        self._deciding: tuple[Array, Array, BatchOutcome] | None = None
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observations, self._infos = self.env.reset(seed=seed, options=options)
+        self.plans.reset(np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool))
+        return observations, self._infos
+
+    def step(self, actions: Any) -> StepBatch:
+        self.begin_step(actions)
+        return self.end_step()
+
+    def begin_step(self, actions: Any) -> BatchOutcome:
+        """Decide on the actions (N, m), and start the period in a thread of the environment."""
+        if self._infos is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before the first step")
+        proposed, before = np.asarray(actions, dtype=float), self.plans.input_in_force
+        outcome = self.plans.decide(self._infos["state"], proposed, ObstacleArrays(**self._infos["obstacles"]))
+        self.env.unwrapped.begin_step(outcome.inputs)  # type: ignore[attr-defined]
+        self._deciding = proposed, before, outcome
+        return outcome
+
+    def end_step(self) -> StepBatch:
+        """Wait for the period that `begin_step` started, and return what `step` returns."""
+        assert self._deciding is not None, "begin_step comes first"
+        proposed, before, outcome = self._deciding
+        observations, rewards, terminated, truncated, infos = self.env.unwrapped.end_step()  # type: ignore[attr-defined]
+        penalty = correction_penalties(self.plans.robot, proposed, before, outcome.inputs, self.penalty)
+        after = infos.get("final_info", infos)["state"]
+        infos = infos | {
+            "outcome": outcome,
+            "executed": outcome.inputs,
+            "penalty": penalty,
+            "compared": self.plans.predicted.given.copy(),
+            "contained": self.plans.contains(after),
+        }
+        resets, self._ended = self._ended, terminated | truncated
+        if self._mode != AutoresetMode.DISABLED:
+            self.plans.reset(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
+        self._infos = infos
+        return observations, rewards - penalty, terminated, truncated, infos

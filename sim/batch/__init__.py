@@ -1,0 +1,1 @@
+"""The environment of many robots at once, as arrays."""

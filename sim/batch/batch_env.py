@@ -1,0 +1,279 @@
+"""`NavigationEnv` for many robots: a `gymnasium.vector` environment that simulates a period of all of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from brakeline.errors import BadInput, NoBatch
+from brakeline.messaging.obstacle import Array
+from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
+from brakeline.sim.arena import Arena
+from brakeline.sim.arena_generator import arena_kind, draw_arena
+from brakeline.sim.batch.ground_batch import GroundBatch, MotionBatch, PeriodBatch
+from brakeline.sim.batch.ground_estimator_batch import wrapped
+from brakeline.sim.batch.ground_observation_batch import GroundObservationBatch
+from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.ground_robot import GROUND
+from brakeline.sim.navigation_env import OBSERVED_LIMIT
+from brakeline.sim.sim_conditions import Conditions
+
+Infos = dict[str, Any]
+Flags = NDArray[np.bool_]
+Observations = NDArray[np.float32]
+StepBatch = tuple[Observations, Array, Flags, Flags, Infos]
+EpisodeSeeds = Callable[[int], int]  # the seed of the next episode of a robot, by its number
+
+
+class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
+    """N robots, each alone in an arena of its own.
+
+    Robot i sees what a `NavigationEnv` with the same seed gives, up to rounding: arenas, noise, rewards, ends. One
+    thread pool simulates the physics, and arrays hold all other quantities. `infos` has the arrays of `NavigationEnv`'s
+    `info` with the robot first, and `obstacles` instead of lists: a dict of the arrays of
+    `brakeline.safety.filter.batch.obstacle_arrays.ObstacleArrays` with every static obstacle of each arena.
+
+    `begin_step` starts the physics in a thread and `end_step` waits for it, so that you can compute between them.
+
+    >>> env = BatchNavigationEnv("ground", 4)
+    >>> observations, infos = env.reset(seed=0)
+    >>> observations.shape, infos["state"].shape
+    ((4, 26), (4, 5))
+    >>> env.close()
+
+    In the mode SAME_STEP, `infos` has `final_obs` (N, o) and `final_info` (arrays) of the robots whose episode ended.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        robot: RobotWithTask | str,
+        num_envs: int,
+        arena: str = "default",
+        *,
+        conditions: Conditions | None = None,
+        seed_key: int = 0,
+        reward: Reward | None = None,
+        threads: int = 1,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        episode_seeds: EpisodeSeeds | None = None,
+    ) -> None:
+        """Make the environment; `reset` draws the first episodes.
+
+        Args:
+            robot, arena, conditions, seed_key, reward: see `NavigationEnv`.
+            num_envs: number of robots.
+            threads: number of threads for the physics.
+            episode_seeds: gives the seed of each further episode. Defaults to each robot's own generator, which
+                `reset(seed=...)` seeds as `SyncVectorEnv` does.
+
+        Raises:
+            NoBatch: this robot, arena or perception can only be simulated one by one.
+            UnknownRobot, UnknownTask, UnknownName: see `NavigationEnv`.
+        """
+        self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
+        self.conditions, self.num_envs, self.arena_name = conditions or Conditions(), num_envs, arena
+        check_batch(self.robot, arena, self.conditions)
+        self.reward, self.seed_key = reward or self.robot.task.reward, seed_key
+        self.autoreset_mode = autoreset_mode
+        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+        low, high = self.robot.low().astype(np.float32), self.robot.high().astype(np.float32)
+        self.single_action_space = Box(low, high, dtype=np.float32)
+        limit = np.full(self.robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
+        self.single_observation_space = Box(-limit, limit, dtype=np.float32)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._generators = [np.random.default_rng() for _ in range(num_envs)]
+        self._episode_seeds = episode_seeds or (lambda i: int(self._generators[i].integers(2**31)))
+        kind = arena_kind(self.robot, arena)
+        self._streams = NormalStreams(num_envs)
+        self._robots = GroundBatch(num_envs, kind, self.conditions, threads if threads > 1 else 0, self._streams)
+        noise = self.conditions.lidar_noise(flies=False)
+        obstacles = self._robots.obstacles
+        self._observations = GroundObservationBatch(num_envs, self.robot, obstacles, self._streams, noise)
+        self._bound = np.asarray(self.robot.measurement_bound)
+        self._goal_radius, self._step_limit = kind.goal_radius, kind.step_limit
+        self._arenas = np.empty(num_envs, dtype=object)
+        self._seeds, self._steps = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
+        self._goals, self._distance = np.zeros((num_envs, self.robot.position_dim)), np.zeros(num_envs)
+        self._ended: Flags = np.zeros(num_envs, dtype=bool)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="physics")
+        self._stepping: tuple[NDArray[np.intp], Future[MotionBatch]] | None = None
+        self._now: tuple[Observations, Infos] | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Begin an episode of every robot, or of those in `options["reset_mask"]`.
+
+        options["episode_seeds"] (N,) determines the episodes, as `episode_seed` does for `NavigationEnv`.
+        """
+        options = options or {}
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        if self._now is None:
+            mask[:] = True
+        for i, one in enumerate(seeds):
+            if one is not None:
+                self._generators[i], _ = seeding.np_random(one)
+        rows, given = np.flatnonzero(mask), options.get("episode_seeds")
+        episodes = [self._episode_seeds(i) if given is None else int(given[i]) for i in rows.tolist()]
+        self._now = self._join(rows, *self._begin(rows, episodes))
+        return self._now
+
+    def step(self, actions: Array) -> StepBatch:
+        self.begin_step(actions)
+        return self.end_step()
+
+    def begin_step(self, actions: Array) -> None:
+        """Start a period with the robots' inputs (N, m), which are clipped to their bounds and slew.
+
+        Raises:
+            BadInput: an input is not finite.
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        if self._now is None:
+            raise gymnasium.error.ResetNeeded("call reset() before the first step")
+        inputs = np.asarray(actions, dtype=float)
+        if inputs.shape != (self.num_envs, self.robot.action_dim) or not np.isfinite(inputs).all():
+            raise BadInput(f"the inputs of {self.num_envs} robots must be {self.robot.action_dim} finite numbers each")
+        resting = self._ended if self.autoreset_mode == AutoresetMode.NEXT_STEP else np.zeros_like(self._ended)
+        rows = np.flatnonzero(~resting)
+        self._robots.set_input(rows, inputs[rows])
+        self._stepping = rows, self._worker.submit(self._robots.advance, rows)
+
+    def end_step(self) -> StepBatch:
+        """Wait for the period that `begin_step` started, and return what `step` returns."""
+        assert self._stepping is not None, "begin_step comes first"
+        rows, motion = self._stepping
+        self._stepping = None
+        period = self._robots.finish(rows, motion.result())
+        self._steps[rows] += 1
+        before = self._distance[rows]
+        self._measure_distance(rows)
+        at_goal = self._at_goal(rows, period)
+        rewards, terminated, truncated = np.zeros(self.num_envs), *np.zeros((2, self.num_envs), dtype=bool)
+        reward = self.reward.progress * (before - self._distance[rows])
+        rewards[rows] = reward + self.reward.goal * at_goal + self.reward.collision * period.collision
+        terminated[rows] = at_goal | period.collision
+        truncated[rows] = ~terminated[rows] & (self._steps[rows] >= self._step_limit)
+        observations, infos = self._join(rows, self._observe(rows), self._infos(rows, period))
+        resets = np.flatnonzero(self._ended) if self.autoreset_mode == AutoresetMode.NEXT_STEP else rows[:0]
+        self._ended = terminated | truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
+            resets = np.flatnonzero(self._ended)
+            final = {"final_obs": observations.copy(), "final_info": dict(infos), "_final_obs": self._ended}
+        else:
+            final = {}
+        if len(resets):
+            self._now = observations, infos
+            episodes = [self._episode_seeds(i) for i in resets.tolist()]
+            observations, infos = self._join(resets, *self._begin(resets, episodes))
+        self._now = observations, infos
+        return observations, rewards, terminated, truncated, infos | final
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the threads."""
+        self._worker.shutdown()
+        self._robots.close()
+
+    def _begin(self, rows: NDArray[np.intp], episodes: list[int]) -> tuple[Observations, Infos]:
+        """Begin episodes with these seeds; return the observations and infos of the rows."""
+        arenas: list[Arena] = []
+        for row, episode in zip(rows.tolist(), episodes, strict=True):
+            generator = np.random.default_rng((self.seed_key, episode))
+            arenas.append(draw_arena(self.arena_name, generator, self.robot))
+            self._streams.begin(row, generator)
+            self._arenas[row], self._seeds[row], self._goals[row] = arenas[-1], episode, arenas[-1].goal
+        self._robots.begin(rows, arenas)
+        self._observations.begin(rows)
+        self._steps[rows], self._ended[rows] = 0, False
+        self._measure_distance(rows)
+        return self._observe(rows), self._infos(rows, self._robots.initial_period(rows))
+
+    def _join(self, rows: NDArray[np.intp], observations: Observations, infos: Infos) -> tuple[Observations, Infos]:
+        """Return the latest observations and infos of all robots, with new ones in some rows."""
+        if self._now is None or len(rows) == self.num_envs:
+            return observations, infos
+        now, before = self._now[0].copy(), self._now[1]
+        now[rows] = observations
+        joined: Infos = {}
+        for name, values in infos.items():
+            if isinstance(values, np.ndarray):
+                joined[name] = before[name].copy()
+                joined[name][rows] = values
+            else:
+                joined[name] = values
+        return now, joined
+
+    def _measure_distance(self, rows: NDArray[np.intp]) -> None:
+        away = self._goals[rows] - self._robots.true[rows, : self.robot.position_dim]
+        self._distance[rows] = np.sqrt((away * away).sum(axis=1))
+
+    def _at_goal(self, rows: NDArray[np.intp], period: PeriodBatch) -> Flags:
+        return np.asarray((self._distance[rows] <= self._goal_radius) & ~period.collision)
+
+    def _observe(self, rows: NDArray[np.intp]) -> Observations:
+        robots = self._robots
+        seen = self._observations.observe(
+            rows, robots.true[rows], robots.measured[rows], robots.input[rows], self._goals[rows]
+        )
+        return np.clip(seen, -OBSERVED_LIMIT, OBSERVED_LIMIT).astype(np.float32)
+
+    def _outside(self, period: PeriodBatch) -> Flags:
+        """Return whether each measurement error exceeds the bound of the robot's description."""
+        error = period.measured - period.true
+        if (heading := self.robot.heading) is not None:
+            error[:, heading] = wrapped(error[:, heading])
+        return np.asarray((np.abs(error) > self._bound).any(axis=1))
+
+    def _infos(self, rows: NDArray[np.intp], period: PeriodBatch) -> Infos:
+        obstacles, none = self._robots.obstacles, np.zeros(len(rows), dtype=bool)
+        return {
+            "robot": self.robot.name,
+            "state": period.measured,
+            "true_state": period.true,
+            "outside": self._outside(period),
+            "input_in_force": self._robots.input[rows],
+            "obstacles": obstacles.shapes | {"count": obstacles.count},
+            "arena": self._arenas[rows],
+            "goal": self._goals[rows],
+            "time": self._steps[rows] * self.robot.period,
+            "collision": period.collision,
+            **dict.fromkeys(("contact_moving", "contact_standing", "contact_robot"), none),
+            "clearance": period.clearance,
+            "subsamples": period.subsamples,
+            "turned": period.turned,
+            "at_goal": self._at_goal(rows, period),
+            "speed": period.true[:, 3],
+            "episode_seed": self._seeds[rows],
+        }
+
+
+def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> None:
+    """Check that many robots can be simulated at once.
+
+    Raises:
+        NoBatch: this robot, arena or perception can only be simulated one by one.
+        UnknownName: the robot has no arena of this name.
+    """
+    kind, advice = arena_kind(robot, arena), "use NavigationEnv, or train without --backend batch"
+    if robot.layout() != GROUND.layout() or robot.task.senses != GROUND_SENSES:
+        raise NoBatch(f"{robot.name} with the task {robot.task.name} is not simulated in batches: {advice}")
+    if kind.movers is not None or kind.ring is not None:
+        raise NoBatch(f"the arena {arena} has moving obstacles or other robots, which no batch simulates: {advice}")
+    if conditions.perception.kind != "map":
+        raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {advice}")
+
+
+GROUND_SENSES = "brakeline.sim.observations:GroundObservation"

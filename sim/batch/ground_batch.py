@@ -1,0 +1,228 @@
+"""Many ground robots, each alone in its arena: one rollout of MuJoCo simulates a period of all of them.
+
+As long as a robot touches nothing, the obstacles of its arena do not change its motion, but they cost two thirds of the
+time of a step. So all robots take the period in one model without obstacles, in the threads of `mujoco.rollout`. A
+robot that may touch something in the period takes it in the model of its own arena, where MuJoCo reports contacts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from numpy.typing import NDArray
+
+from brakeline.messaging.obstacle import Array
+from brakeline.messaging.task import ArenaKind
+from brakeline.sim.arena import Arena
+from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
+from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.obstacle_batch import ObstacleBatch
+from brakeline.sim.floor_physics import FloorPhysics
+from brakeline.sim.ground_robot import (
+    COORDINATES,
+    GROUND,
+    MODEL,
+    SAMPLE_TIME,
+    SAMPLES,
+    SPEEDS,
+    WHEEL_RADIUS,
+    WHEELS,
+    YAW_RATE,
+    TurtleBot,
+    wheel_speeds,
+)
+from brakeline.sim.sim_conditions import Conditions
+
+Rows = NDArray[np.intp]
+
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+BARE = Arena("bare", (), (0.0, 0.0, 0.0), (0.0, 0.0), 0.0, 1, ((-1.0, 1.0), (-1.0, 1.0)))
+SAFE_GAP = 0.01  # m; the wheels turn too slowly to cover it between two samples
+
+
+@dataclass(frozen=True)
+class PeriodBatch:
+    """The reports of one period, with a row for each robot: see `Period`."""
+
+    measured: Array  # (rows, n)
+    true: Array  # (rows, n)
+    collision: NDArray[np.bool_]  # (rows,)
+    clearance: Array  # (rows,) m
+    subsamples: Array  # (rows, S, d) m
+    turned: Array  # (rows,) rad
+
+
+@dataclass(frozen=True)
+class MotionBatch:
+    """The true motion of robots in one period.
+
+    Attributes:
+        coordinates (rows, S, 9): MuJoCo's, at the samples.
+        collision (rows,): whether the robot touched an obstacle in some physics step.
+        clearance (rows, S): m, from the body to the nearest obstacle.
+    """
+
+    coordinates: Array
+    collision: NDArray[np.bool_]
+    clearance: Array
+
+
+class GroundBatch:
+    """N ground robots.
+
+    Attributes:
+        true, measured: (N, 5) states; see `TurtleBot`.
+        input: (N, 2) inputs executed last.
+        obstacles: those of each robot's arena.
+    """
+
+    robot, samples = GROUND, SAMPLES
+
+    def __init__(
+        self, size: int, kind: ArenaKind, conditions: Conditions, threads: int, streams: NormalStreams
+    ) -> None:
+        """Prepare for `size` robots.
+
+        Args:
+            kind: of the arenas.
+            threads: number of threads for the physics; 0: the calling thread.
+            streams: the source of all sensor errors.
+        """
+        self._conditions = conditions
+        self._physics = self._floor_physics(BARE)
+        model = self._physics.model
+        self._rollout = Rollout(nthread=threads)
+        self._data = [mujoco.MjData(model) for _ in range(max(1, threads))]
+        self._steps = round(SAMPLE_TIME / model.opt.timestep)
+        self._state, self._warmstart = np.zeros((size, mujoco.mj_stateSize(model, STATE))), np.zeros((size, SPEEDS))
+        self._clearance = np.zeros(size)
+        self._arenas: list[Arena] = [BARE] * size
+        self._near: dict[int, FloorPhysics] = {}
+        self._estimator = GroundEstimatorBatch(size, conditions.noise, streams, WHEEL_RADIUS, SAMPLE_TIME)
+        self.obstacles = ObstacleBatch(size, kind)
+        self.true, self.measured = np.zeros((size, GROUND.state_dim)), np.zeros((size, GROUND.state_dim))
+        self.input = np.zeros((size, GROUND.action_dim))
+
+    def close(self) -> None:
+        """End the threads."""
+        self._rollout.close()
+
+    def begin(self, rows: Rows, arenas: list[Arena]) -> None:
+        """Place robots at the starts of their arenas, and let them settle on their wheels."""
+        model, data = self._physics.model, self._physics.data
+        for row, arena in zip(rows.tolist(), arenas, strict=True):
+            self._near.pop(row, None)
+            self._arenas[row] = arena
+            self.obstacles.put(row, arena)
+            x, y, heading = arena.start
+            mujoco.mj_resetData(model, data)
+            data.qpos[:7] = x, y, WHEEL_RADIUS, math.cos(0.5 * heading), 0.0, 0.0, math.sin(0.5 * heading)
+            mujoco.mj_forward(model, data)
+            mujoco.mj_getState(model, data, self._state[row], STATE)
+            self._warmstart[row] = data.qacc_warmstart
+        self.input[rows] = 0.0
+        starts = np.array([arena.start[:2] for arena in arenas]).reshape(-1, 1, 2)
+        self._clearance[rows] = self.obstacles.clearance(rows, starts)[:, 0] - GROUND.footprint
+        motion = self.advance(rows)
+        self.true[rows] = self._true_states(rows)
+        self._estimator.begin(rows, self.true[rows, :3], motion.coordinates[:, -1, WHEELS])
+        self.measured[rows] = np.column_stack([self._estimator.pose[rows], np.zeros((len(rows), 2))])
+
+    def initial_period(self, rows: Rows) -> PeriodBatch:
+        """Return the reports of a period in which nothing happened, at the present states."""
+        k = len(rows)
+        states = self.measured[rows], self.true[rows]
+        path = np.zeros((k, SAMPLES, 2))
+        return PeriodBatch(*states, np.zeros(k, dtype=bool), self._clearance[rows], path, np.zeros(k))
+
+    def set_input(self, rows: Rows, inputs: Array) -> None:
+        """Set the inputs (rows, 2) of the next period, which are finite; clip them to the robot's bounds."""
+        self.input[rows] = np.clip(inputs, GROUND.low(), GROUND.high())
+
+    def advance(self, rows: Rows) -> MotionBatch:
+        """Simulate a period of the physics. It uses no array but the robots' own motion, so it may run in a thread."""
+        reach = GROUND.period * np.maximum(self.input[rows, 0], np.abs(self.true[rows, 3])) + SAFE_GAP
+        near = self._clearance[rows] < reach
+        coordinates = np.empty((len(rows), SAMPLES, COORDINATES))
+        clearance, collision = np.empty((len(rows), SAMPLES)), np.zeros(len(rows), dtype=bool)
+        before = self._state[rows], self._warmstart[rows]
+        if not near.all():
+            far = rows[~near]
+            coordinates[~near] = self._roll(far)
+            clearance[~near] = self.obstacles.clearance(far, coordinates[~near, :, :2]) - GROUND.footprint
+            doubtful = clearance.min(axis=1) < SAFE_GAP
+            near |= doubtful & ~near
+        for i in np.flatnonzero(near):
+            self._state[rows[i]], self._warmstart[rows[i]] = before[0][i], before[1][i]
+            collision[i] = self._advance_in_arena(int(rows[i]), coordinates[i])
+        if near.any():
+            clearance[near] = self.obstacles.clearance(rows[near], coordinates[near, :, :2]) - GROUND.footprint
+        self._clearance[rows] = clearance[:, -1]
+        return MotionBatch(coordinates, collision, clearance)
+
+    def finish(self, rows: Rows, motion: MotionBatch) -> PeriodBatch:
+        """Measure, and return the reports of a period whose physics `advance` simulated."""
+        headings = headings_of(motion.coordinates[..., 3:7])
+        headings = np.column_stack([self.true[rows, 2], headings])
+        rates = np.diff(np.unwrap(headings, axis=1), axis=1) * (SAMPLES / GROUND.period)
+        self.true[rows] = self._true_states(rows)
+        measured, path, turned = self._estimator.update(
+            rows, motion.coordinates[..., WHEELS], rates, self.true[rows, :3]
+        )
+        self.measured[rows] = measured
+        return PeriodBatch(measured, self.true[rows], motion.collision, motion.clearance[:, -1], path, turned)
+
+    def _floor_physics(self, arena: Arena) -> FloorPhysics:
+        """Compile the robot in an arena, under the conditions."""
+        physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
+        robot = TurtleBot(arena, physics.model, physics.data)
+        robot.alter(payload_kg=self._conditions.payload_kg, floor_friction=self._conditions.floor_friction)
+        return physics
+
+    def _roll(self, rows: Rows) -> Array:
+        """Simulate a period without obstacles; return the coordinates (rows, S, 9) at the samples."""
+        model, steps = self._physics.model, SAMPLES * self._steps
+        control = np.repeat(wheel_speeds(self.input[rows])[:, None], steps, axis=1)
+        states, _ = self._rollout.rollout(
+            model, self._data, self._state[rows], control, initial_warmstart=self._warmstart[rows]
+        )
+        self._state[rows] = states[:, -1]
+        speeds = states[:, -2:, 1 + COORDINATES : 1 + COORDINATES + SPEEDS]
+        # MuJoCo starts its solver from the last accelerations, which no rollout returns.
+        self._warmstart[rows] = (speeds[:, 1] - speeds[:, 0]) / model.opt.timestep
+        return np.asarray(states[:, self._steps - 1 :: self._steps, 1 : 1 + COORDINATES])
+
+    def _advance_in_arena(self, row: int, coordinates: Array) -> bool:
+        """Simulate a period of a robot in its arena, and fill in `coordinates` (S, 9). Return whether it collided."""
+        if row not in self._near:
+            self._near[row] = self._floor_physics(self._arenas[row])
+        physics = self._near[row]
+        model, data = physics.model, physics.data
+        mujoco.mj_setState(model, data, self._state[row], STATE)
+        data.qacc_warmstart[:], data.ctrl[:] = self._warmstart[row], wheel_speeds(self.input[row])
+        mujoco.mj_step1(model, data)
+        collision = False
+        for i in range(SAMPLES):
+            collision |= physics.advance(at_rest=False)
+            coordinates[i] = data.qpos
+        mujoco.mj_getState(model, data, self._state[row], STATE)
+        self._warmstart[row] = data.qacc_warmstart
+        return collision
+
+    def _true_states(self, rows: Rows) -> Array:
+        """Return the true states (rows, 5)."""
+        coordinates = self._state[rows, 1 : 1 + COORDINATES]
+        speeds = self._state[rows, 1 + COORDINATES : 1 + COORDINATES + SPEEDS]
+        heading = headings_of(coordinates[:, 3:7])
+        speed = speeds[:, 0] * np.cos(heading) + speeds[:, 1] * np.sin(heading)
+        return np.column_stack([coordinates[:, :2], heading, speed, speeds[:, YAW_RATE]])
+
+
+def headings_of(attitudes: Array) -> Array:
+    """Return the headings (...) [rad] of attitudes (..., 4): `heading_of` for arrays."""
+    w, x, y, z = np.moveaxis(attitudes, -1, 0)
+    return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))

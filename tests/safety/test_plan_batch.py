@@ -1,0 +1,128 @@
+"""Committed plans as arrays decide, widen and brake as one `BackupPlan` for each robot does."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from brakeline.errors import BadRequest
+from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, correction_penalty
+from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
+from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, correction_penalties
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.gym_batch import BatchSafetyWrapper
+from brakeline.safety.service.in_process import InProcess
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
+
+GROUND = robot_with_task("ground")
+SAFETY = Filter.load("ground")
+
+
+def near(info: dict[str, Any], row: int) -> list[Obstacle]:
+    arena, position = info["arena"][row], info["state"][row][:2]
+    return [arena.obstacles[i] for i in np.flatnonzero(arena.shapes.distance(position) <= GROUND.sight)]
+
+
+def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
+    """The inputs differ by less than 1e-6; the status of each plan and the widening are the same."""
+    size, rng = 4, np.random.default_rng(0)
+    env, singles = BatchNavigationEnv(GROUND, size, "dense"), [InProcess(SAFETY) for _ in range(size)]
+    _, infos = env.reset(seed=0)
+    plans = BackupPlanBatch(SAFETY, size)
+    status = np.array(["", SAFETY.version, UNVERIFIED])
+    for _ in range(60):
+        actions = np.column_stack([np.full(size, 0.25), rng.uniform(-0.5, 0.5, size)])
+        before = plans.input_in_force
+        outcome = plans.decide(infos["state"], actions, ObstacleArrays(**infos["obstacles"]))
+        for row, single in enumerate(singles):
+            single.decide(infos["state"][row], actions[row], near(infos, row), known_free=True)
+            plan = single.backup_plan
+            assert np.abs(outcome.inputs[row] - plan.next_input).max() < 1e-6
+            assert status[plans._status[row]] == plan.model
+            assert plans.widening[row] == pytest.approx(plan.widening.factor, abs=1e-6)
+            penalty = correction_penalty(GROUND, actions[row], before[row], outcome.inputs[row], 1.0)
+            mine = correction_penalties(GROUND, actions, before, outcome.inputs, 1.0)
+            assert mine[row] == pytest.approx(penalty, abs=1e-12)
+        _, _, terminated, truncated, infos = env.step(outcome.inputs)
+        ended = terminated | truncated
+        plans.reset(ended)
+        for row in np.flatnonzero(ended):
+            singles[row].backup_plan.reset()
+    env.close()
+
+
+class Broken:
+    """A filter whose answers a test spoils."""
+
+    def __init__(self, spoil: Any) -> None:
+        self.robot, self.version, self._spoil = SAFETY.robot, SAFETY.version, spoil
+
+    def decide_batch(self, requests: Any) -> DecisionArrays:
+        return self._spoil(SAFETY.decide_batch(requests))
+
+
+def beyond(answers: DecisionArrays) -> DecisionArrays:
+    answers.plan[0, 0] = 9.0
+    return answers
+
+
+def endless(answers: DecisionArrays) -> DecisionArrays:
+    answers.plan[0, -1] = 0.2
+    return answers
+
+
+def unknown(answers: DecisionArrays) -> DecisionArrays:
+    return replace(answers, plan=np.where(np.arange(2)[:, None, None] == 0, np.nan, answers.plan))
+
+
+def failing(answers: DecisionArrays) -> DecisionArrays:
+    raise BadRequest("state", "row 0: not finite")
+
+
+@pytest.mark.parametrize("spoil", [beyond, endless, unknown, failing, None])
+def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(spoil: Any) -> None:
+    """As `BackupPlan.fallback`: the first row brakes; the second goes on, unless the filter failed as a whole."""
+    plans, single = BackupPlanBatch(SAFETY, 2), InProcess(SAFETY)
+    free = ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    states = np.tile([0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
+    actions = np.tile([0.2, 0.1], (2, 1))
+    assert np.allclose(plans.decide(states, actions, free).inputs, actions)
+    single.decide(states[0], actions[0], [], known_free=True)
+    states[:, 0], states[:, 3] = 0.03, 0.19
+    if spoil is None:
+        actions[0, 1] = np.nan
+    else:
+        plans.safety = Broken(spoil)  # type: ignore[assignment]
+    outcome = plans.decide(states, actions, free)
+    single.backup_plan.measured(states[0])
+    assert np.allclose(outcome.inputs[0], single.backup_plan.fallback())
+    assert outcome.decided.tolist() == [False, spoil is not failing] and outcome.failure
+    assert np.allclose(outcome.inputs[1], actions[1]) == (spoil is not failing)
+    assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
+
+
+def test_plans_of_other_robots_are_not_kept_in_batches() -> None:
+    other = Broken(beyond)
+    other.robot = robot_named("ground-late")
+    with pytest.raises(ValueError, match="one robot at a time"):
+        BackupPlanBatch(other, 2)  # type: ignore[arg-type]
+
+
+def test_the_wrapper_filters_every_step_and_nothing_collides() -> None:
+    """Robots that drive straight ahead never touch anything, and an episode begins with a standing plan."""
+    env = BatchSafetyWrapper(BatchNavigationEnv(GROUND, 16, "dense"), SAFETY, penalty=1.0)
+    env.reset(seed=1)
+    contained = compared = 0
+    for _ in range(60):
+        *_, infos = env.step(np.tile([0.25, 0.0], (16, 1)))
+        assert infos["outcome"].decided.all() and not infos["collision"].any()
+        assert (infos["penalty"] >= 0.0).all()
+        contained, compared = contained + infos["contained"].sum(), compared + infos["compared"].sum()
+    assert compared > 900 and contained > 0.98 * compared
+    assert BackupPlan(GROUND).plan.shape == env.plans.plan.shape[1:]
+    env.close()

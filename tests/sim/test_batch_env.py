@@ -1,0 +1,146 @@
+"""Many robots at once see what single environments with the same seeds give, in every autoreset mode."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from brakeline.errors import BadInput, NoBatch, UnknownName
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.ray_directions import planar_rays
+from brakeline.messaging.task import robot_with_task
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.obstacle_batch import ObstacleBatch
+from brakeline.sim.ground_estimator import cut_normal
+from brakeline.sim.lidar import Lidar
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception
+from tests.robots import GROUND
+
+COMPARED = (
+    *("state", "true_state", "outside", "input_in_force", "goal", "time", "collision", "contact_moving", "clearance"),
+    *("subsamples", "turned", "at_goal", "speed", "episode_seed"),
+)
+SAME = 1e-9  # rounding
+
+
+def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
+    """Compare the infos of one robot."""
+    for name in COMPARED:
+        assert np.abs(np.asarray(batch[name][row], float) - single[name]).max() <= SAME, name
+    assert batch["arena"][row] == single["arena"] and batch["robot"] == single["robot"]
+
+
+@pytest.mark.parametrize(
+    ("arena", "policy", "steps", "conditions"),
+    [
+        ("default", "greedy", 40, Conditions()),
+        ("dense", "adversary", 90, Conditions(noise=NoiseLevels(scale=0.5), payload_kg=0.4, floor_friction=0.7)),
+        ("open", "random", 25, Conditions(noise=NoiseLevels(scale=0.0))),
+    ],
+)
+def test_robots_of_a_batch_move_as_single_ones(arena: str, policy: str, steps: int, conditions: Conditions) -> None:
+    """Everything is equal within 1e-9. In the period of a collision, the impact amplifies the rounding of the state."""
+    size = 4
+    batch = BatchNavigationEnv(GROUND, size, arena, conditions=conditions, seed_key=3, threads=2)
+    singles = [NavigationEnv(GROUND, arena, conditions=conditions, seed_key=3) for _ in range(size)]
+    policies = [scripted(policy, GROUND, np.random.default_rng(i)) for i in range(size)]
+    observations, infos = batch.reset(seed=7)
+    now = [env.reset(seed=7 + i) for i, env in enumerate(singles)]
+    collisions = ends = 0
+    for _ in range(steps):
+        for i, (observation, info) in enumerate(now):
+            assert np.abs(observations[i] - observation).max() <= 1e-6  # float32
+            compare(infos, i, info)
+        inputs = np.array([policy(*one) for policy, one in zip(policies, now, strict=True)])
+        observations, rewards, terminated, truncated, infos = batch.step(inputs)
+        for i, env in enumerate(singles):
+            *seen, info = env.step(inputs[i])
+            observation, reward, *end = seen
+            assert end == [terminated[i], truncated[i]]
+            assert rewards[i] == pytest.approx(reward, abs=0.5 if info["collision"] else SAME)
+            now[i] = observation, info
+            if any(end):
+                assert infos["final_info"]["collision"][i] == info["collision"]
+                assert np.abs(infos["final_obs"][i] - observation).max() <= 1e-6 or info["collision"]
+                now[i], ends, collisions = env.reset(), ends + 1, collisions + info["collision"]
+    batch.close()
+    assert ends >= collisions >= (5 if policy == "adversary" else 0)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
+def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
+    """`SyncVectorEnv` with the same modes gives the same observations, rewards and ends."""
+    size = 3
+    batch = BatchNavigationEnv(GROUND, size, "dense", autoreset_mode=mode)
+    peer = SyncVectorEnv([lambda: NavigationEnv(GROUND, "dense")] * size, autoreset_mode=mode)
+    seen, _ = batch.reset(seed=1)
+    assert np.allclose(seen, peer.reset(seed=1)[0], atol=1e-6)
+    ended = 0
+    inputs = np.tile(np.float32([0.25, 0.0]), (size, 1))
+    for _ in range(60):
+        (seen, *mine, infos), (theirs, *other, _) = batch.step(inputs), peer.step(inputs)
+        ends = mine[1] | mine[2]
+        for a, b in zip(mine, other, strict=True):
+            assert np.allclose(a, b, atol=0.5 * infos["collision"].any() + SAME)
+        touched = infos["collision"] if mode == AutoresetMode.NEXT_STEP else np.zeros(size, dtype=bool)
+        if mode == AutoresetMode.DISABLED and ends.any():
+            options = {"reset_mask": ends}
+            (seen, _), (theirs, _) = batch.reset(options=dict(options)), peer.reset(options=dict(options))
+        assert np.allclose(seen[~touched], theirs[~touched], atol=1e-6)
+        ended += int(ends.sum())
+    batch.close()
+    peer.close()
+    assert ended > 3
+
+
+def test_ranges_are_those_of_the_lidar_of_mujoco() -> None:
+    """Within 1e-9, in all arenas of the plane, from random points and headings."""
+    rng, rays = np.random.default_rng(0), planar_rays(18, 180.0, 3.5)
+    for name in ("default", "dense", "open"):
+        arenas = [draw_arena(name, rng, GROUND) for _ in range(8)]
+        batch = ObstacleBatch(8, GROUND.task.arenas[name])
+        for row, arena in enumerate(arenas):
+            batch.put(row, arena)
+        rows, points = np.arange(8), rng.uniform(-2.4, 2.4, (8, 2))
+        for turn in rng.uniform(-np.pi, np.pi, 5):
+            cos, sin = np.cos(turn), np.sin(turn)
+            beams = np.tile(rays.directions @ np.array([[cos, sin], [-sin, cos]]), (8, 1, 1))
+            ranges = batch.cast(rows, points, beams, 3.5)
+            for row, arena in enumerate(arenas):
+                assert np.abs(ranges[row] - Lidar(arena, rays).cast(points[row], turn)).max() <= SAME
+        clear = [Shapes.of(arena.obstacles, 2).distance(points[row]).min() for row, arena in enumerate(arenas)]
+        assert np.abs(batch.clearance(rows, points[:, None])[:, 0] - clear).max() <= SAME
+
+
+def test_noise_is_that_of_each_generator() -> None:
+    streams = NormalStreams(3)
+    for row in range(3):
+        streams.begin(row, np.random.default_rng(row))
+    peers = [np.random.default_rng(row) for row in range(3)]
+    for size in (1, 18, 20, 3) * 60:
+        rows = np.array([0, 2]) if size == 3 else np.arange(3)
+        drawn = streams.cut_normal(rows, 0.3, size)
+        assert np.array_equal(drawn, [cut_normal(peers[row], 0.3, (size,)) for row in rows])
+
+
+def test_what_only_single_environments_simulate_is_refused() -> None:
+    for robot, arena, conditions in (
+        ("ground", "walkers", Conditions()),
+        ("ground", "crossing", Conditions()),
+        ("ground+tracks", "default", Conditions()),
+        ("ground", "default", Conditions(perception=Perception("scan"))),
+    ):
+        with pytest.raises(NoBatch, match="NavigationEnv"):
+            BatchNavigationEnv(robot_with_task(robot), 2, arena, conditions=conditions)
+    with pytest.raises(UnknownName, match="no arena"):
+        BatchNavigationEnv(GROUND, 2, "moon")
+    env = BatchNavigationEnv(GROUND, 2)
+    env.reset(seed=0)
+    with pytest.raises(BadInput, match="finite"):
+        env.step(np.full((2, 2), np.nan))
+    env.close()
