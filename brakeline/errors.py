@@ -197,6 +197,10 @@ class UnknownName(BrakelineError, ValueError):
     """The robot has no arena, policy or rule set of this name; the message lists the names."""
 
 
+class NoCluster(BrakelineError, RuntimeError):
+    """There is no Ray cluster at an address."""
+
+
 class NoArena(BrakelineError, RuntimeError):
     """No drawn arena has a path from start to goal: the settings of the arena leave too little room."""
 

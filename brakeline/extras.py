@@ -14,6 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
         *("foxglove", "foxglove_schemas_protobuf", "jinja2", "lz4", "matplotlib", "mcap", "mcap_protobuf", "minari"),
         *("pyarrow", "zstandard"),
     ),
+    "ray": ("ray",),
 }
 
 

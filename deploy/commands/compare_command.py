@@ -11,7 +11,7 @@ import tyro
 from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, errors, print_json
-from brakeline.deploy.commands.common_options import Json
+from brakeline.deploy.commands.common_options import Json, Unprefixed
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments import conservatism
 from brakeline.deploy.experiments.comparison_cells import (
@@ -27,6 +27,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, table
 from brakeline.deploy.experiments.experiment_jobs import Job, complete
+from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import address, robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
@@ -53,8 +54,7 @@ class CompareCommand:
     quick: bool = False
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
-    workers: int = 2
-    """Run this many trainings at once, each on one core."""
+    engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     again: bool = False
     """Run again what has results already."""
     conservatism: bool = True
@@ -82,7 +82,7 @@ class CompareCommand:
                 if method != NONE:
                     method_for(robot_with_task(robot), method, ModelConfig())
             jobs = self._jobs(robot)
-            finished = complete(jobs, results, runs, self.workers, self.again or self.quick, self._print_progress)
+            finished = complete(jobs, results, runs, self.engine, self.again or self.quick, self._print_progress)
             cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
             tables[robot] = self._write(cells, others, results / robot)

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, errors, print_result
-from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
+from brakeline.deploy.experiments.evaluate import (
+    Evaluation,
+    evaluate,
+    evaluate_with,
+    prepare_evaluation,
+    progress_line,
+)
+from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine
 from brakeline.deploy.progress import under_way
-from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.logs.figure_tables import show
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
@@ -37,6 +44,7 @@ class EvaluateCommand:
     """With --render, draw the episode of this number."""
     beside: bool = False
     """With --render, draw the same episode without the filter beside it."""
+    engine: options.Unprefixed[Engine] = field(default_factory=Engine)
     verbose: bool = False
     """Show also the conditions: sensor errors, wind, payload."""
     json: options.Json = False
@@ -60,17 +68,17 @@ class EvaluateCommand:
         )
         if self.render is not None:
             self._draw(robot, evaluation, self.render)
-        with under_way("driving episodes", self.episodes) as advance:
-
-            def show_progress(tally: EpisodeStats) -> None:
-                counts = f"goals {tally.goals}, collisions {tally.collisions}, interventions {tally.interventions}"
-                advance(what=counts)
-
-            figures = evaluate(robot, evaluation, show_progress)
+        figures = self._figures(robot, evaluation)
         print_result(
             self.json, figures, show(figures), *([conditions_table(figures["conditions"])] if self.verbose else [])
         )
         return 0
+
+    def _figures(self, robot: RobotWithTask, evaluation: Evaluation) -> dict[str, Any]:
+        with under_way("driving episodes", self.episodes) as advance:
+            if self.engine == IN_THIS_PROCESS:
+                return evaluate(robot, evaluation, lambda stats: advance(what=progress_line(stats)))
+            return evaluate_with(self.engine, robot, evaluation, lambda name, text: advance(0, f"{name}: {text}"))
 
     def _draw(self, robot: RobotWithTask, evaluation: Evaluation, path: Path) -> None:
         from brakeline.deploy.run.episode_render import record, save

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
@@ -24,6 +27,10 @@ from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.sim_conditions import Conditions
 
 FRESH = 1_000_000  # added to the seed, so that no training run has the same episodes
+EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
+POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
+
+Each = Callable[[EpisodeStats], Any]
 
 
 @dataclass(frozen=True)
@@ -71,17 +78,26 @@ def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number:
         yield step
 
 
-def prepare_evaluation(robot: RobotWithTask, what: Evaluation) -> tuple[EpisodeRunner, Policy, Ask | None]:
-    """Create the episode runner in a fresh environment, the policy, and the filter's function (None: no filter)."""
-    policy = policy_named(what.policy, robot, what.seed)
+def prepare_evaluation(
+    robot: RobotWithTask, what: Evaluation, first: int = 0
+) -> tuple[EpisodeRunner, Policy, Ask | None]:
+    """Create the episode runner in a fresh environment, the policy, and the filter's function (None: no filter).
+
+    first: number of the first episode, which decides about the seed of scripted policies.
+    """
+    policy = policy_named(what.policy, robot, what.seed + POLICY_SEEDS * first)
     env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
     question = _question(robot, what)
     driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, what.seed), filtered=question is not None)
     return driver, policy, question
 
 
-def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
+def prepare_fleet(
+    robot: RobotWithTask, what: Evaluation, first: int = 0
+) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """Create the group, the world, the policies and the filter's function for several robots in one world.
+
+    first: see `prepare_evaluation`.
 
     Raises:
         NoFleet: this robot or this arena has no fleet.
@@ -89,7 +105,7 @@ def prepare_fleet(robot: RobotWithTask, what: Evaluation) -> tuple[RobotGroup, F
     """
     check_reservations(what.method)
     world = FleetEnv(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
-    policies = [policy_named(what.policy, robot, what.seed + i) for i in range(what.fleet)]
+    policies = [policy_named(what.policy, robot, what.seed + POLICY_SEEDS * first + i) for i in range(what.fleet)]
     question = _question(robot, what)
     drivers = [
         EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
@@ -105,39 +121,130 @@ def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
     return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
 
 
-def evaluate(
-    robot: RobotWithTask, what: Evaluation, each: Callable[[EpisodeStats], Any] = lambda stats: None
-) -> dict[str, Any]:
-    """Run `what.episodes` episodes and return their closed-loop metrics.
+@dataclass(frozen=True)
+class DrivenEpisodes:
+    """What was counted in some episodes of an evaluation.
 
-    A fleet runs at least that many episodes, counted over all its robots; its metrics are also given by kind, by robot,
-    and for its worlds. The function calls `each` after every episode with the statistics so far.
+    Attributes:
+        stats: statistics by actor.
+        periods: control periods.
+        touches: contacts between two robots, for any reason.
     """
-    world: FleetEnv | None = None
+
+    stats: dict[str, EpisodeStats]
+    periods: int
+    touches: int
+
+
+@dataclass(frozen=True)
+class EvaluationPart:
+    """Some episodes of an evaluation, as a task of `deploy/experiments/task_engine.py`.
+
+    Attributes:
+        robot_with_task: the robot.
+        what: the evaluation.
+        first, rounds: number of its first episode (of a fleet: of its first world), and how many there are.
+        policy_file: content of the policy's file, if the policy is one. Another machine may not have it.
+    """
+
+    robot_with_task: RobotWithTask
+    what: Evaluation
+    first: int
+    rounds: int
+    policy_file: bytes | None
+
+    @property
+    def robot(self) -> str:
+        """The name of the robot."""
+        return self.robot_with_task.name
+
+    @property
+    def name(self) -> str:
+        """The name in reports of progress."""
+        return f"episodes from {self.first}"
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> DrivenEpisodes:
+        """Drive the episodes in a process of their own."""
+        what = self.what
+        if self.policy_file is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / Path(what.policy).name
+            path.write_bytes(self.policy_file)
+            what = replace(what, policy=str(path))
+        return replace(self, what=what).drive(lambda stats: say(progress_line(stats)))
+
+    def drive(self, each: Each) -> DrivenEpisodes:
+        """Drive the episodes. Calls `each` after every episode with the statistics so far."""
+        robot, what, world = self.robot_with_task, self.what, None
+        if what.fleet:
+            group, world, policies, question = prepare_fleet(robot, what, self.first)
+        else:
+            driver, policy, question = prepare_evaluation(robot, what, self.first)
+            group, policies = RobotGroup([driver]), [policy]
+        stats, periods = {runner.identity.actor: EpisodeStats() for runner in group.runners}, 0
+        for number in range(self.first, self.first + self.rounds):
+            for steps in run_episode(group, policies, question, number):
+                periods += 1
+                for step in steps:
+                    stats[step.actor].step(step)
+            for actor in stats.values():
+                each(actor)
+        return DrivenEpisodes(stats, periods, 0 if world is None else world.touches)
+
+
+def progress_line(stats: EpisodeStats) -> str:
+    """Return what the statistics have counted, in a few words."""
+    return f"goals {stats.goals}, collisions {stats.collisions}, interventions {stats.interventions}"
+
+
+def parts_of(robot: RobotWithTask, what: Evaluation) -> list[EvaluationPart]:
+    """Cut an evaluation into parts, the same ones whatever runs them, for they decide about its figures.
+
+    A part begins as an evaluation does: without a widening, and with a seed of its own for scripted policies. Written
+    inputs are one sequence, and stay one part. A fleet drives at least `what.episodes` episodes, counted over all its
+    robots.
+    """
+    rounds = -(-what.episodes // max(what.fleet, 1))
+    size = max(rounds, 1) if what.policy.endswith(".csv") else EPISODES_A_PART
+    content = path.read_bytes() if (path := Path(what.policy)).is_file() else None
+    firsts = range(0, rounds, size)
+    return [EvaluationPart(robot, what, first, min(size, rounds - first), content) for first in firsts]
+
+
+def evaluate(robot: RobotWithTask, what: Evaluation, each: Each = lambda stats: None) -> dict[str, Any]:
+    """Run `what.episodes` episodes in this process, and return their closed-loop metrics.
+
+    The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls `each` after every
+    episode with the statistics of its part (`parts_of`) so far.
+    """
+    return _figures(robot, what, [part.drive(each) for part in parts_of(robot, what)])
+
+
+def evaluate_with(engine: Engine, robot: RobotWithTask, what: Evaluation, say: Say = unsaid) -> dict[str, Any]:
+    """Return the same metrics as `evaluate`, by several processes or machines. say: see `Engine.completed`."""
+    parts = parts_of(robot, what)
+    with TemporaryDirectory() as folder:
+        driven = {part.first: counted for part, counted in engine.completed(parts, Path(folder), say)}
+    return _figures(robot, what, [driven[part.first] for part in parts])
+
+
+def _figures(robot: RobotWithTask, what: Evaluation, parts: Sequence[DrivenEpisodes]) -> dict[str, Any]:
+    """Return the metrics of all parts of an evaluation, in the order of their episodes."""
+    by_actor: dict[str, list[EpisodeStats]] = {}
+    for part in parts:
+        for actor, stats in part.stats.items():
+            by_actor.setdefault(actor, []).append(stats)
+    figures = closed_loop(stats for part in parts for stats in part.stats.values())
     if what.fleet:
-        group, world, policies, question = prepare_fleet(robot, what)
-    else:
-        driver, policy, question = prepare_evaluation(robot, what)
-        group, policies = RobotGroup([driver]), [policy]
-    stats = {runner.identity.actor: EpisodeStats() for runner in group.runners}
-    rounds, periods = -(-what.episodes // len(stats)), 0
-    for number in range(rounds):
-        for steps in run_episode(group, policies, question, number):
-            periods += 1
-            for step in steps:
-                stats[step.actor].step(step)
-        for actor in stats.values():
-            each(actor)
-    figures = closed_loop(stats.values())
-    if world is not None:
+        periods = sum(part.periods for part in parts)
         seconds = periods * robot.period
         figures |= {
             "robots": {robot.name: dict(figures)},
-            "actors": {name: closed_loop([actor]) for name, actor in stats.items()},
+            "actors": {name: closed_loop(stats) for name, stats in by_actor.items()},
             "worlds": {
-                "count": rounds,
+                "count": sum(part.rounds for part in parts_of(robot, what)),
                 "robot_steps": periods * what.fleet,  # includes robots that stand at their goals
-                "touches": world.touches,  # contacts between two robots, for any reason
+                "touches": sum(part.touches for part in parts),
                 "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
             },
         }

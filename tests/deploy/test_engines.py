@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,20 @@ def test_kubernetes_manifests_are_consistent():
             assert all(p["httpGet"]["port"] in ports and p["httpGet"]["path"] in ("/live", "/ready") for p in probed)
             volumes = {volume["name"] for volume in manifest["spec"]["template"]["spec"]["volumes"]}
             assert {mount["name"] for mount in container["volumeMounts"]} <= volumes
+
+
+def test_the_study_on_ray_is_parsed_and_its_pods_match_the_schema():
+    validate = pytest.importorskip("kubernetes_validate")
+    claim, study = yaml.safe_load_all((DEPLOY / "kubernetes" / "ray" / "study.yaml").read_text())
+    validate.validate(claim, validate.latest_version(), strict=True)
+    _, name, *words = shlex.split(study["spec"]["entrypoint"])
+    assert tyro.cli(command_class(name), args=words).engine.ray == "auto"
+    cluster = study["spec"]["rayClusterSpec"]
+    assert f"ray=={cluster['rayVersion']}" in (ROOT / "constraints.txt").read_text().splitlines()
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "ray"}, "spec": group["template"]["spec"]}
+        validate.validate(pod, validate.latest_version(), strict=True)
+        assert all(container["image"] == f"brakeline:{version('brakeline')}" for container in pod["spec"]["containers"])
 
 
 def test_kustomize_builds_all_manifests():

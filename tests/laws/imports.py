@@ -62,6 +62,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "sim.autopilot.common_dialect",
         "deploy.data.sources.ardupilot_log",
     ),
+    "ray": ("deploy.experiments.ray_tasks",),
     "pyulog": ("deploy.data.sources.px4_log",),
     "pyarrow": ("deploy.data.sources.parquet_files", "deploy.data.sources.csv_file"),
     "numba": ("safety.compilation",),

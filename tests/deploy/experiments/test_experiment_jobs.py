@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, write
+from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.errors import ResultError
 from tests.waiting import until
 
@@ -40,17 +41,17 @@ def test_what_is_there_is_not_run_again(tmp_path):
     jobs, reports = [Errand(n) for n in (1, 2, 3)], []
     write(tmp_path / "results", jobs[1], {"study": configuration(jobs[1]), "square": -1})
     say = lambda name, text: reports.append((name, text))  # noqa: E731
-    results = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=1, say=say)
+    results = complete(jobs, tmp_path / "results", tmp_path / "runs", engine=Engine(1), say=say)
     assert [result["square"] for result in results] == [1, -1, 9]
     assert reports == [("errand-1", "half way"), ("errand-3", "half way")]
-    assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", workers=2) == results
+    assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", engine=Engine(2)) == results
     assert not (tmp_path / "elsewhere").exists(), "the results alone suffice, on any machine"
     assert read(tmp_path / "results", Errand(4)) is None
 
 
 def test_side_by_side_they_give_the_same(tmp_path):
     jobs = [Errand(n) for n in range(5)]
-    results = complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
+    results = complete(jobs, tmp_path / "results", tmp_path / "runs", engine=Engine(2))
     assert [result["square"] for result in results] == [0, 1, 4, 9, 16]
     assert len(list((tmp_path / "results" / "ground").iterdir())) == 5
 
@@ -69,9 +70,10 @@ class Nap(Errand):
 NAPS = """
 from pathlib import Path
 from brakeline.deploy.experiments.experiment_jobs import complete
+from brakeline.deploy.experiments.task_engine import Engine
 from tests.deploy.experiments.test_experiment_jobs import Nap
 if __name__ == "__main__":
-    complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", workers=2)
+    complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", engine=Engine(2))
 """
 
 
@@ -92,15 +94,15 @@ def test_killed_it_leaves_no_worker_behind(tmp_path):
 def test_a_job_that_fails_loses_nothing_that_was_done(tmp_path):
     jobs = [Errand(1), Errand(-1), Errand(2)]
     with pytest.raises(RuntimeError, match="no such number"):
-        complete(jobs, tmp_path / "results", tmp_path / "runs", workers=2)
+        complete(jobs, tmp_path / "results", tmp_path / "runs", engine=Engine(2))
     assert read(tmp_path / "results", jobs[0]) is not None
 
 
 def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_path):
-    complete([Errand(1)], tmp_path / "results", tmp_path / "runs", workers=1)
+    complete([Errand(1)], tmp_path / "results", tmp_path / "runs", engine=Engine(1))
     with pytest.raises(ResultError, match="another setting") as refused:
-        complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", workers=1)
+        complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", engine=Engine(1))
     assert "errand-1.json" in str(refused.value)
     assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"
-    complete([Errand(1, setting=5)], tmp_path / "results", tmp_path / "again", workers=1, again=True)
+    complete([Errand(1, setting=5)], tmp_path / "results", tmp_path / "again", engine=Engine(1), again=True)
     assert read(tmp_path / "results", Errand(1, setting=5)) is not None

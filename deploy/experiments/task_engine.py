@@ -1,0 +1,143 @@
+"""Run the tasks of a study side by side: in worker processes of this machine, or on a Ray cluster.
+
+Keep the imports of this module light: a worker imports what its task needs.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Annotated, Any, Protocol, TypeVar
+
+import tyro
+
+from brakeline.deploy.interpreter import end_with_parent, spawning
+from brakeline.messaging.structured_text import parse_json
+
+LONGEST_LINE = 500  # characters per progress message
+
+Say = Callable[[str, str], object]  # called with a task's name and its progress
+
+
+class StudyTask(Protocol):
+    """A part of a study: an object that a process can hand to another one."""
+
+    @property
+    def robot(self) -> str:
+        """The robot, whose data and model sets the task needs."""
+
+    @property
+    def name(self) -> str:
+        """The name in reports of progress."""
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> Any:
+        """Run the task, and return its result. folder: for its files; say: reports progress."""
+
+
+T = TypeVar("T", bound=StudyTask)
+
+
+def unsaid(name: str, text: str) -> None:
+    """Ignore the progress."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Choose what runs the parts of a study."""
+
+    workers: int = 1
+    """Use this many processes of this machine at once, each on one core."""
+    ray: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = ""
+    """Use a Ray cluster instead: local starts one on this machine, auto takes the running one, HOST:PORT takes
+    another's. A part whose machine dies runs again. Needs the extra ray."""
+
+    def completed(self, tasks: Sequence[T], runs: Path, say: Say = unsaid) -> Iterator[tuple[T, Any]]:
+        """Run tasks, and yield each with its result once it is there.
+
+        Args:
+            tasks: the tasks.
+            runs: folder of their files, `runs/<robot>/<name>` for each.
+            say: called with a task's name and its progress.
+
+        Raises:
+            ModuleNotFoundError: Ray is not installed.
+            NoCluster: there is no Ray cluster at this address.
+            Any exception of a task, after the tasks that already run have ended; on Ray, after all others have.
+        """
+        if self.ray and tasks:
+            from brakeline.deploy.experiments.ray_tasks import run_on_ray
+
+            yield from run_on_ray(tasks, self.ray, runs, say)
+        elif self.workers <= 1 or len(tasks) <= 1:
+            for task in tasks:
+                yield task, task.run(folder_of(runs, task), lambda text, task=task: say(task.name, text))  # type: ignore[misc]
+        else:
+            yield from _run_in_processes(tasks, self.workers, runs, say)
+
+
+IN_THIS_PROCESS = Engine()
+
+
+def folder_of(runs: Path, task: StudyTask) -> Path:
+    """Return the folder of a task's files."""
+    return runs / task.robot / task.name
+
+
+def _run_in_processes(tasks: Sequence[T], workers: int, runs: Path, say: Say) -> Iterator[tuple[T, Any]]:
+    """Run each task in a process of its own."""
+    context, failure = spawning(), None
+    reader, writer = context.Pipe(duplex=False)
+    with reader, writer, ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(writer,)) as pool:
+        under_way = {pool.submit(_run_task, task, folder_of(runs, task)): task for task in tasks}
+        while under_way:
+            done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
+            while reader.poll():
+                say(*parse_json(reader.recv_bytes()))
+            for future in done:
+                task = under_way.pop(future)
+                if future.cancelled():
+                    continue
+                if error := future.exception():
+                    failure = failure or error
+                    for other in under_way:
+                        other.cancel()
+                else:
+                    yield task, future.result()
+                    say(task.name, "done")
+    if failure is not None:
+        raise failure
+
+
+_to_parent: list[Connection] = []  # in a worker: the pipe on which it reports its progress
+
+
+def _start_worker(progress: Connection) -> None:
+    """Start a worker that ends with its parent, however the parent ends.
+
+    NumPy gets one thread: two processes with two threads each are slower on two cores.
+    """
+    _to_parent.append(progress)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends workers too, without a traceback
+    parent = multiprocessing.parent_process()
+    if parent is None or parent.pid is None or not end_with_parent(parent.pid, signal.SIGKILL):
+        os._exit(1)
+
+
+def _run_task(task: StudyTask, folder: Path) -> Any:
+    """Run a task in a worker."""
+
+    def say(text: str) -> None:
+        # The workers share the pipe, which writes up to 4096 bytes atomically.
+        line = json.dumps([task.name, text[:LONGEST_LINE]], ensure_ascii=False)
+        _to_parent[0].send_bytes(line.encode(errors="replace"))
+
+    return task.run(folder, say)
