@@ -84,7 +84,7 @@ class RunAnalysis:
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
             STEP.name: lambda series, step: self.training[series.robot].step(step),
             EXCHANGE.name: lambda series, exchange: self.training[series.robot].exchange(exchange),
-            LEARNER.name: lambda _, metrics: self.training[metrics.robot].learner(metrics),
+            LEARNER.name: lambda _, metrics: self._learner(metrics),
         }
         if self.options.pictures or self.options.episode is not None:
             handlers |= {
@@ -104,10 +104,20 @@ class RunAnalysis:
                 log.malformed += 1
                 rejected.reject(series.key, error)
 
-    def _step(self, series: LogChannel, step: Any) -> None:
-        self.training[series.robot].step(step)
+    def _learner(self, metrics: Any) -> None:
+        """Add a learner's message, and the steps after a gap of the log that it permits. Episodes drawn lack these."""
+        self.training[metrics.robot].learner(metrics)
+        for step in self.metrics.late:
+            self._count(metrics.robot, step)
+
+    def _count(self, robot: str, step: Any) -> None:
+        """Add a step to the curves and the map of a robot kind."""
+        self.training[robot].step(step)
         if len(state := step.state[:2]) == 2:
-            self.intervention_maps[series.robot].step(state, step)
+            self.intervention_maps[robot].step(state, step)
+
+    def _step(self, series: LogChannel, step: Any) -> None:
+        self._count(series.robot, step)
         sampler, buffer = self._buffer(series)
         sampler.step(buffer, step)
         self.timeline.step(self._received)

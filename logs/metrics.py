@@ -87,6 +87,7 @@ class Metrics:
         processes: by name.
         log_lines: counts by level.
         admission: decides which steps count.
+        late: the steps that count since the last message of a learner, because it permitted them.
     """
 
     def __init__(self, topics: Iterable[Topic] = RECORDED, robots: RecordedRobots | None = None) -> None:
@@ -107,6 +108,7 @@ class Metrics:
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()
         self.admission = StepAdmission()
+        self.late: list[pb.Step] = []
         self._now = 0  # ns, when the message in hand was received
         self._tube_stats = partial(TubeStats, self._robots)
         self._roots = {topic.key.split("/", 1)[0] for topic in topics}
@@ -210,7 +212,8 @@ class Metrics:
     def _add_learner(self, metrics: pb.LearnerMetrics) -> None:
         _get_or_create(self.learners, metrics.robot, pb.LearnerMetrics)
         self.learners[metrics.robot] = metrics
-        for step in self.admission.learner(metrics):
+        self.late = self.admission.learner(metrics)
+        for step in self.late:
             self._step(step)
 
     def _health(self, health: pb.Health) -> None:

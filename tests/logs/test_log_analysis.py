@@ -13,10 +13,10 @@ from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.intervention_map import MOST_CELLS, InterventionMap
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
-from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
+from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
-from brakeline.logs.reader import by_run, find, open_log
+from brakeline.logs.reader import Log, by_run, find, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
 
@@ -273,3 +273,23 @@ def test_console_output_is_complete_at_any_width(two: Two, columns: int) -> None
         assert "…" not in shown and max(map(len, shown.splitlines())) <= columns
         assert "flight_" not in shown and "bound_step" not in shown, "noise and model sets are for --verbose"
     assert str(both["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"
+
+
+def test_steps_after_a_gap_are_in_the_curves_and_the_map(tmp_path: Path) -> None:
+    """A recorder that was cut off stores steps before the learner's message that permits them."""
+    writer = Writer(losses=0.0)
+
+    def learner(limit: int) -> None:
+        writer.put("metrics/ground", pb.LearnerMetrics(robot="ground", limit={"actor-0": limit}))
+
+    learner(20)
+    for index in (1, 2, *range(4001, 4006)):
+        step = pb.Step(robot="ground", actor="actor-0", episode=1, step=index, index=index, state=[0.1] * 5)
+        step.decision = pb.ADJUSTED
+        writer.put("step/ground/actor-0", step)
+    learner(4010)
+    writer.write(tmp_path / "run.mcap")
+    run = RunAnalysis("gap", Log([tmp_path / "run.mcap"]), AnalysisOptions(pictures=True))
+    figures = run.figures()
+    assert figures["steps"] == 7 == sum(row["steps"] for row in figures["training"]["ground"]["bins"])
+    assert sum(cell[0] for cell in run.intervention_maps["ground"].cells.values()) == 7
