@@ -5,32 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.markup import escape
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
-from brakeline.deploy.data.certification import certify_supported
-from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
-from brakeline.deploy.data.run_dataset import from_log
-from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.progress import PERCENT, WorkProgress, under_way
 from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
-from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus
-from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.messaging.topics import MODEL
-from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
-from brakeline.safety.model.model_set import MODES, ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.model_config import KINDS, MODES, ONE_STEP, RESIDUAL, ModelConfig
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
-from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR, ValidationReport
-from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
+
+if TYPE_CHECKING:
+    from brakeline.messaging.robot import Robot
+    from brakeline.safety.model.dataset import Dataset
+    from brakeline.safety.model.model_set import ModelSet
+    from brakeline.safety.model.validation import ValidationReport
 
 DIVERGENT = 100.0  # m, half-width of a stop that is wider than any arena
 
@@ -76,6 +70,8 @@ class CertifyCommand:
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
+        from brakeline.deploy.data.certification import certify_supported
+
         settings = ModelConfig(outside=self.outside)  # before data are recorded: it may be out of range
         path, data, note = self._load()
         accepted_bound(data.robot, self.accept_bound)
@@ -144,6 +140,8 @@ class CertifyCommand:
         return refusal(data.robot, model.about, self.accept_bound)
 
     def _print(self, models: list[tuple[ModelSet, ValidationReport]], notes: list[str], data: Dataset) -> None:
+        from brakeline.deploy.data.coverage import recording_advice
+
         console.print(validation_table([(report, model.model_config.windows) for model, report in models]))
         for _, report in models:
             if report.groups:
@@ -156,6 +154,8 @@ class CertifyCommand:
 
     def _save(self, model: ModelSet, data: Dataset) -> None:
         """Write a model set to where the other commands load it from; signed, if there is a key to sign with."""
+        from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
+
         path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or options.default_keys()
         seal_of(path).unlink(missing_ok=True)
         if keys is not None and (keys / KEY).exists():
@@ -166,6 +166,10 @@ class CertifyCommand:
 
     def _load(self) -> tuple[Path, Dataset, str]:
         """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""
+        from brakeline.deploy.data.run_dataset import from_log
+        from brakeline.deploy.data.simulated_recording import data_for
+        from brakeline.safety.model.dataset import Dataset
+
         robot = robot_maybe_with_task(self.robot)
         if self.data is None:
             path, data = record_path(robot.in_lockstep()), data_for(robot)
@@ -181,6 +185,11 @@ class CertifyCommand:
         return path, data, f"{data.periods} recorded periods of {data.robot.name}"
 
     def _publish(self, model: ModelSet, data: Dataset) -> None:
+        from brakeline.messaging import brakeline_pb2 as pb
+        from brakeline.messaging.bus import Bus
+        from brakeline.messaging.topics import MODEL
+        from brakeline.safety.service.signature import ModelSigner
+
         settings = self.endpoints.bus()
         with Bus(settings, "certify") as bus:
             message = pb.Model(robot=model.robot.name, version=model.version, file=model.encode())
@@ -232,6 +241,8 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
 
 def bounds_in_words(s: ValidationReport, period: float) -> str:
     """Return the bounds of a validation report as sentences. period: control period [s]."""
+    from brakeline.safety.model.validation import CONFIDENCE, EPISODE, HOUR
+
     lines = [
         f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
         f"  a step: at most {s.bound_step:.2%} of steps leave their predicted set ({s.step_violations} did)",

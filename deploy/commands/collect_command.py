@@ -11,12 +11,8 @@ from rich.markup import escape
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.certify_command import bounds_in_words, validation_table
 from brakeline.deploy.commands.command_output import errors, print_result
-from brakeline.deploy.data.build_lock import folder_lock
-from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
 from brakeline.deploy.data.simulated_recording import SEED, load_or_record
-from brakeline.deploy.run.first_flight_run import FirstFlightSettings, fly
-from brakeline.messaging.task import robot_maybe_with_task
-from brakeline.safety.model.stated_bound import accepted_bound, refusal
+from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 
 
 @dataclass(frozen=True)
@@ -40,6 +36,9 @@ class CollectCommand:
 
     def run(self) -> int:
         """Record the data set. Returns the exit status; 1 if a first flight gave no model set to use."""
+        from brakeline.deploy.data.data_paths import record_path
+        from brakeline.messaging.task import robot_maybe_with_task
+
         if self.url:
             return self._first_flight()
         robot = robot_maybe_with_task(self.robot)
@@ -52,6 +51,12 @@ class CollectCommand:
         return 0
 
     def _first_flight(self) -> int:
+        from brakeline.deploy.data.build_lock import folder_lock
+        from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
+        from brakeline.deploy.run.first_flight_run import fly
+        from brakeline.messaging.task import robot_maybe_with_task
+        from brakeline.safety.model.stated_bound import accepted_bound, refusal
+
         robot = robot_maybe_with_task(self.robot)
         if robot.position_dim != 3:
             raise ValueError(f"a {robot.kind} robot does not fly: leave out --url")

@@ -12,8 +12,6 @@ from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.common_options import Json, Unprefixed
-from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.experiments import conservatism
 from brakeline.deploy.experiments.comparison_cells import (
     METHODS,
     NONE,
@@ -24,13 +22,9 @@ from brakeline.deploy.experiments.comparison_cells import (
     cell_configs,
     quick,
 )
-from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
-from brakeline.deploy.experiments.comparison_table import markdown, plain, table
 from brakeline.deploy.experiments.experiment_jobs import Job, complete
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.learner.learner_config import TD3Config
-from brakeline.messaging.task import address, robot_with_task
-from brakeline.safety.model.model_set import ModelConfig
 
 QUICK = Path("runs/quick")
 
@@ -71,6 +65,10 @@ class CompareCommand:
 
     def run(self) -> int:
         """Train, evaluate and write the tables. Returns the exit status."""
+        from brakeline.deploy.data.model_store import method_for
+        from brakeline.messaging.task import address, robot_with_task
+        from brakeline.safety.model.model_config import ModelConfig
+
         results, runs = self.results, self.runs
         if self.quick:
             results = QUICK / "results" if results == RESULTS else results
@@ -91,6 +89,8 @@ class CompareCommand:
         return 0
 
     def _jobs(self, robot: str) -> list[Job]:
+        from brakeline.deploy.experiments.conservatism import Conservatism
+
         seeds = self.seeds[:1] if self.quick else self.seeds
         changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
         jobs: list[Job] = []
@@ -99,7 +99,7 @@ class CompareCommand:
                 own = replace(cell, penalty=self.penalty, td3=self.td3, arenas=self.arenas)
                 jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
-            jobs.append(conservatism.Conservatism(robot))
+            jobs.append(Conservatism(robot))
         return jobs
 
     def _print_progress(self, name: str, text: str) -> None:
@@ -107,6 +107,10 @@ class CompareCommand:
 
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
         """Write the tables and figures of a robot, and return its figures."""
+        from brakeline.deploy.experiments import conservatism
+        from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
+        from brakeline.deploy.experiments.comparison_table import markdown, plain, table
+
         figures = table(cells)
         text = markdown(figures)
         (folder / "table.md").write_text(text + "\n")

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, errors, print_result
-from brakeline.deploy.experiments.evaluate import (
-    Evaluation,
-    evaluate,
-    evaluate_with,
-    prepare_evaluation,
-    progress_line,
-)
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine
 from brakeline.deploy.progress import under_way
-from brakeline.logs.figure_tables import show
-from brakeline.messaging.task import RobotWithTask, robot_with_task
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.evaluate import Evaluation
+    from brakeline.messaging.task import RobotWithTask
 
 
 @dataclass(frozen=True)
@@ -51,6 +46,10 @@ class EvaluateCommand:
 
     def run(self) -> int:
         """Drive the episodes and print the figures. Returns the exit status."""
+        from brakeline.deploy.experiments.evaluate import Evaluation
+        from brakeline.logs.figure_tables import show
+        from brakeline.messaging.task import robot_with_task
+
         if self.beside and self.render is None:
             raise ValueError("--beside draws an episode: give --render FILE too")
         if self.render is not None:
@@ -75,12 +74,15 @@ class EvaluateCommand:
         return 0
 
     def _figures(self, robot: RobotWithTask, evaluation: Evaluation) -> dict[str, Any]:
+        from brakeline.deploy.experiments.evaluate import evaluate, evaluate_with, progress_line
+
         with under_way("driving episodes", self.episodes) as advance:
             if self.engine == IN_THIS_PROCESS:
                 return evaluate(robot, evaluation, lambda stats: advance(what=progress_line(stats)))
             return evaluate_with(self.engine, robot, evaluation, lambda name, text: advance(0, f"{name}: {text}"))
 
     def _draw(self, robot: RobotWithTask, evaluation: Evaluation, path: Path) -> None:
+        from brakeline.deploy.experiments.evaluate import prepare_evaluation
         from brakeline.deploy.run.episode_render import record, save
 
         films = []

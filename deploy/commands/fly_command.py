@@ -11,7 +11,6 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.train_command import STOPPED, dated_folder
-from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.deploy.run.display import Display, summary
 from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.run_config import AutopilotConfig, RunConfig
@@ -112,6 +111,8 @@ class FlyCommand:
         systems = self.systems or (self.flight.system,) * len(self.url)
         if len(systems) != len(self.url):
             raise ValueError(f"{len(self.url)} links and {len(systems)} system ids: give one id for each --url")
+        from brakeline.deploy.quadrotor_vehicles import flight_arena  # brings the simulator
+
         arena = flight_arena(self.arena, self.seed)
         pairs = zip(self.url, systems, strict=True)
         return tuple(replace(self.flight.settings(url, arena), system=system) for url, system in pairs)

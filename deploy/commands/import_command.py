@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.markup import escape
@@ -12,16 +12,11 @@ from rich.text import Text
 
 from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
-from brakeline.deploy.data import importer
-from brakeline.deploy.data.build_lock import folder_lock
-from brakeline.deploy.data.coverage import Coverage, coverage
-from brakeline.deploy.data.coverage_plot import draw_coverage
-from brakeline.deploy.data.data_paths import record_path
-from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import HOLD
-from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.logs.stacking_table import PLAIN, StackingTable
-from brakeline.messaging.robot import robot_named
+
+if TYPE_CHECKING:
+    from brakeline.deploy.data.coverage import Coverage
 
 
 @dataclass(frozen=True)
@@ -54,6 +49,15 @@ class ImportCommand:
 
     def run(self) -> int:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
+        from brakeline.deploy.data import importer
+        from brakeline.deploy.data.build_lock import folder_lock
+        from brakeline.deploy.data.coverage import coverage
+        from brakeline.deploy.data.coverage_plot import draw_coverage
+        from brakeline.deploy.data.data_paths import record_path
+        from brakeline.deploy.data.log_options import LogOptions
+        from brakeline.deploy.data.sources.isolated_reader import ReadLimits
+        from brakeline.messaging.robot import robot_named
+
         robot = robot_named(self.robot)
         limits = ReadLimits(self.read_seconds, self.read_gib)
         options = LogOptions.parse(self.map, self.unit, self.topics, limits)

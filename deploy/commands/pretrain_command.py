@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from brakeline.deploy.commands.command_output import console, errors, print_result
 from brakeline.deploy.commands.common_options import Json, Robot
-from brakeline.deploy.data.data_paths import method_path
-from brakeline.deploy.data.model_store import pretrained
-from brakeline.deploy.data.rival_pretraining import config_for
-from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
-from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.rivals.pretrained import Pretrained
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.rival_tuning import ThresholdTrial
+    from brakeline.messaging.task import RobotWithTask
+    from brakeline.safety.rivals.pretrained import Pretrained
 
 
 @dataclass(frozen=True)
@@ -37,6 +35,12 @@ class PretrainCommand:
 
     def run(self) -> int:
         """Pretrain or tune the method. Returns the exit status."""
+        from brakeline.deploy.data.data_paths import method_path
+        from brakeline.deploy.data.model_store import pretrained
+        from brakeline.deploy.data.rival_pretraining import config_for
+        from brakeline.messaging.task import robot_with_task
+        from brakeline.safety.model.model_config import ModelConfig
+
         robot = robot_with_task(self.robot)
         config = config_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
@@ -49,6 +53,8 @@ class PretrainCommand:
         return 0
 
     def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
+        from brakeline.deploy.experiments.rival_tuning import best_threshold, tune_threshold, values_for
+
         rows = tune_threshold(model, robot, values_for(model, robot), self.episodes, self._print_row)
         chosen = best_threshold(rows)
         best = f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"

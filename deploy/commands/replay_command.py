@@ -9,21 +9,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode
-from brakeline.deploy.data.certification import certify
-from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.progress import under_way
-from brakeline.deploy.run.replay_run import ROUNDING, Replacement, replay
-from brakeline.logs.log_length import count
 from brakeline.logs.stacking_table import PLAIN, StackingTable
-from brakeline.messaging.robot import Robot
-from brakeline.messaging.topics import EXCHANGE
-from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import ModelConfig
+
+if TYPE_CHECKING:
+    from brakeline.deploy.run.replay_run import Replacement
+    from brakeline.messaging.robot import Robot
+    from brakeline.safety.filter.filter import Filter
 
 ANY_BOUND = 1.0  # the replay drives no robot, so it accepts a model set with any stated bound
 DIFFERENT = 1  # exit status: decisions differ by more than rounding although you replaced nothing
@@ -46,6 +42,10 @@ class ReplayCommand:
 
     def run(self) -> int:
         """Replay the logs and print the comparison. Returns the exit status: 0, or DIFFERENT."""
+        from brakeline.deploy.run.replay_run import replay
+        from brakeline.logs.log_length import count
+        from brakeline.messaging.topics import EXCHANGE
+
         values = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
         changes = {name: value for name, value in values.items() if value is not None}
         if self.certificate or self.data:
@@ -64,6 +64,12 @@ class ReplayCommand:
 
     def _replacement(self) -> Replacement:
         """Return the function that gives, for a robot, the filter to ask instead of the one that was in use."""
+        from brakeline.deploy.data.certification import certify
+        from brakeline.deploy.data.model_store import model_for
+        from brakeline.safety.filter.filter import Filter
+        from brakeline.safety.model.dataset import Dataset
+        from brakeline.safety.model.model_config import ModelConfig
+
         config = ModelConfig(self.certificate or "residual", self.mode)
         fitted = None if self.data is None else certify(Dataset.load(self.data), config)[0]
 
@@ -91,6 +97,8 @@ def errors_only(name: str) -> Iterator[None]:
 
 def print_comparison(figures: dict[str, Any]) -> None:
     """Print the figures of a replay on stdout."""
+    from brakeline.deploy.run.replay_run import ROUNDING
+
     compared = figures["requests"] - figures["unanswered"]
     changes = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
     heading = f"decided again with {changes}" if changes else "decided again"

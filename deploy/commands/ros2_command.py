@@ -16,8 +16,6 @@ from brakeline.actors.ros2.ros_inputs import AgeLimits, SensorSettings
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import print_counts
-from brakeline.deploy.data.model_store import model_for
-from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.logs.bag_writer import BagWriter
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -103,6 +101,9 @@ class Ros2Command:
     @contextlib.contextmanager
     def _asker(self, settings: Ros2Settings) -> Iterator[Ask]:
         """Yield the function that asks for decisions: in this process, or over the bus."""
+        from brakeline.deploy.data.model_store import model_for
+        from brakeline.deploy.experiments.evaluate import in_process
+
         robot = driven(self.robot)
         if not self.connect:
             accept_bound = self.filtering.accept_bound

@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from brakeline.deploy.data import collect
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.progress import console, each
@@ -51,6 +50,8 @@ def load_or_record(
 
 
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
+    from brakeline.deploy.data import collect  # brings the simulators
+
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     restless = math.ceil(RESTLESS_SHARE * trajectories)
     total = trajectories + restless
@@ -85,6 +86,8 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
 
 def _check_replaceable(path: Path, robot: Robot) -> None:
     """Raise BadData if the data set at `path` does not come from the simulator: a recording must not replace it."""
+    from brakeline.deploy.data import collect
+
     about = Dataset.about_of(path)
     origin = about.get("origin", collect.ORIGIN)
     if origin != collect.ORIGIN:
