@@ -29,8 +29,8 @@ class TopView:
         self._robot, self._arena = robot, arena
         (left, right), (bottom, top) = arena.bounds[:2]
         pixel = max(right - left, top - bottom) / PIXELS  # m
-        x: Array = left + pixel * (np.arange(round((right - left) / pixel)) + 0.5)
-        y: Array = top - pixel * (np.arange(round((top - bottom) / pixel)) + 0.5)
+        x: Array = left + pixel * (np.arange(round((right - left) / pixel), dtype=np.float64) + 0.5)
+        y: Array = top - pixel * (np.arange(round((top - bottom) / pixel), dtype=np.float64) + 0.5)
         self._axes = x, y
         self._points: Array = np.stack(np.meshgrid(x, y), axis=-1)  # (H, W, 2)
         self._background = self._draw_map(0.0) if arena.dim == 2 else None
