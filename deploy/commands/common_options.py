@@ -71,6 +71,7 @@ Pictures = Annotated[
         "intervention. 0 draws none at all."
     ),
 ]
+Verbose = Annotated[bool, tyro.conf.arg(help="Print all figures of the run at its end, not only the verdict.")]
 Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
 
 

@@ -61,6 +61,7 @@ class FlyCommand:
     pictures: options.Pictures = RunConfig.pictures
     out: options.RunFolder = None
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    verbose: options.Verbose = False
     json: options.Json = False
 
     def run(self) -> int:
@@ -76,10 +77,11 @@ class FlyCommand:
         if self.json:
             print_json(figures)
         else:
-            summary(console, figures)
+            summary(console, figures, self.verbose)
             for prefix, values in [("", figures["flight"]), *figures.get("flights", {}).items()]:
                 for name, value in values.items():
-                    console.print(f"{prefix}: {name}: {value}".removeprefix(": "), markup=False)
+                    if self.verbose or name.startswith("true"):  # what the autopilot's own simulator says
+                        console.print(f"{prefix}: {name}: {value}".removeprefix(": "), markup=False)
         return 0 if figures["finished"] else STOPPED
 
     def config(self) -> RunConfig:

@@ -30,6 +30,7 @@ class TrainCommand(RunConfig):
     resume: Path | None = None
     """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    verbose: options.Verbose = False
     json: options.Json = False
 
     # Options that `--help` leaves to `--help-all`.
@@ -90,11 +91,20 @@ class TrainCommand(RunConfig):
     def run(self) -> int:
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
-        return train(self.config(), folder, self.resume is not None, self.meeting, self.json)
+        return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose)
 
 
-def train(config: RunConfig, folder: Path, resume: bool, meeting: options.RunBusOptions, as_json: bool) -> int:
+def train(
+    config: RunConfig,
+    folder: Path,
+    resume: bool,
+    meeting: options.RunBusOptions,
+    as_json: bool,
+    verbose: bool = False,
+) -> int:
     """Run all processes of a configuration, with a display on stdout (with `as_json` on stderr).
+
+    With `verbose` it prints all figures at the end, not only the verdict.
 
     Returns the exit status: 0, or STOPPED if the run was stopped before its last step.
     """
@@ -112,7 +122,7 @@ def train(config: RunConfig, folder: Path, resume: bool, meeting: options.RunBus
     if as_json:
         print_json(figures)
     else:
-        summary(console, figures)
+        summary(console, figures, verbose)
     return 0 if figures["finished"] else STOPPED
 
 

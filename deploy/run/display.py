@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.deploy.run.launcher import Launcher
+from brakeline.deploy.run.verdict import verdict
 from brakeline.logs.figure_tables import show
 from brakeline.logs.stacking_table import PLAIN
 from brakeline.logs.tube_stats import stated
@@ -157,20 +158,26 @@ def share(count: int, of: int) -> str:
     return f"{count} ({count / of:.1%})" if of else str(count)
 
 
-def summary(console: Console, figures: dict[str, Any]) -> None:
-    """Print the figures of a run and the paths of its files."""
-    console.print(show({name: value for name, value in figures.items() if name != "topics"}))
+def summary(console: Console, figures: dict[str, Any], verbose: bool = False) -> None:
+    """Print the verdict on a run and what its log lacks; with `verbose` all figures and the paths of its files too."""
+    if verbose:
+        _print_everything(console, figures)
+    first, *others = verdict(figures)
+    console.print(first, style="bold red" if figures["collisions"] else "bold", markup=False)
+    for line in others:
+        console.print(line, markup=False)
+    log = figures.get("log_messages")
+    if log is not None and not verbose and (log["missing"] or log["failures"]):
+        console.print(log_line(log))
+
+
+def _print_everything(console: Console, figures: dict[str, Any]) -> None:
+    console.print(show({name: value for name, value in figures.items() if name not in ("topics", "latest")}))
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     restarts = ", ".join(f"{name} {count}" for name, count in figures["restarts"].items())
     console.print(f"messages lost on the way to the display: {lost}; restarts: {restarts or 'none'}")
     if (log := figures.get("log_messages")) is not None:
         console.print(log_line(log))
-    if fed := figures.get("from_logs"):
-        known_before = f"{fed.get('known', 0)} that the learner had already"
-        console.print(f"steps from logs: {fed.get('published', 0)}, and {known_before}")
-    if not figures["finished"] and figures.get("policy") in (None, "learning"):
-        resume = f"brakeline train --resume {figures['folder']}"
-        console.print(f"[yellow]stopped before the last step[/]; continue with: {resume}")
     lines = [f"log:    {figures['log'] or 'not recorded'}", *(f"policy: {path}" for path in figures["policies"])]
     for line in (*lines, *(f"next:   {command}" for command in following(figures))):
         console.print(line, markup=False)
@@ -185,10 +192,10 @@ def log_line(log: dict[str, Any]) -> str:
 
 
 def following(figures: dict[str, Any]) -> list[str]:
-    """Return useful commands after a run."""
+    """Return useful commands after a run, besides that of the verdict."""
     folder, robots, commands = figures["folder"], list(figures["robots"]), []
     if figures["log"]:
-        commands += [f"brakeline analyse {folder} --html report.html", f"brakeline replay {folder}"]
+        commands.append(f"brakeline replay {folder}")
     if figures["policies"] and len(robots) == 1:
         commands.append(f"brakeline evaluate {robots[0]} --policy {figures['policies'][0]}")
     return commands

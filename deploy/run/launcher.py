@@ -15,6 +15,7 @@ from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
 from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed_run
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
+from brakeline.deploy.run.verdict import LatestEpisodes
 from brakeline.errors import LaunchError, LogError
 from brakeline.learner.checkpoint import CHECKPOINT
 from brakeline.learner.checkpoint import exists as checkpoint_exists
@@ -23,6 +24,7 @@ from brakeline.logs.log_length import count_by_key
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.bus.inbox import Inbox
@@ -106,6 +108,7 @@ class Launcher:
             check_signer(bus.keys)
         self.config, self.folder, self.bus = config, folder, bus
         self.processes = [SupervisedProcess(spec, folder) for spec in process_specs(config)]
+        self.latest = LatestEpisodes()
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self.ending = False
@@ -187,7 +190,7 @@ class Launcher:
             "log_messages": self._log_messages() if self.config.record else None,
             "policies": [str(path) for path in sorted(self.folder.glob("learner*/policy.safetensors"))],
         }
-        return setup | self.metrics.figures() | outcome | paths
+        return setup | self.metrics.figures() | {"latest": self.latest.figures()} | outcome | paths
 
     def _log_messages(self) -> dict[str, Any]:
         """Return how many messages the log of this start of the run has, and how many more were published.
@@ -279,7 +282,8 @@ class Launcher:
         for sample in self._inbox.drain(seconds):
             with self._rejected.skip_on_error(sample.key):
                 message = sample.message()
-                self.metrics.add(sample.key, message, sample.received)
+                if self.metrics.add(sample.key, message, sample.received) and isinstance(message, pb.Step):
+                    self.latest.step(message)
                 if sample.topic.name == "health":
                     for child in self.processes:
                         if child.spec.name == message.process:

@@ -77,16 +77,50 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypa
     assert rows[1:] == [line(view.metrics.figures()), "ending every process in order"]
 
 
-def test_the_summary_has_the_paths_whole(view: Launcher) -> None:
-    console = Console(file=io.StringIO(), soft_wrap=command_output.console.soft_wrap)
+def ended(view: Launcher, **changes: object) -> dict[str, object]:
+    """Return the figures of a run that has ended."""
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
-    summary(console, view.metrics.figures() | paths | {"finished": False, "restarts": {"learner": 2, "safety-0": 1}})
-    rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    outcome = {"finished": False, "restarts": {"learner": 2, "safety-0": 1}}
+    latest = {"ground": {"episodes": 100, "goals": 97}}
+    return view.metrics.figures() | {"latest": latest} | paths | outcome | changes
+
+
+def rows_of(figures: dict[str, object], verbose: bool = False) -> list[str]:
+    console = Console(file=io.StringIO(), soft_wrap=command_output.console.soft_wrap)
+    summary(console, figures, verbose)
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+
+
+def test_a_run_ends_with_a_verdict_in_three_lines(view: Launcher) -> None:
+    figures = ended(view, finished=True, fallbacks=0, collisions=1, interventions=3, steps=60)
+    outcome, answers, following = rows_of(figures)
+    assert outcome == "97 of the last 100 episodes reached the goal; 1 collision; 5.0% of 60 steps corrected"
+    assert answers == "every answer came in time"
+    assert following == f"next: brakeline analyse {figures['folder']} --html report.html"
+
+
+def test_what_went_wrong_has_a_line_of_its_own(view: Launcher) -> None:
+    lacks = {"recorded": 6, "missing": 4, "failures": []}
+    _, answers, _, stopped, log = rows_of(ended(view, fallbacks=2, log_messages=lacks))
+    assert answers.startswith("2 answers came late or not at all")
+    assert "brakeline train --resume /very/long" in stopped and log == "messages in the log: 6; NOT in the log: 4"
+
+
+def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:
+    latest = {"ground": {"episodes": 5, "goals": 4}, "quadrotor": {"episodes": 2, "goals": 0}}
+    assert rows_of(ended(view, latest=latest))[0].startswith(
+        "4 of the last 5 episodes reached the goal (ground), 0 of the last 2 episodes reached the goal (quadrotor); "
+    )
+    assert rows_of(ended(view, latest={}))[0].startswith("no episode ended; ")
+
+
+def test_all_figures_and_paths_are_whole(view: Launcher) -> None:
+    figures = ended(view)
+    rows, folder = rows_of(figures, verbose=True), figures["folder"]
     assert f"log:    {folder}/run.mcap" in rows and f"policy: {folder}/policy.safetensors" in rows
     assert any(row.endswith("restarts: learner 2, safety-0 1") for row in rows)
-    assert any(f"brakeline train --resume {folder}" in row for row in rows)
-    assert f"next:   brakeline analyse {folder} --html report.html" in rows, "and what comes next"
+    assert f"next:   brakeline replay {folder}" in rows, "and what comes next"
 
 
 def test_what_a_run_is_at_is_said_from_the_first_second(view: Launcher) -> None:

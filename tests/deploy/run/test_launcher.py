@@ -164,6 +164,6 @@ def test_steps_that_the_learner_refuses_do_not_count(launcher: Launcher) -> None
     say(launcher, STEP, step(0, 9))
     figures = launcher.figures()
     assert (figures["steps"], figures["refused"]) == (20, 4004)
-    assert "4004: repeated, or not permitted by the learner" in printed(summary, figures)
+    assert "4004 steps do not count: repeated, or not permitted by the learner" in printed(summary, figures)
     say(launcher, STEP, step(21))
     assert launcher.figures()["steps"] == 21

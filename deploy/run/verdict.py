@@ -1,0 +1,68 @@
+"""Say in a few lines how a run went: goals, collisions, interventions, late answers, and what to do next."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from typing import Any
+
+from brakeline.messaging import brakeline_pb2 as pb
+
+LATEST = 100  # episodes
+
+
+class LatestEpisodes:
+    """The outcomes of the latest episodes of each robot kind, in the order in which they ended."""
+
+    def __init__(self) -> None:
+        self._goals: defaultdict[str, deque[bool]] = defaultdict(lambda: deque(maxlen=LATEST))
+
+    def step(self, step: pb.Step) -> None:
+        """Add a step."""
+        if step.terminated or step.truncated:
+            self._goals[step.robot].append(step.goal)
+
+    def figures(self) -> dict[str, dict[str, int]]:
+        """Return by robot kind the number of episodes, and how many of them reached the goal."""
+        return {robot: {"episodes": len(goals), "goals": sum(goals)} for robot, goals in sorted(self._goals.items())}
+
+
+def verdict(figures: dict[str, Any]) -> list[str]:
+    """Return the verdict on a run: three lines, and one more for each thing that went wrong.
+
+    Args:
+        figures: of a launcher (`Launcher.figures`).
+    """
+    lines = [_outcome(figures), _answers(figures)] if figures["steps"] else []
+    if fed := figures.get("from_logs"):
+        lines.append(
+            f"steps from logs: {fed.get('published', 0)}, and {fed.get('known', 0)} that the learner had already"
+        )
+    if not figures["log"]:
+        lines.append(f"no log was recorded; policies: {', '.join(figures['policies']) or 'none'}")
+    else:
+        lines.append(f"next: brakeline analyse {figures['folder']} --html report.html")
+    if refused := figures.get("refused"):
+        lines.append(f"{refused} steps do not count: repeated, or not permitted by the learner")
+    if not figures["finished"] and figures.get("policy") in (None, "learning"):
+        lines.append(f"stopped before the last step; continue with: brakeline train --resume {figures['folder']}")
+    return lines
+
+
+def _outcome(figures: dict[str, Any]) -> str:
+    latest = [
+        f"{row['goals']} of the last {row['episodes']} episodes reached the goal"
+        + (f" ({robot})" if len(figures["latest"]) > 1 else "")
+        for robot, row in figures["latest"].items()
+    ]
+    corrected = f"{figures['interventions'] / figures['steps']:.1%} of {figures['steps']} steps corrected"
+    return f"{', '.join(latest) or 'no episode ended'}; {_counted(figures['collisions'], 'collision')}; {corrected}"
+
+
+def _answers(figures: dict[str, Any]) -> str:
+    if not (late := figures["fallbacks"]):
+        return "every answer came in time"
+    return f"{_counted(late, 'answer')} came late or not at all: there the robot braked along its verified plan"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
