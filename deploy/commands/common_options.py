@@ -71,7 +71,8 @@ Pictures = Annotated[
         "intervention. 0 draws none at all."
     ),
 ]
-Verbose = Annotated[bool, tyro.conf.arg(help="Print all figures of the run at its end, not only the verdict.")]
+Verbose = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print all figures at the end.")]
+Watch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Open a live page in a browser.")]
 Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
 
 

@@ -1,12 +1,18 @@
-"""Implement `brakeline demo`: train the ground robot for some minutes."""
+"""Implement `brakeline demo`: show what the filter does, then train the ground robot for some minutes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
+from brakeline.deploy.commands.command_output import console, errors
 from brakeline.deploy.commands.common_options import Json, RunBusOptions, RunFolder, Seed, Verbose
 from brakeline.deploy.commands.train_command import dated_folder, train
+from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import EXPERIMENTS
+from brakeline.safety.model.model_config import AUTO, ModelConfig
+
+EPISODES, ARENA = 20, "dense"  # of the stored policy
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,27 @@ class DemoCommand:
     json: Json = False
 
     def run(self) -> int:
-        """Run the training. Returns the exit status."""
+        """Drive the stored policy without and with the filter, then run the training. Returns the exit status."""
+        self._driven("none", "the stored policy alone, among dense obstacles")
+        filtered = self._driven("ddpc", "the same episodes behind the filter")
+        share = filtered["interventions"] / max(filtered["steps"], 1)
+        shown = errors if self.json else console
+        shown.print(f"{share:.0%} of its inputs were corrected. Now a policy learns behind the filter, from nothing:")
         config = replace(EXPERIMENTS["demo"], steps=self.steps, seed=self.seed)
-        return train(config, self.out or dated_folder(), False, RunBusOptions(), self.json, self.verbose)
+        folder, bus = self.out or dated_folder(), RunBusOptions()
+        return train(config, folder, False, bus, self.json, self.verbose, watch=True, browser=False)
+
+    def _driven(self, method: str, what: str) -> dict[str, Any]:
+        """Drive the stored policy, print how the episodes ended, and return the figures."""
+        with under_way(what, EPISODES) as advance:
+            from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
+            from brakeline.messaging.task import robot_with_task
+
+            settings = Evaluation(
+                policy="trained", method=method, model_config=ModelConfig(mode=AUTO), arena=ARENA, episodes=EPISODES
+            )
+            figures = evaluate(robot_with_task("ground"), settings, lambda stats: advance())
+        colour = "red" if figures["collisions"] else "green"
+        counts = f"{figures['goals']} of {EPISODES} goals, [{colour}]{figures['collisions']} collisions[/]"
+        (errors if self.json else console).print(f"{what}: {counts}")
+        return figures

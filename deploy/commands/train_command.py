@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
+
+import tyro
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
@@ -27,9 +30,10 @@ class TrainCommand(RunConfig):
     experiment: str = "default"
     """Start from this configuration, which the other options change: default, demo or debug."""
     out: options.RunFolder = None
-    resume: Path | None = None
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Continue the run in this folder, with its own configuration. Only --steps and --from-logs can change."""
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
+    watch: options.Watch = False
     verbose: options.Verbose = False
     json: options.Json = False
 
@@ -91,7 +95,7 @@ class TrainCommand(RunConfig):
     def run(self) -> int:
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
-        return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose)
+        return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
 
 
 def train(
@@ -101,10 +105,13 @@ def train(
     meeting: options.RunBusOptions,
     as_json: bool,
     verbose: bool = False,
+    watch: bool = False,
+    browser: bool = True,
 ) -> int:
     """Run all processes of a configuration, with a display on stdout (with `as_json` on stderr).
 
-    With `verbose` it prints all figures at the end, not only the verdict.
+    With `verbose` it prints all figures at the end, not only the verdict. With `watch` it serves a live page, which
+    `browser` opens.
 
     Returns the exit status: 0, or STOPPED if the run was stopped before its last step.
     """
@@ -113,11 +120,13 @@ def train(
     with under_way(f"{folder}: {summary_line}"):  # the imports alone take seconds
         from brakeline.deploy.run.display import Display, summary
         from brakeline.deploy.run.launcher import Launcher, prepare
+        from brakeline.deploy.run.live_page import LivePage
 
     config = prepare(config, folder, resume)
     if resume:
         shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
-    with Display(shown, config.steps * len(config.robots)) as display:
+    steps = config.steps * len(config.robots)
+    with LivePage(folder, browser) if watch else nullcontext() as page, Display(shown, steps, page) as display:
         figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
     if as_json:
         print_json(figures)

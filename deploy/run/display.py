@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.deploy.run.launcher import Launcher
+from brakeline.deploy.run.live_page import LivePage
 from brakeline.deploy.run.verdict import verdict
 from brakeline.logs.figure_tables import show
 from brakeline.logs.stacking_table import PLAIN
@@ -28,8 +29,9 @@ LINES = 5  # shown warnings
 class Display:
     """Shows a run. You can call it at any rate: it limits the redrawing itself."""
 
-    def __init__(self, console: Console, steps: int) -> None:
-        self.console = console
+    def __init__(self, console: Console, steps: int, page: LivePage | None = None) -> None:
+        """steps: of all robot kinds. page: the run's live page, whose address it shows."""
+        self.console, self._page = console, page
         self._bar = Progress(
             TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         )
@@ -37,6 +39,7 @@ class Display:
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._last = -1e9 if self._live is not None else time.monotonic()
         self._last_phase = ""  # the last printed phase, without a terminal
+        self._page_shown = False
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -52,6 +55,9 @@ class Display:
         if self._live is None and (phase := run_phase(run)) != self._last_phase:
             self._last_phase = phase
             self.console.print(phase, markup=False)
+        if self._page is not None and self._page.notice and not self._page_shown:
+            self._page_shown = True
+            self.console.print(self._page.notice, markup=False)
         spacing = REFRESH if self._live is not None else SPACING
         if time.monotonic() - self._last < spacing and not (run.ending and self._live is not None):
             return

@@ -1,5 +1,6 @@
 """Test the first minute with the program: the README's first screen, and the next commands that the program names."""
 
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -25,10 +26,14 @@ def test_the_first_screen_leads_from_the_demo_to_a_report_a_replay_and_an_evalua
     recipe = (ROOT / "Makefile").read_text().partition("demo: setup\n")[2].splitlines()[0]
     assert recipe.strip() == "$(BIN)/brakeline demo"
 
-    output = printed(tmp_path, "demo", "--steps", 600, "--out", "runs/first")
-    assert "collisions" in output and "log:    runs/first/run.mcap" in output
+    output = printed(tmp_path, "demo", "--steps", 600, "--out", "runs/first", "--verbose")
+    alone, filtered, *_ = output.splitlines()
+    assert alone.startswith("the stored policy alone") and not alone.endswith(" 0 collisions")
+    assert filtered.startswith("the same episodes behind the filter") and filtered.endswith(" 0 collisions")
+    assert re.search(r"^live page: http://127\.0\.0\.1:\d+/$", output, re.M)
+    assert "log:    runs/first/run.mcap" in output
     commands = [shlex.split(line.removeprefix("next:")) for line in output.splitlines() if line.startswith("next:")]
-    assert [command[:2] for command in commands] == [["brakeline", name] for name in ("analyse", "replay", "evaluate")]
+    assert [command[:2] for command in commands] == [["brakeline", name] for name in ("replay", "evaluate", "analyse")]
     for command in commands:
         few = ("--episodes", 2) if command[1] == "evaluate" else ()
         assert printed(tmp_path, *command[1:], *few)
