@@ -37,6 +37,7 @@ from benchmarks import (
     recording_cost,
     roundtrip,
     solvers,
+    training_speed,
 )
 from benchmarks.timing import Figures, Words
 from brakeline.logs.stacking_table import StackingTable
@@ -64,6 +65,8 @@ class Bench:
     """Send this many messages in fuzz."""
     plans: int = driving_groups.PLANS
     """Drive this many plans of each group in groups."""
+    seeds: int = 3
+    """Train this many runs of each backend in training."""
     rate: int = crowd.JUNK
     """Let each sender of crowd send this many junk messages a second."""
     minutes: float = 10.0
@@ -108,6 +111,7 @@ BENCHMARKS = {
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
     "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
+    "training": Benchmark(training_speed, lambda given: training_speed.run(given.seeds), named=True),
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
     "campaign": Benchmark(campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True),

@@ -19,25 +19,22 @@ from brakeline.errors import BadStep, CheckpointError
 from brakeline.learner.checkpoint import CHECKPOINT, exists
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
+from brakeline.learner.learner_output import LearnerOutput
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.task import robot_with_task
-from brakeline.messaging.topics import FLOW, JOIN, LEARNER, LOGGED, STEP, WEIGHTS
+from brakeline.messaging.topics import FLOW, JOIN, LOGGED, STEP, WEIGHTS
 
 log = logging.getLogger("brakeline.learner")
 
-POLICY = "policy.safetensors"
 UPDATES_A_TURN = 4  # take about 20 ms, the longest that a joining actor or a step in lockstep waits
 FLOW_SPACING = 0.02  # least time between two flows [s]; in lockstep every change is published
 FLOW_PERIOD = 0.5  # longest time between two flows [s]
-METRICS_PERIOD = 1.0  # [s]
 JOIN_PATIENCE = 10.0  # longest time to answer a join, with the time of a checkpoint [s]
-RETRY = 30.0  # time to the next attempt after a failed checkpoint [s]
 LINGER = 1.0  # time for which the process announces the end of the run [s]
 
 
@@ -94,10 +91,10 @@ class LearnerLoop:
         self._joins: deque[tuple[bytes, str, Future[bytes]]] = deque()
         self._wake = Event()
         self._last_flow: object = None
-        self._flow_at = self._metrics_at = self._retry_at = -1e9
+        self._flow_at = -1e9
+        self.output = LearnerOutput(process, learner, settings.out, clock)
         bus, robot = process.bus, learner.robot.name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
-        self._metrics = bus.publisher(LEARNER, robot=robot)
         self._weights.put(learner.weights())
         for topic in (STEP, LOGGED):
             bus.subscribe(topic, self._receive, robot=robot)
@@ -135,11 +132,9 @@ class LearnerLoop:
         busy = self._take_joins() + self._take_steps() + self._learner.work(UPDATES_A_TURN) > 0
         if self._learner.weights_due():
             self._weights.put(self._learner.publish())
-        if self._learner.checkpoint_due() and self._clock() > self._retry_at:
-            self._save()
+        self.output.save_if_due()
         self._publish_flow()
-        if self._clock() - self._metrics_at > METRICS_PERIOD:
-            self._publish_metrics()
+        self.output.publish_if_due(len(self._steps))
         return busy
 
     def _take_joins(self) -> int:
@@ -153,7 +148,7 @@ class LearnerLoop:
                 outcome = f"refused: {reply.error.message}" if reply.HasField("error") else "accepted"
                 log.info("actor %s: %s", headline(join.actor), outcome)
                 answer.set_result(reply.SerializeToString())
-                self._metrics_at = -1e9  # tell the new limits before the actor's first steps
+                self.output.hurry()  # tell the new limits before the actor's first steps
             except Exception as error:  # the bus sends it to the actor
                 answer.set_exception(error)
         return taken
@@ -178,39 +173,6 @@ class LearnerLoop:
             self._last_flow, self._flow_at = content, self._clock()
             self._flow.put(flow)
 
-    def _publish_metrics(self) -> None:
-        self._metrics_at = self._clock()
-        metrics = self._learner.metrics()
-        self._process.figures = {
-            "steps": metrics.steps,
-            "updates_per_s": metrics.updates_per_s,
-            "missing": metrics.missing,
-            "duplicates": metrics.duplicates,
-            "refused": self._learner.rejected,
-            "surplus": self._learner.surplus,
-            "waiting": len(self._steps),
-        }
-        self._metrics.put(metrics)
-
-    def _save(self) -> None:
-        """Write a checkpoint and the policy; if that fails, log the reason and continue."""
-        try:
-            place = self._learner.save(self._settings.out / CHECKPOINT)
-            self._process.notes["checkpoint"] = f"step {self._learner.steps}"
-            log.info("checkpoint of step %d in %s", self._learner.steps, place)
-        except CheckpointError as error:
-            self._retry_at = self._clock() + RETRY
-            self._process.notes["checkpoint"] = str(error)
-            log.error("%s", error)
-        self._write_policy()
-
-    def _write_policy(self) -> None:
-        path = self._settings.out / POLICY
-        try:
-            write_atomically(path, self._learner.weights().file)
-        except OSError as error:
-            log.error("the policy was not written: %s", error)
-
     def _finish(self) -> None:
         """Learn from the steps that arrived, as far as updates are due, and save the result."""
         self._take_joins()
@@ -221,8 +183,8 @@ class LearnerLoop:
         if self._learner.weights_due():
             self._weights.put(self._learner.publish())
         if self._learner.may_save():
-            self._save()
+            self.output.save()
         else:
             log.warning("stopped within an episode: in lockstep, the latest checkpoint is from before the episode")
-            self._write_policy()
-        self._publish_metrics()
+            self.output.write_policy()
+        self.output.publish(len(self._steps))

@@ -20,6 +20,10 @@ ROLES = (
     "viewer",  # shows a run: watch, status
     "client",  # a program that only asks the safety service
 )
+SIMULATORS = (
+    "actor",
+    "learner",
+)  # publish steps of robots; a learner those that it simulates (`train --backend batch`)
 RECORDERS = ("recorder", "launcher", "viewer")  # may subscribe to all recorded topics
 
 
@@ -71,9 +75,9 @@ DECIDE = Topic("decide", "safety/{robot}/decide/{source}", pb.RequestBatch, QUER
 JOIN = Topic("join", "learner/{robot}/join/{source}", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
              pb.JoinReply)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, BLOCK, None, ("certify",), ("safety",), True, largest=FILE)
-STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, ("actor",), ("learner", "certify"), True)
+STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, SIMULATORS, ("learner", "certify"), True)
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, BLOCK, None, ("feeder",), ("learner",), False, own=False)
-EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, BLOCK, None, ("actor",), (), True)
+EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, BLOCK, None, SIMULATORS, (), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, BLOCK, None, ("actor",), ("certify",), True)
 FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, BLOCK, None, ("actor",), (), True)
 WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, DROP, None, ("learner",), ("actor", "feeder"), False,

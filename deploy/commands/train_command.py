@@ -13,7 +13,7 @@ import tyro
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
-from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, load
+from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
 
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
@@ -48,15 +48,23 @@ class TrainCommand(RunConfig):
 
     @classmethod
     def defaults(cls, arguments: list[str]) -> Self:
-        """Return the default options: those of the experiment that `arguments` name. Raises ValueError for others."""
-        name = cls.experiment
-        for flag, value in zip(arguments, [*arguments[1:], ""], strict=True):
+        """Return the default options: those of the experiment and the backend that `arguments` name.
+
+        Raises:
+            ValueError: there is no such experiment.
+        """
+        named = {"--experiment": cls.experiment, "--backend": cls.backend}
+        for flag, value in zip(arguments, [*arguments[1:], ""], strict=False):
             option, equals, attached = flag.partition("=")
-            if option == "--experiment":
-                name = attached if equals else value
+            if option in named:
+                named[option] = attached if equals else value
+        name = named["--experiment"]
         if name not in EXPERIMENTS:
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
-        return options.settings_from(cls, EXPERIMENTS[name], experiment=name, steps=0)
+        experiment = EXPERIMENTS[name]
+        if named["--backend"] == BATCH:
+            experiment = in_batches(experiment)
+        return options.settings_from(cls, experiment, experiment=name, steps=0)
 
     def config(self) -> RunConfig:
         """Return the run's configuration. Raises ValueError if options contradict each other."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.run.run_config import RunConfig
+from brakeline.deploy.run.run_config import BATCH, RunConfig
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.robot import robot_named
@@ -34,7 +34,7 @@ class ProcessSpec:
 def process_specs(config: RunConfig) -> list[ProcessSpec]:
     """Return THE table of a run's processes, in the order in which they start."""
     table = [ProcessSpec("recorder", "recorder", nice=5 if config.flights else 0)] if config.record else []
-    if config.filtered:
+    if config.filtered and config.backend != BATCH:  # a batch is filtered in the process of its learner
         table += [ProcessSpec(f"safety-{i}", "safety") for i in range(config.replicas)]
         if config.adapt:
             table.append(ProcessSpec(CERTIFIER, "certifier", nice=10, needed=False))
@@ -46,10 +46,11 @@ def process_specs(config: RunConfig) -> list[ProcessSpec]:
     for robot in config.robots:
         kind = robot_named(robot).name
         if not config.policy:
-            table.append(ProcessSpec("learner" if one else f"learner-{kind}", "learner", robot, nice=10))
+            nice = 2 if config.backend == BATCH else 10  # a batch drives and filters its robots in this process
+            table.append(ProcessSpec("learner" if one else f"learner-{kind}", "learner", robot, nice=nice))
         if config.from_logs:
             table.append(ProcessSpec("feeder" if one else f"feeder-{kind}", "feeder", robot, nice=2))
-        for i in range(config.actors):
+        for i in range(0 if config.backend == BATCH else config.actors):
             name = f"actor-{i}" if one else f"actor-{kind}-{i}"
             nice = 0 if config.flights else 2
             table.append(ProcessSpec(name, "actor", robot, i * config.robots_per_actor, nice))

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
 
@@ -19,6 +19,8 @@ from brakeline.safety.model.model_config import METHODS as FILTERS
 from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
+BATCH: Literal["batch"] = "batch"  # the backend that simulates all robots in the learner's process
+MOST_IN_BATCH = 64  # robots that the certificate of one process speaks for
 FORMER_NAMES = {"recipe": "model_config"}  # names that fields have in older files
 
 T = TypeVar("T")
@@ -50,6 +52,10 @@ class RunConfig:
     accept_bound: Internal[float | None] = None  # largest accepted stated bound; None: the limit of each description
     arena: str = "default"
     """Drive in arenas of this name."""
+    backend: Literal["processes", "batch"] = "processes"
+    """Simulate the robots in actor processes, one by one; or all at once in the learner's process (batch), for much
+    faster training of the ground robot. A batch has --robots-per-actor robots (64 by default) and learner settings of
+    its own."""
     actors: int = 2
     """Run this many actor processes for each robot kind. With --from-logs it may be 0."""
     robots_per_actor: int = 1
@@ -111,6 +117,8 @@ class RunConfig:
             )
         if self.adapt and self.method != DDPC:
             raise ValueError(f"--adapt certifies model sets of the method {DDPC}, not of {self.method}")
+        if self.backend == BATCH:
+            _check_batch(self)
         one_robot = self.robots_per_actor == 1 and len(self.robots) == 1
         if self.deterministic and self.from_logs:
             raise ValueError("a deterministic run learns from its own actor, not from logs: leave out --from-logs")
@@ -144,6 +152,32 @@ def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
         raise ValueError(f"each robot once, with one task: not {', '.join(robots)}")
 
 
+def _check_batch(config: RunConfig) -> None:
+    """Check that a batch can do what the run asks for. Raises ValueError, or NoBatch if the robot can't be batched."""
+    refused = {
+        "more than one robot kind": len(config.robots) > 1,
+        f"the method {config.method}": config.method != DDPC,
+        "--fleet": config.fleet > 0,
+        "--from-logs": bool(config.from_logs),
+        "--adapt": config.adapt,
+        "--practice": config.practice > 0.0,
+        "--change": config.change.after >= 0,
+        "--mavlink": config.mavlink,
+        "--deterministic (a batch is repeatable as it is)": config.deterministic,
+        "a policy that does not learn": bool(config.policy),
+        "flights in real time": bool(config.flights),
+    }
+    for what, given in refused.items():
+        if given:
+            raise ValueError(f"--backend batch does not support {what}: leave it out, or use --backend processes")
+    if config.robots_per_actor > MOST_IN_BATCH:
+        raise ValueError(f"--backend batch simulates at most {MOST_IN_BATCH} robots: lower --robots-per-actor")
+    from brakeline.messaging.task import robot_with_task
+    from brakeline.sim.batch.batch_env import check_batch
+
+    check_batch(robot_with_task(config.robots[0]), config.arena, config.conditions)
+
+
 def _check_fleets(config: RunConfig) -> None:
     """Check that the robots can share a world. Raises NoFleet."""
     from brakeline.messaging.task import robot_with_task
@@ -152,6 +186,9 @@ def _check_fleets(config: RunConfig) -> None:
     for robot in config.robots:
         check_fleet(robot_with_task(robot), config.arena, config.fleet, config.conditions)
 
+
+# Steps of robots are cheap in a batch, and updates are not: learn more from each update (docs/performance.md).
+BATCH_TD3: dict[str, Any] = {"updates_per_step": 0.25, "actor_rate": 1e-3, "critic_rate": 1e-3}
 
 EXPERIMENTS: dict[str, RunConfig] = {
     "default": RunConfig(),
@@ -164,6 +201,13 @@ EXPERIMENTS: dict[str, RunConfig] = {
         ),
     ),
 }
+
+
+def in_batches(config: RunConfig) -> RunConfig:
+    """Return an experiment with the backend batch: fewer and larger updates, and no pictures of its many robots."""
+    td3 = replace(config.learner.td3, **BATCH_TD3)
+    learner = replace(config.learner, td3=td3)
+    return replace(config, backend=BATCH, robots_per_actor=64, actors=1, pictures=0.0, learner=learner)
 
 
 def encode(config: RunConfig) -> str:

@@ -25,7 +25,7 @@ from brakeline.deploy.run.processes import (
     metrics_address,
     process_specs,
 )
-from brakeline.deploy.run.run_config import RunConfig, load
+from brakeline.deploy.run.run_config import BATCH, RunConfig, load
 from brakeline.errors import BusError
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
@@ -74,6 +74,10 @@ def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetting
     out = folder / spec.name
     if resume := exists(out / CHECKPOINT):
         latest(out / CHECKPOINT)  # fails for a damaged checkpoint before the import of torch, which takes seconds
+    if config.backend == BATCH:
+        from brakeline.deploy.run.batch_process import main as train_in_batches
+
+        return train_in_batches(bus, config, folder, spec, resume)
     from brakeline.learner.learner_process import LearnerSettings, main
 
     return main(LearnerSettings(bus, spec.robot, out, resume, spec.name, config.learning()))

@@ -11,11 +11,11 @@ from typing import Any
 
 from brakeline.messaging.bus.identity import role_of
 from brakeline.messaging.bus.topic_keys import own_key
-from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, HEALTH, ROLES, STEP, TOPICS, Delivery
+from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, HEALTH, ROLES, SIMULATORS, STEP, TOPICS, Delivery
 
-MOST_ROBOTS = 64  # of one actor process: a request batch holds as many
+MOST_ROBOTS = 64  # of one process: a request batch holds as many
 SHARED = ("actor", "safety")  # roles of which many processes may share a certificate with the role as its name, in pods
-OF_ROBOTS = (STEP, EPISODE, EXCHANGE, FRAMES)  # an actor publishes them under the name of each robot
+OF_ROBOTS = (STEP, EPISODE, EXCHANGE, FRAMES)  # published under the name of each robot
 ALIVE = "alive/{source}"  # key of the liveliness token of a process
 EVERYTHING = (
     *("put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"),
@@ -103,12 +103,12 @@ def _own(key: str, name: str, shared: bool, robots: bool = False) -> list[str]:
     Args:
         shared: admit all names that begin with this one and a dot, if the name is that of a role. Several processes
             may share such a certificate.
-        robots: admit the names of the robots in an actor.
+        robots: admit the names of the robots that an actor, or a learner with a batch, simulates.
     """
     sources = [name]
     if shared and name in ROLES:
         sources.append(f"{name}.$*")
-    elif robots and role_of(name) == "actor":
+    elif robots and role_of(name) in SIMULATORS:
         sources += [f"{name}.{number}" for number in range(MOST_ROBOTS)]
     elif name == "certify":
         sources.append("certify.adapt")  # the certifier of a run

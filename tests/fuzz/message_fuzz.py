@@ -164,7 +164,7 @@ def learning(robot: RobotWithTask, folder: Path) -> Party:
 
     def look() -> None:
         loop._publish_flow()
-        loop._publish_metrics()
+        loop.output.publish()
 
     return Party(topics, take, look, wire.rejected)
 

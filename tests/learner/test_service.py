@@ -13,7 +13,8 @@ from brakeline.errors import Late, NoReply, Refused, UnknownRobot
 from brakeline.learner import checkpoint
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
-from brakeline.learner.learner_process import POLICY, LearnerLoop, LearnerSettings, main
+from brakeline.learner.learner_output import POLICY
+from brakeline.learner.learner_process import LearnerLoop, LearnerSettings, main
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint

@@ -30,6 +30,7 @@ from brakeline.messaging.topics import (
     LOGGED,
     MODEL,
     ROLES,
+    SIMULATORS,
     STEP,
     TOPICS,
     WEIGHTS,
@@ -326,7 +327,7 @@ def test_a_role_is_granted_what_the_table_says_and_no_more(role: str) -> None:
         root = key.split("/")[1]
         if root not in ("weights", "flow", "metrics", "logged"):
             assert "*" not in key.split("/")[-1], "under exact names"
-            robots = {f"actor-7.{number}" for number in range(MOST_ROBOTS)} if role == "actor" else set()
+            robots = {f"{role}-7.{number}" for number in range(MOST_ROBOTS)} if role in SIMULATORS else set()
             assert key.split("/")[-1] in {f"{role}-7"} | robots, "under its own name"
     answers = {key for _, messages, key in granted if "declare_queryable" in messages and "reply" in messages}
     asks = {key for flow, messages, key in granted if flow == "ingress" and "query" in messages}

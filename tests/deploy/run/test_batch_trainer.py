@@ -1,0 +1,168 @@
+"""Training from a batch: repeatable by its seed, every step filtered and told, resumed without losses."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from brakeline.actors.actor_settings import PhysicsChange
+from brakeline.deploy.commands.train_command import TrainCommand
+from brakeline.deploy.run.batch_trainer import BatchTrainer
+from brakeline.deploy.run.processes import process_specs
+from brakeline.deploy.run.run_config import BATCH, RunConfig, in_batches
+from brakeline.errors import BadRequest, NoBatch
+from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import LearnerConfig, TD3Config
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.filter.filter import Filter
+from tests.system.runs import Run
+
+GROUND = robot_with_task("ground")
+SAFETY = Filter.load("ground")
+SIZE, PERIODS = 6, 40
+SMALL = TD3Config(hidden=(16, 16), batch=16, warmup=90, updates_per_step=0.25)
+CONFIG = LearnerConfig(td3=SMALL, steps=10_000, publish_every=5)
+
+
+class Told:
+    """What the robots of a trainer publish."""
+
+    def __init__(self) -> None:
+        self.steps: list[pb.Step] = []
+        self.episodes: list[pb.Episode] = []
+
+    def __call__(self, number: int, message: pb.Step | pb.Episode) -> None:
+        assert message.actor == f"learner.{number}"
+        (self.steps if isinstance(message, pb.Step) else self.episodes).append(message)  # type: ignore[arg-type]
+
+
+def trained(seed: int = 0, learner: Learner | None = None, periods: int = PERIODS) -> tuple[Learner, Told]:
+    learner, told = learner or Learner(GROUND, replace(CONFIG, seed=seed)), Told()
+    trainer = BatchTrainer(learner, SAFETY, SIZE, "learner", told, seed=seed)
+    for _ in range(periods):
+        trainer.period()
+    trainer.close()
+    return learner, told
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Learner, Told]:
+    return trained()
+
+
+def test_the_seed_determines_the_weights_and_every_step(run: tuple[Learner, Told]) -> None:
+    learner, told = run
+    assert learner.updates > 30
+    again, other = trained(), trained(seed=1)
+    assert again[0].weights() == learner.weights() and other[0].weights() != learner.weights()
+    for step, same in zip(told.steps, again[1].steps, strict=True):
+        step.decide_ms = same.decide_ms = 0.0
+        assert step == same
+
+
+def test_every_step_is_filtered_learned_and_published_once(run: tuple[Learner, Told]) -> None:
+    learner, told = run
+    assert learner.steps == len(told.steps) == SIZE * PERIODS
+    metrics = learner.metrics()
+    assert (metrics.duplicates, metrics.missing, metrics.refused) == (0, 0, 0)
+    begun = {(episode.actor, episode.episode): episode for episode in told.episodes}
+    assert len(begun) == len(told.episodes) >= SIZE
+    for step in told.steps:
+        assert begun[step.actor, step.episode].seed == step.episode * 4096 + int(step.actor.rpartition(".")[2])
+        assert step.decision and not step.fallback and not step.collision
+        assert len(step.observation) == 26 and len(step.path) == 20 and step.header.time > 0.0
+    kinds = Counter(step.decision for step in told.steps)
+    assert kinds[pb.ALLOWED] > 50 and kinds[pb.ADJUSTED] > 5
+    corrected = [step for step in told.steps if step.decision == pb.ADJUSTED]
+    assert all(step.penalty > 0.0 for step in corrected)
+    compared = [step for step in told.steps if step.compared]
+    assert np.mean([step.contained for step in compared]) > 0.97
+    assert {step.weights_version for step in told.steps} > {1, 2}
+
+
+def test_consecutive_steps_of_a_robot_continue_each_other(run: tuple[Learner, Told]) -> None:
+    last: dict[str, pb.Step] = {}
+    for step in run[1].steps:
+        before = last.get(step.actor)
+        assert step.index == (1 if before is None else before.index + 1)
+        if before is not None and before.episode == step.episode:
+            assert step.observation == before.next_observation and step.step == before.step + 1
+        elif before is not None:
+            assert before.terminated or before.truncated
+            assert step.step == 0
+        last[step.actor] = step
+
+
+def test_a_resumed_run_goes_on_with_the_next_episodes(run: tuple[Learner, Told], tmp_path: Path) -> None:
+    learner, _ = trained(periods=20)
+    learner.save(tmp_path)
+    resumed = Learner(GROUND, CONFIG)
+    resumed.restore(tmp_path)
+    _, told = trained(learner=resumed, periods=20)
+    assert resumed.steps == 2 * 20 * SIZE and resumed.metrics().duplicates == 0
+    assert resumed.metrics().missing == 0
+    assert min(episode.episode for episode in told.episodes) == 1
+
+
+def test_all_robots_brake_while_the_filter_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They brake along their committed plans, the steps say so, and the filter goes on when it can."""
+    told = Told()
+    trainer = BatchTrainer(Learner(GROUND, CONFIG), SAFETY, SIZE, "learner", told)
+    for _ in range(3):
+        trainer.period()
+
+    def fail(requests: Any) -> None:
+        raise BadRequest("state", "row 0: not finite")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Filter, "decide_batch", lambda self, requests: fail(requests))
+        for _ in range(4):
+            trainer.period()
+    trainer.period()
+    trainer.close()
+    failed = told.steps[3 * SIZE : 7 * SIZE]
+    assert all(step.fallback and step.decision == pb.FAILSAFE for step in failed)
+    assert not any(any(step.action) for step in failed[-SIZE:])
+    assert not any(step.fallback or step.collision for step in told.steps[-SIZE:])
+
+
+def test_the_backend_has_settings_of_its_own_which_options_change() -> None:
+    config = TrainCommand.defaults(["ground", "--backend", "batch", "--experiment=debug"])
+    assert (config.backend, config.robots_per_actor, config.experiment) == (BATCH, 64, "debug")
+    assert config.learner.td3.updates_per_step < 1.0 and config.learner.td3.hidden == (32, 32)
+    assert TrainCommand.defaults(["--backend=batch"]).backend == BATCH
+    assert TrainCommand.defaults([]).backend == "processes"
+    assert [spec.name for spec in process_specs(in_batches(RunConfig()))] == ["recorder", "learner"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"method": "secas"}, "the method secas"),
+        ({"adapt": True}, "--adapt"),
+        ({"practice": 0.1}, "--practice"),
+        ({"change": PhysicsChange(after=5)}, "--change"),
+        ({"robots": ("ground", "quadrotor")}, "more than one robot kind"),
+        ({"robots_per_actor": 65}, "at most 64"),
+    ],
+)
+def test_what_a_batch_does_not_do_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        replace(in_batches(RunConfig()), **changes)
+    with pytest.raises(NoBatch, match="quadrotor"):
+        replace(in_batches(RunConfig()), robots=("quadrotor",))
+
+
+@pytest.mark.long
+def test_a_whole_run_is_logged_and_analysed_as_others(data_folder: Path, tmp_path: Path) -> None:
+    command = ("train", "ground", "--backend", "batch", "--experiment", "debug")
+    with Run(tmp_path / "run", "--steps", 1500, command=command) as run:
+        figures = run.end()
+        assert run.popen.returncode == 0, run.errors.read_text()
+    assert figures["finished"] and figures["steps"] == 1536 and figures["collisions"] == 0
+    assert figures["log_messages"]["missing"] == 0 and figures["learners"]["ground"]["steps"] == 1500
+    assert (run.folder / "learner" / "policy.safetensors").is_file()
