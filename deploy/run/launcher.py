@@ -41,6 +41,7 @@ log = logging.getLogger("brakeline.launcher")
 PERIOD = 0.1  # s between two looks at the processes
 TERMINATION_TIMEOUT = 10.0  # s from SIGTERM to SIGKILL: a process may be writing a checkpoint
 RECORDER_TIMEOUT = 30.0  # s after which the run starts without a recorder, whose disk may be full
+UNBEGUN_TIMEOUT = 0.5  # s, the same for a run in which nothing has begun
 LAST_MESSAGES_TIMEOUT = 2.0  # s, longest wait for the last messages of processes that have ended
 SILENCE = 0.5  # s without a message after which the launcher takes the last message to have arrived
 FIGURES = "figures.json"
@@ -299,18 +300,30 @@ class Launcher:
             log.error("messages come faster than the launcher counts them, most at %s: its figures lack some", keys)
 
     def _end(self) -> None:
-        """End the actors first, so that none lacks answers, and the recorder last, so that it logs all messages."""
+        """End the actors first, so that none lacks answers, and the recorder last, so that it logs all messages.
+
+        If nothing has begun, end all of them at once: they still import, and there is nothing to lose.
+        """
         others = [child for child in self.processes if child.spec.kind not in ("actor", "recorder")]
-        for group in filter(None, (self._of("actor"), others, self._of("recorder"))):
+        groups, patience = [self._of("actor"), others, self._of("recorder")], TERMINATION_TIMEOUT
+        if not self._begun():
+            groups, patience = [self.processes], UNBEGUN_TIMEOUT
+        for group in filter(None, groups):
             for child in group:
                 child.terminate()
-            deadline = time.monotonic() + TERMINATION_TIMEOUT
+            deadline = time.monotonic() + patience
             while any(child.alive for child in group) and time.monotonic() < deadline:
                 self._drain()
                 time.sleep(0.02)
             for child in group:
                 child.end(deadline)
-            self._await_last_messages()
+            if patience == TERMINATION_TIMEOUT:
+                self._await_last_messages()
+
+    def _begun(self) -> bool:
+        """Return whether a robot has driven or a learner has learned, here or before; a vehicle may fly at any time."""
+        before = self.config.flights or self._earlier
+        return bool(before or self.metrics.actors or any(one.steps for one in self.metrics.learners.values()))
 
     def _await_last_messages(self) -> None:
         """Wait for the last messages of ended processes. Others may go on to publish."""

@@ -53,7 +53,9 @@ class LivePage:
         keys = [] if bus.keys is None else ["--keys", str(bus.keys)]
         words = ["watch", "--connect", *bus.connect, *keys, "--port", "0", "--foxglove-port", "-1", "--json"]
         command = [*PYTHON, "-m", "brakeline.deploy.run.live_page", str(os.getpid()), *words]
-        with (self._folder / "logs" / "watch.log").open("ab") as errors:
+        logs = self._folder / "logs"
+        logs.mkdir(exist_ok=True)
+        with (logs / "watch.log").open("ab") as errors:
             self._popen = popen = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -65,7 +67,7 @@ class LivePage:
         assert popen.stdout is not None
         with popen.stdout:
             if not (line := popen.stdout.readline()):
-                self.notice = f"no live page: see {self._folder / 'logs' / 'watch.log'}"
+                self.notice = f"no live page: see {logs / 'watch.log'}"
                 return
             url = json.loads(line)["page"]
             self.notice = f"live page: {url}"

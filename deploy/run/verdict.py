@@ -32,6 +32,8 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     Args:
         figures: of a launcher (`Launcher.figures`).
     """
+    if not (figures["steps"] or figures.get("from_logs") or figures["learners"]):
+        return [f"ended before the first step; nothing was driven, see {figures['folder']}/logs if you did not end it"]
     lines = [_outcome(figures), _answers(figures)] if figures["steps"] else []
     if fed := figures.get("from_logs"):
         lines.append(

@@ -115,6 +115,11 @@ def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:
     assert rows_of(ended(view, latest={}))[0].startswith("no episode ended; ")
 
 
+def test_a_run_that_was_ended_before_its_first_step_asks_for_no_resumption(view: Launcher) -> None:
+    (only,) = rows_of(ended(view, steps=0, learners={}))
+    assert only.startswith("ended before the first step") and "resume" not in only
+
+
 def test_all_figures_and_paths_are_whole(view: Launcher) -> None:
     figures = ended(view)
     rows, folder = rows_of(figures, verbose=True), figures["folder"]

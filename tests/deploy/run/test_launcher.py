@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.display import summary
 from brakeline.deploy.run.launcher import Launcher, prepare
@@ -135,6 +136,17 @@ def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_pa
     (tmp_path / "run_0003.mcap").write_bytes(b"no log at all")
     (failure,) = launcher.figures()["log_messages"]["failures"][1:]
     assert "run_0003.mcap is not an MCAP file" in failure
+
+
+def test_only_a_run_in_which_nothing_has_begun_may_end_at_once(launcher: Launcher) -> None:
+    assert not launcher._begun()
+    launcher.metrics.add("metrics/ground", pb.LearnerMetrics(header=pb.Header(sequence=1), robot="ground"), 1)
+    assert not launcher._begun(), "the learner waits for steps"
+    launcher.config = replace(launcher.config, actors=1, flights=(FlightSettings("udpin:127.0.0.1:1"),))
+    assert launcher._begun(), "a vehicle may fly already"
+    launcher.config = replace(launcher.config, flights=())
+    say(launcher, STEP, pb.Step(header=pb.Header(sequence=1), actor="a"))
+    assert launcher._begun()
 
 
 def printed(show: Callable[[Console, object], None], figures: object) -> str:
