@@ -27,7 +27,7 @@ from brakeline.errors import NotMcap
 
 MAGIC = b"\x89MCAP0\r\n"
 MOST_CHUNK_BYTES = 2**27  # a chunk that declares more is damaged
-BROKEN = (McapError, struct.error, ValueError, EOFError, RuntimeError, zstandard.ZstdError)
+BROKEN = (McapError, struct.error, ValueError, EOFError, OverflowError, RuntimeError, zstandard.ZstdError)
 
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
 

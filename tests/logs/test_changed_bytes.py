@@ -55,3 +55,11 @@ def test_counts_by_the_summary_are_right_or_by_the_messages(path: Path) -> None:
         assert count_by_key(path)[KEY] <= 30
     path.write_bytes(whole[:-1])
     assert count_by_key(path) == {KEY: 30}
+
+
+def test_a_chunk_with_an_absurd_length_is_damage(path: Path) -> None:
+    whole = path.read_bytes()
+    name = whole.index(b"zstd")  # the chunk's compression, before the length of its records
+    path.write_bytes(whole[: name + 4] + b"\xff" * 8 + whole[name + 12 :])
+    log = open_log(path)
+    assert list(log) == [] and log.cuts

@@ -30,7 +30,7 @@ MOST_BYTES = 2**27  # of a record, after decompression: more is damaged
 ROS1 = "ros1"  # the encoding of ROS 1's messages; that of ROS 2 is "cdr"
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 TIME = struct.Struct("<II")  # s, ns
-BROKEN = (EOFError, KeyError, OSError, RuntimeError, ValueError, struct.error)
+BROKEN = (EOFError, KeyError, OSError, OverflowError, RuntimeError, ValueError, struct.error)
 
 
 @dataclass(frozen=True)
