@@ -3,7 +3,7 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo setup test test-fast check style types kernels unit bench messages docs safety-gymnasium bullet-safety-gym clean
+.PHONY: demo setup test test-fast check style types compiled unit bench messages docs safety-gymnasium bullet-safety-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -30,16 +30,19 @@ style: setup
 types: setup
 	nice $(BIN)/mypy
 
-# Compiles loops (Numba) once. Otherwise every process that the first tests start would compile them.
-kernels: setup
-	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.perception.occluded_regions as s; s.prepare()'
+# Compiles all loops (Numba) and all tests once. Otherwise each process of the tests would compile them. If a test cannot
+# be imported, the tests themselves say so.
+compiled: setup
+	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels'
+	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()'
+	-$(BIN)/python -m pytest --collect-only > /dev/null
 
-# Real time in one process, real autopilots in another, whole runs in a third, the rest in a fourth at a lower priority
+# Real time in one process, real autopilots in another, whole runs in a third, the rest in two more at a lower priority
 # (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
-unit: kernels
-	$(BIN)/python -m pytest -m "not long" -n 4 --dist loadscope --no-loadscope-reorder -rs
+unit: compiled
+	$(BIN)/python -m pytest -m "not long" -n 5 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: export PYTHONDONTWRITEBYTECODE =

@@ -13,7 +13,7 @@ import brakeline
 
 ROOT = Path(__file__).parents[2]
 # The names, the files and the decisions are tested here, so the kernels of another folder are not compiled: it takes
-# 17 s. `tests/safety/test_kernel_bounds.py` compiles them in a folder of its own.
+# 17 s. The long test of `tests/safety/test_kernel_bounds.py` compiles them in a folder of its own.
 NOT_COMPILED = {"NUMBA_DISABLE_JIT": "1"}
 PARTS = ("messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "robots", "policies")
 
