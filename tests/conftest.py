@@ -1,6 +1,7 @@
 """A small recording of the ground robot, made once a session, for the tests that need a model set; and who runs what
 where tests run side by side (`pytest -n 4`)."""
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +17,8 @@ from brakeline.safety.model.model_set import ModelConfig
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 
+gc.disable()  # until all tests are collected: to search the half million objects takes a second in each process
+
 # A machine that stalls is no failure of what is tested.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
@@ -24,22 +27,30 @@ FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
 TRAJECTORIES = 55  # the fewest whose held-out plans state the limit of 1 %, late ones too; recorded in eleven seconds
 
 
-# What flies or drives in real time mostly waits, as do real autopilots; whole runs keep both cores busy. One of each at
-# a time, and the rest beside them at a lower priority.
+# Flights and drives in real time mostly wait, as real autopilots do. Whole runs keep both cores busy. One process runs
+# the tests of one lane, in this order. Tests that need no recording come first: another lane records meanwhile.
 LIVE = (
-    *("tests/actors/test_mavlink_vehicle.py", "tests/actors/ros2/", "tests/system/test_fly.py"),
-    *("tests/system/test_mavsdk.py", "tests/system/test_hil.py", "tests/system/test_ros2.py"),
+    *("tests/actors/test_vehicle_server.py", "tests/system/test_mavsdk.py", "tests/system/test_hil.py"),
+    *("tests/actors/ros2/", "tests/system/test_fly.py", "tests/system/test_ros2.py"),
 )
-REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py",)
+REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py", "tests/actors/test_mavlink_vehicle.py")
 WHOLE_RUNS = ("tests/system/",)
 LANES = (LIVE, REAL_AUTOPILOTS, WHOLE_RUNS)
+REST = ("tests/examples/", "tests/deploy/", "")  # the longest modules first: at the end no process waits for one
 ASIDE = pytest.StashKey[bool]()  # of a process: it has given way to the others
 BESIDE = 10  # by which the priority of a process is lower that is on no lane
 
 
 def lane(nodeid: str) -> int:
-    """Which of the lanes a test goes along; the number after the last one if it may be anywhere."""
+    """Return the number of the lane of a test, or the number after the last one if any process may run the test."""
     return next((i for i, paths in enumerate(LANES) if nodeid.startswith(paths)), len(LANES))
+
+
+def turn(nodeid: str) -> tuple[int, int]:
+    """Return when a test runs: its lane, and its place there."""
+    number = lane(nodeid)
+    paths = (*LANES, REST)[number]
+    return number, next(i for i, path in enumerate(paths) if nodeid.startswith(path))
 
 
 class Rooms(LoadScopeScheduling):
@@ -56,8 +67,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Rooms:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The lanes first: they take as long as all the rest."""
-    items.sort(key=lambda item: lane(item.nodeid))  # stable
+    """Begin with the lanes: they take as long as all the rest."""
+    items.sort(key=lambda item: turn(item.nodeid))  # stable
+
+
+def pytest_collection_finish() -> None:
+    """Switch the garbage collector on, which then passes over the collected tests."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -54,7 +54,7 @@ class Episodes:
 @each_robot
 @pytest.mark.parametrize(("arena", "least"), [("default", 0.40), ("dense", 0.65)])
 def test_the_greedy_policy_collides_in_many_episodes(robot: RobotWithTask, arena: str, least: float) -> None:
-    episodes = Episodes(robot, "greedy", arena, 60)
+    episodes = Episodes(robot, "greedy", arena, 30)
     assert least <= episodes.share("collision") <= 0.9
     if robot is QUADROTOR:
         assert episodes.share("collision") + episodes.share("at_goal") == 1.0

@@ -13,7 +13,7 @@ from tests.accepting import WORDS
 from tests.system.runs import Run, brakeline
 from tests.waiting import until
 
-BEFORE, DURING, AFTER = 800, 4000, 600  # steps of both actors
+BEFORE, DURING, AFTER = 800, 2400, 600  # steps of both actors
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
@@ -62,7 +62,7 @@ def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(d
     shutil.copytree(data_folder, tmp_path / "data")  # other tests' runs take the newest model set of the shared folder
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2)
-    adapt = ("--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
+    adapt = ("--actors", 1, "--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
     with Run(tmp_path / "run", "--steps", ENDLESS, *adapt, *change, *WORDS) as run:
         processes = run.watch().processes
         certifier = until(lambda: processes.get("certify.adapt"), "the certifier")

@@ -30,7 +30,8 @@ from tests.system.runs import BRAKELINE
 from tests.waiting import PATIENCE, until
 
 DRIVER = Path(__file__).with_name("ros2_driver.py")
-SIMULATED = ("--sim-time", "--lockstep", "--factor", 6)
+STEADY = ("--sim-time", "--lockstep")  # at the pace of real time: while a test waits, the robot leaves the cores alone
+SIMULATED = (*STEADY, "--factor", 6)
 GRAPH = """
 import json, sys, time
 from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
@@ -155,7 +156,7 @@ def test_a_bag_is_one_to_readers_of_bags(run: Any) -> None:
 
 
 def test_it_is_seen_in_the_graph_and_stops_when_it_is_killed(late_folder: Path, tmp_path: Path) -> None:
-    with Bench(tmp_path, *SIMULATED, "--seed", 2, node=("--sim-time",)) as bench:
+    with Bench(tmp_path, *STEADY, "--seed", 2, node=("--sim-time",)) as bench:
         until(lambda: bench.said("driver").get("delays"), f"a raw command goes through: {bench.errors('filter')}")
         graph = bench.start("graph", sys.executable, "-c", GRAPH, bench.port)
         assert graph.wait(PATIENCE) == 0, bench.errors("graph")

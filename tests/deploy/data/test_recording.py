@@ -32,7 +32,7 @@ MAKE = """
 from brakeline.deploy.data import model_store, simulated_recording
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_config import ModelConfig
-simulated_recording.load_or_record(robot_with_task("ground"), trajectories=12)
+simulated_recording.load_or_record(robot_with_task("ground"), trajectories=8)
 model_store.model_for(robot_with_task("ground"), ModelConfig(), 0.3)
 """
 
@@ -101,7 +101,7 @@ def elsewhere(tmp_path, monkeypatch):
     recordings = []
     original = simulated_recording.collect.record
     monkeypatch.setattr(
-        simulated_recording, "load_or_record", partial(simulated_recording.load_or_record, trajectories=12)
+        simulated_recording, "load_or_record", partial(simulated_recording.load_or_record, trajectories=8)
     )
     monkeypatch.setattr(simulated_recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
