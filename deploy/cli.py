@@ -1,4 +1,4 @@
-"""Implement `brakeline COMMAND ...`. COMMANDS is THE table of commands, each with an example.
+"""Implement `brakeline COMMAND ...`. GROUPS is THE table of commands, each with an example.
 
 Each command is a module `deploy/commands/NAME_command.py` with a dataclass `NameCommand`: its fields are the options,
 and its method `run` returns the exit status. The module is imported when the command runs, so that `--help` answers at
@@ -32,108 +32,124 @@ class CommandEntry(NamedTuple):
     example: str
 
 
-COMMANDS: dict[str, CommandEntry] = {
-    "demo": CommandEntry("Train the ground robot for some minutes and watch it.", "brakeline demo"),
-    "train": CommandEntry(
-        "Run all processes of a training on this machine: actors, safety service, learner, recorder.",
-        "brakeline train ground --steps 90000 --actors 2 --seed 0",
-    ),
-    "keys": CommandEntry(
-        "Make the keys of processes on several machines, of whoever signs models, and of verified plans.",
-        "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
-    ),
-    "robot": CommandEntry(
-        "Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"
-    ),
-    "safety": CommandEntry(
-        "Run a safety service alone.", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
-    ),
-    "router": CommandEntry(
-        "Run a router at which the processes of several machines meet. Linked routers form one bus.",
-        "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
-    ),
-    "learner": CommandEntry("Run a learner alone.", "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys"),
-    "actor": CommandEntry(
-        "Run one actor process alone, with one or several robots.",
-        "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
-    ),
-    "fly": CommandEntry(
-        "Fly a quadrotor in real time over MAVLink, with autopilot, safety service, actor and recorder.",
-        "brakeline fly --minutes 10 --policy astar",
-    ),
-    "autopilot": CommandEntry(
-        "Simulate quadrotors behind MAVLink in real time, with the rules of PX4 or ArduPilot.",
-        "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
-    ),
-    "ros2": CommandEntry(
-        "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. Needs no ROS installation.",
-        "brakeline ros2 ground --router tcp/localhost:7447",
-    ),
-    "bridge-sim": CommandEntry(
-        "Simulate a ground robot as a ROS 2 robot: odom, scan, tf, clock and cmd_vel.",
-        "brakeline bridge-sim --arena dense --seed 3",
-    ),
-    "recorder": CommandEntry(
-        "Run a recorder alone.", "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"
-    ),
-    "collect": CommandEntry(
-        "Record the data set that the filter learns a robot from.",
-        "brakeline collect ground --seed 1",
-    ),
-    "import": CommandEntry(
-        "Make a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, own runs.",
-        "brakeline import drive.csv --robot my.toml --picture driven.png",
-    ),
-    "excite": CommandEntry(
-        "Print the inputs that excite a robot best within a region, or drive them in its simulator.",
-        "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
-    ),
-    "certify": CommandEntry(
-        "Validate model sets on held-out data, and put them to use or publish them.",
-        "brakeline certify --robot ground",
-    ),
-    "evaluate": CommandEntry(
-        "Evaluate a policy behind the filter, in this process, on fresh episodes.",
-        "brakeline evaluate ground --policy astar --episodes 100 --json",
-    ),
-    "pretrain": CommandEntry(
-        "Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"
-    ),
-    "compare": CommandEntry(
-        "Train and evaluate each method from the same seeds, as tables and figures. Resumes from results/.",
-        "brakeline compare ground --quick",
-    ),
-    "query": CommandEntry(
-        "Ask a running safety service for a decision about a state and an action.",
-        "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
-    ),
-    "status": CommandEntry("Show the living processes and their figures.", "brakeline status"),
-    "watch": CommandEntry("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
-    "replay": CommandEntry(
-        "Decide each logged request again and compare, to within 1e-12, or with another model set.",
-        "brakeline replay runs/latest --certificate set-membership",
-    ),
-    "export": CommandEntry(
-        "Export a log as CSV, Minari data set, .tlog, or MCAP with a picture of each step for Foxglove.",
-        "brakeline export runs/latest --csv steps.csv",
-    ),
-    "analyse": CommandEntry(
-        "Compute the figures of one or many logs, also of incomplete ones, and write a report page.",
-        "brakeline analyse runs/latest --html report.html",
-    ),
-    "recover": CommandEntry("Repair damaged logs.", "brakeline recover runs/latest"),
+GROUPS: dict[str, dict[str, CommandEntry]] = {
+    "See it and train": {
+        "demo": CommandEntry("Train the ground robot for some minutes and watch it.", "brakeline demo"),
+        "train": CommandEntry(
+            "Run all processes of a training on this machine: actors, safety service, learner, recorder.",
+            "brakeline train ground --steps 90000 --actors 2 --seed 0",
+        ),
+        "evaluate": CommandEntry(
+            "Evaluate a policy behind the filter, in this process, on fresh episodes.",
+            "brakeline evaluate ground --policy astar --episodes 100 --json",
+        ),
+        "compare": CommandEntry(
+            "Train and evaluate each method from the same seeds, as tables and figures. Resumes from results/.",
+            "brakeline compare ground --quick",
+        ),
+        "pretrain": CommandEntry(
+            "Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"
+        ),
+    },
+    "Your own robot": {
+        "robot": CommandEntry(
+            "Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"
+        ),
+        "import": CommandEntry(
+            "Make a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, own runs.",
+            "brakeline import drive.csv --robot my.toml --picture driven.png",
+        ),
+        "collect": CommandEntry(
+            "Record the data set that the filter learns a robot from.",
+            "brakeline collect ground --seed 1",
+        ),
+        "excite": CommandEntry(
+            "Print the inputs that excite a robot best within a region, or drive them in its simulator.",
+            "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
+        ),
+        "certify": CommandEntry(
+            "Validate model sets on held-out data, and put them to use or publish them.",
+            "brakeline certify --robot ground",
+        ),
+    },
+    "Ask the filter, fly and drive": {
+        "query": CommandEntry(
+            "Ask a running safety service for a decision about a state and an action.",
+            "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
+        ),
+        "fly": CommandEntry(
+            "Fly a quadrotor in real time over MAVLink, with autopilot, safety service, actor and recorder.",
+            "brakeline fly --minutes 10 --policy astar",
+        ),
+        "ros2": CommandEntry(
+            "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. Needs no ROS installation.",
+            "brakeline ros2 ground --router tcp/localhost:7447",
+        ),
+        "autopilot": CommandEntry(
+            "Simulate quadrotors behind MAVLink in real time, with the rules of PX4 or ArduPilot.",
+            "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
+        ),
+        "bridge-sim": CommandEntry(
+            "Simulate a ground robot as a ROS 2 robot: odom, scan, tf, clock and cmd_vel.",
+            "brakeline bridge-sim --arena dense --seed 3",
+        ),
+    },
+    "Look at runs": {
+        "watch": CommandEntry("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
+        "status": CommandEntry("Show the living processes and their figures.", "brakeline status"),
+        "analyse": CommandEntry(
+            "Compute the figures of one or many logs, also of incomplete ones, and write a report page.",
+            "brakeline analyse runs/latest --html report.html",
+        ),
+        "replay": CommandEntry(
+            "Decide each logged request again and compare, to within 1e-12, or with another model set.",
+            "brakeline replay runs/latest --certificate set-membership",
+        ),
+        "export": CommandEntry(
+            "Export a log as CSV, Minari data set, .tlog, or MCAP with a picture of each step for Foxglove.",
+            "brakeline export runs/latest --csv steps.csv",
+        ),
+        "recover": CommandEntry("Repair damaged logs.", "brakeline recover runs/latest"),
+    },
+    "Processes on several machines": {
+        "keys": CommandEntry(
+            "Make the keys of processes on several machines, of whoever signs models, and of verified plans.",
+            "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
+        ),
+        "router": CommandEntry(
+            "Run a router at which the processes of several machines meet. Linked routers form one bus.",
+            "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
+        ),
+        "safety": CommandEntry(
+            "Run a safety service alone.", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
+        ),
+        "actor": CommandEntry(
+            "Run one actor process alone, with one or several robots.",
+            "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
+        ),
+        "learner": CommandEntry(
+            "Run a learner alone.", "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys"
+        ),
+        "recorder": CommandEntry(
+            "Run a recorder alone.", "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"
+        ),
+    },
 }
+COMMANDS: dict[str, CommandEntry] = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 
 
 def print_overview(console: Console) -> None:
     """Print each command with its example."""
-    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
-    for name, (summary, example) in COMMANDS.items():
-        table.add_row(f"[bold]{name}[/]", summary)
-        table.add_row("", f"[dim]{example}[/]")
     console.print("[bold]brakeline[/]: robots learn by trial and error without ever hitting anything\n")
-    console.print(table)
-    console.print("\n`brakeline COMMAND --help` lists the options of a command. With --json a command prints one JSON")
+    for title, group in GROUPS.items():
+        table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+        for name, (summary, example) in group.items():
+            table.add_row(f"[bold]{name:<10}[/]", summary)
+            table.add_row("", f"[dim]{example}[/]")
+        console.print(f"[bold]{title}[/]")
+        console.print(table)
+        console.print()
+    console.print("`brakeline COMMAND --help` lists the options of a command. With --json a command prints one JSON")
     console.print("object on stdout.")
 
 

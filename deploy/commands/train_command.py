@@ -39,7 +39,18 @@ class TrainCommand(RunConfig):
 
     # Options that `--help` leaves to `--help-all`.
     expert: ClassVar[tuple[str, ...]] = (
-        *("physics", "robots_per_actor", "penalty", "deadline", "replicas", "from_logs", "practice", "adapt", "change"),
+        *(
+            "physics",
+            "fleet",
+            "robots_per_actor",
+            "penalty",
+            "deadline",
+            "replicas",
+            "from_logs",
+            "practice",
+            "adapt",
+            "change",
+        ),
         *("deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
     )
 

@@ -53,13 +53,12 @@ class RunConfig:
     arena: str = "default"
     """Drive in arenas of this name."""
     backend: Literal["processes", "batch"] = "processes"
-    """Simulate the robots in actor processes, one by one; or all at once in the learner's process (batch), for much
-    faster training of the ground robot. A batch has --robots-per-actor robots (64 by default) and learner settings of
-    its own."""
+    """Simulate in actor processes, or all ground robots at once (batch: much faster)."""
     actors: int = 2
     """Run this many actor processes for each robot kind. With --from-logs it may be 0."""
     robots_per_actor: int = 1
-    """Run this many robots in each actor process. They share one request to the safety service."""
+    """Run this many robots in each actor process. They share one request to the safety service. With --backend batch,
+    run this many in all; 64 unless you say otherwise."""
     fleet: int = 0
     """Let this many robots of each actor process share one world and avoid each other. 0 gives each a world of its
     own."""
