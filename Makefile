@@ -3,6 +3,12 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
 
+# Compiles all loops (Numba), if their code has changed. Otherwise the first command or each test would wait for it.
+define COMPILE
+$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels'
+	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()'
+endef
+
 .PHONY: demo setup test test-fast check style types compiled unit bench messages docs safety-gymnasium bullet-safety-gym clean
 
 demo: setup
@@ -14,6 +20,7 @@ $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv || python3 -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch==2.13.0
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(COMPILE)
 	touch $(STAMP)
 
 # The types are checked beside the tests: in their first minute, which records data, a core is idle.
@@ -30,11 +37,10 @@ style: setup
 types: setup
 	nice $(BIN)/mypy
 
-# Compiles all loops (Numba) and all tests once. Otherwise each process of the tests would compile them. If a test cannot
+# Compiles loops and tests once. Otherwise each process of the tests would compile them. If a test cannot
 # be imported, the tests themselves say so.
 compiled: setup
-	$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels'
-	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()'
+	$(COMPILE)
 	-$(BIN)/python -m pytest --collect-only > /dev/null
 
 # Real time in one process, real autopilots in another, whole runs in a third, the rest in two more at a lower priority
