@@ -93,7 +93,8 @@ class BatchTrainer:
     def period(self) -> None:
         """Run one period of all robots, and make the updates that are due."""
         proposals = self._propose()
-        seen, steps, index = self._now, self._steps.copy(), self._index + 1
+        self.learner.flow()  # permits the steps of this period
+        seen, steps, index, episodes = self._now, self._steps.copy(), self._index + 1, self._now_in()
         outcome = self._env.begin_step(proposals)
         self.learner.work(ALL_DUE)
         if self.learner.weights_due():
@@ -102,6 +103,7 @@ class BatchTrainer:
         self._now, rewards, terminated, truncated, infos = self._env.end_step()
         after = infos.get("final_info", infos)
         columns = {
+            "episode": episodes,
             "step": steps,
             "index": index,
             "observation": seen,
@@ -142,8 +144,8 @@ class BatchTrainer:
         """Yield the message of each robot's step, from columns with a row for each robot."""
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         common: dict[str, Any] = {"robot": self._robot.name, "weights_version": version}
-        for actor, episode, time, row in zip(self.actors, self._episodes, times.tolist(), rows, strict=True):
-            step = pb.Step(actor=actor, episode=episode - 1, **common, **dict(zip(columns, row, strict=True)))
+        for actor, time, row in zip(self.actors, times.tolist(), rows, strict=True):
+            step = pb.Step(actor=actor, **common, **dict(zip(columns, row, strict=True)))
             step.header.time = time
             yield step
 
@@ -154,6 +156,10 @@ class BatchTrainer:
         if reply.HasField("error"):
             raise LaunchError(f"the learner refuses {actor}: {reply.error.message}")
         return reply.episode
+
+    def _now_in(self) -> NDArray[np.int64]:
+        """Return the number (N,) of each robot's present episode. The environment begins the next one by itself."""
+        return np.array(self._episodes) - 1
 
     def _next_episode_seed(self, number: int) -> int:
         """Return the seed of a robot's next episode, which begins now."""

@@ -19,6 +19,7 @@ from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
+from brakeline.sim.scripted_policies import GroundGreedyPolicy
 from tests.system.runs import Run
 
 GROUND = robot_with_task("ground")
@@ -84,17 +85,33 @@ def test_every_step_is_filtered_learned_and_published_once(run: tuple[Learner, T
     assert {step.weights_version for step in told.steps} > {1, 2}
 
 
-def test_consecutive_steps_of_a_robot_continue_each_other(run: tuple[Learner, Told]) -> None:
-    last: dict[str, pb.Step] = {}
-    for step in run[1].steps:
+def test_consecutive_steps_of_a_robot_continue_each_other_over_the_ends_of_episodes() -> None:
+    """The last step of an episode belongs to that episode, although the next one has begun when it is published."""
+    learner, told = Learner(GROUND, CONFIG), Told()
+    trainer = BatchTrainer(learner, SAFETY, SIZE, "learner", told)
+    greedy, ended, last = GroundGreedyPolicy(GROUND, np.random.default_rng(0)), 0, dict[str, pb.Step]()
+    trainer._propose = lambda: np.array([greedy(None, info) for info in infos(trainer)])  # type: ignore
+    for _ in range(70):
+        trainer.period()
+    trainer.close()
+    assert (learner.metrics().duplicates, learner.metrics().missing) == (0, 0)
+    for step in told.steps:
         before = last.get(step.actor)
         assert step.index == (1 if before is None else before.index + 1)
         if before is not None and before.episode == step.episode:
             assert step.observation == before.next_observation and step.step == before.step + 1
         elif before is not None:
-            assert before.terminated or before.truncated
-            assert step.step == 0
+            assert (before.terminated or before.truncated) and step.episode == before.episode + 1
+            assert step.step == 0 and before.goal
+            ended += 1
         last[step.actor] = step
+    assert ended >= 1 and all(learner.metrics().limit[actor] >= 70 for actor in trainer.actors)
+
+
+def infos(trainer: BatchTrainer) -> list[dict[str, Any]]:
+    """Return what a scripted policy needs of each robot."""
+    env = trainer._env.unwrapped
+    return [{"state": state, "goal": goal} for state, goal in zip(env._robots.measured, env._goals, strict=True)]
 
 
 def test_a_resumed_run_goes_on_with_the_next_episodes(run: tuple[Learner, Told], tmp_path: Path) -> None:
