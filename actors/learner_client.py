@@ -90,6 +90,8 @@ class LearnerClient:
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
         """Wait for permission for step number `index`. Return False if the run is over or `stop` returned true."""
         since, self._index = time.monotonic(), index
+        if not self._permitted(index):
+            self.bus.flush()  # the learner permits further steps when it has these
         while not stop() and not self.flow.done:
             with self._changed:
                 if self._permitted(index):

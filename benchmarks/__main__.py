@@ -37,6 +37,7 @@ from benchmarks import (
     recording_cost,
     roundtrip,
     solvers,
+    step_cost,
     training_speed,
 )
 from benchmarks.timing import Figures, Words
@@ -71,6 +72,8 @@ class Bench:
     """Let each sender of crowd send this many junk messages a second."""
     minutes: float = 10.0
     """Fly each policy of flights for this long in each arena [min]."""
+    against: Path | None = None
+    """Run step with the code of this checkout, too, in turn with this one's."""
     folder: Path = Path("runs/flights")
     """Store the data, logs and figures of flights, upsets, cuts and campaign here. What the folder has is not
     repeated."""
@@ -114,6 +117,7 @@ BENCHMARKS = {
     "training": Benchmark(training_speed, lambda given: training_speed.run(given.seeds), named=True),
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
+    "step": Benchmark(step_cost, lambda given: step_cost.run(given.against), named=True),
     "campaign": Benchmark(campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }

@@ -10,7 +10,7 @@ bit for bit. In lockstep, an actor may publish step i after all updates that ste
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -237,6 +237,16 @@ class Learner:
             warmup=self._limiter.warming_up,
             done=self.done,
         )
+
+    def needed(self, limits: Mapping[str, int]) -> bool:
+        """Return whether an actor has used half of its window up to a limit, and may go on beyond it.
+
+        Args:
+            limits: of `flow` when it was published last.
+        """
+        half, places = self.config.window // 2, self._ledger.places
+        known = {actor: limits.get(actor, 0) for actor, limit in self._limits.items() if limit > limits.get(actor, 0)}
+        return any(limit - places[actor].last_index <= half for actor, limit in known.items())
 
     def _grant(self) -> None:
         room = 0 if self._enough() else self._limiter.room()

@@ -90,7 +90,7 @@ class LearnerLoop:
         self._steps = Inbox()
         self._joins: deque[tuple[bytes, str, Future[bytes]]] = deque()
         self._wake = Event()
-        self._last_flow: object = None
+        self._last_flow = pb.Flow()  # without the header, which `put` fills in
         self._flow_at = -1e9
         self.output = LearnerOutput(process, learner, settings.out, clock)
         bus, robot = process.bus, learner.robot.name
@@ -165,12 +165,16 @@ class LearnerLoop:
         return taken
 
     def _publish_flow(self) -> None:
-        flow = self._learner.flow()
-        content = (dict(flow.limit), flow.weights_version, flow.warmup, flow.done)
-        age = self._clock() - self._flow_at
-        spacing = 0.0 if self._settings.learner.lockstep else FLOW_SPACING
-        if age > FLOW_PERIOD or (content != self._last_flow and age >= spacing):
-            self._last_flow, self._flow_at = content, self._clock()
+        """Publish the flow if it is old, or if actors need it: each message costs every process some time."""
+        flow, last, age = self._learner.flow(), self._last_flow, self._clock() - self._flow_at
+        if self._settings.learner.lockstep:
+            due = flow != last
+        else:
+            changed = (flow.warmup, flow.done) != (last.warmup, last.done) or self._learner.needed(last.limit)
+            due = changed and age >= FLOW_SPACING
+        if due or age > FLOW_PERIOD:
+            self._last_flow.CopyFrom(flow)
+            self._flow_at = self._clock()
             self._flow.put(flow)
 
     def _finish(self) -> None:

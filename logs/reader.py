@@ -112,7 +112,7 @@ class Log:
         for series, log_time, publish_time, payload in self.rows():
             try:
                 message = series.decode(payload)
-                check(message)
+                check(message, len(payload))
                 check_names(series.names, message)
             except (DecodeError, Implausible):
                 self.malformed += 1

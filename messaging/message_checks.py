@@ -38,8 +38,11 @@ def _checked_fields(kind: Descriptor) -> _CheckedFields:
     return _CheckedFields("header" in fields, names, tuple(sizes), numbers, "request" in fields)
 
 
-def check(message: Any) -> None:
+def check(message: Any, size: int) -> None:
     """Check a message.
+
+    Args:
+        size: of its payload [bytes]. A number takes at least one byte, and an obstacle two.
 
     Raises:
         Implausible: a time, a name or a size is out of bounds; the error names the field.
@@ -54,14 +57,14 @@ def check(message: Any) -> None:
         _check_name(header, "source")
     for name in fields.names:
         _check_name(message, name)
-    for name, most in fields.sizes:
-        if (size := len(getattr(message, name))) > most:
-            raise Implausible(f"{size} {name}")
+    for name, most in fields.sizes if size > MAX_OBSTACLES else ():
+        if (count := len(getattr(message, name))) > most:
+            raise Implausible(f"{count} {name}")
     for name in fields.numbers:
         if not abs(value := getattr(message, name)) < MAX_VALUE:
             raise Implausible(f"{name} {value}")
     if fields.request:
-        check(message.request)
+        check(message.request, size)
 
 
 def _check_name(message: Any, field: str) -> None:

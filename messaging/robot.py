@@ -216,6 +216,11 @@ class Robot:
         return self.low() - INPUT_ROUNDING, self.high() + INPUT_ROUNDING
 
     @cached_property
+    def slew(self) -> Array:
+        """Largest change of each input (m,) in a period; infinite without a limit."""
+        return np.asarray(self.action_slew, dtype=float)
+
+    @cached_property
     def zero_at_rest(self) -> NDArray[np.bool_]:
         """Whether each input (m,) is zero when the robot stands: true for all rules except HOLD."""
         return np.array([rule != HOLD for rule in self.stop])
@@ -241,8 +246,7 @@ class Robot:
         wanted = np.asarray(wanted, dtype=np.float64)
         if wanted.shape != (self.action_dim,) or not np.isfinite(wanted).all():
             raise BadInput(f"the input of {self.name} must be {self.action_dim} finite numbers, not {wanted!r}")
-        slew = np.asarray(self.action_slew)
-        return np.clip(np.clip(wanted, before - slew, before + slew), self.low(), self.high())
+        return np.clip(np.clip(wanted, before - self.slew, before + self.slew), self.low(), self.high())
 
     def is_stop_input(self, inputs: Array) -> NDArray[np.bool_]:
         """Return whether inputs (..., m) are zero where a standing robot has zero: (...,)."""
@@ -287,8 +291,7 @@ class Robot:
         if not self.feedback:
             return planned
         wanted = np.where(self.stops_by_feedback, state @ np.asarray(self.feedback).T, planned)
-        slew = np.asarray(self.action_slew)
-        low, high = np.maximum(self.low(), before - slew), np.minimum(self.high(), before + slew)
+        low, high = np.maximum(self.low(), before - self.slew), np.minimum(self.high(), before + self.slew)
         return np.asarray(np.clip(wanted, low, high))
 
     def is_standing(self, state: Array) -> bool:

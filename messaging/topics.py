@@ -80,6 +80,8 @@ LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, BLOCK, None, ("feed
 EPISODE = Topic("episode", "episode/{robot}/{source}", pb.Episode, BLOCK, None, SIMULATORS, (), True)
 EXCHANGE = Topic("exchange", "exchange/{robot}/{source}", pb.Exchange, BLOCK, None, ("actor",), ("certify",), True)
 FRAMES = Topic("frames", "frames/{robot}/{source}", pb.MavlinkFrames, BLOCK, None, ("actor",), (), True)
+BUNDLE = Topic("bundle", "bundle/{robot}/{source}", pb.Bundle, BLOCK, None, ("actor",),
+               ("learner", "certify", *RECORDERS), False, largest=2**21)
 WEIGHTS = Topic("weights", "weights/{robot}", pb.Weights, DROP, None, ("learner",), ("actor", "feeder"), False,
                 largest=FILE)
 FLOW = Topic("flow", "flow/{robot}", pb.Flow, BLOCK, 1.0, ("learner",), ("actor", "feeder"), False)
@@ -89,7 +91,8 @@ LOG = Topic("log", "log/{source}", pb.LogLine, BLOCK, None, ROLES, (), True)
 # fmt: on
 
 TOPICS: tuple[Topic, ...] = (
-    *(DECIDE, JOIN, MODEL, STEP, LOGGED, EPISODE, EXCHANGE, FRAMES),
+    *(DECIDE, JOIN, MODEL, STEP, LOGGED, EPISODE, EXCHANGE, FRAMES, BUNDLE),
     *(WEIGHTS, FLOW, LEARNER, HEALTH, LOG),
 )
+BUNDLED: tuple[Topic, ...] = (STEP, EPISODE, EXCHANGE, FRAMES)  # an actor publishes them under the name of each robot
 RECORDED: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.recorded)

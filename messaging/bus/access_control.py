@@ -11,11 +11,10 @@ from typing import Any
 
 from brakeline.messaging.bus.identity import role_of
 from brakeline.messaging.bus.topic_keys import own_key
-from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, HEALTH, ROLES, SIMULATORS, STEP, TOPICS, Delivery
+from brakeline.messaging.topics import BUNDLED, HEALTH, ROLES, SIMULATORS, TOPICS, Delivery
 
 MOST_ROBOTS = 64  # of one process: a request batch holds as many
 SHARED = ("actor", "safety")  # roles of which many processes may share a certificate with the role as its name, in pods
-OF_ROBOTS = (STEP, EPISODE, EXCHANGE, FRAMES)  # published under the name of each robot
 ALIVE = "alive/{source}"  # key of the liveliness token of a process
 EVERYTHING = (
     *("put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"),
@@ -77,9 +76,7 @@ def grants(name: str, prefix: str) -> list[Grant]:
                     granted += [(INGRESS, ("query",), at), (EGRESS, ("reply",), at)]
             granted += [(EGRESS, ("declare_queryable",), at) for at in (everywhere, own_key(everywhere, "*"))]
         elif role in topic.publishers:
-            keys = (
-                _own(topic.key, name, shared=role in SHARED, robots=topic in OF_ROBOTS) if topic.own else [topic.at()]
-            )
+            keys = _own(topic.key, name, shared=role in SHARED, robots=topic in BUNDLED) if topic.own else [topic.at()]
             granted += [(INGRESS, ("put",), f"{prefix}/{key}") for key in keys]
             granted.append((EGRESS, ("declare_subscriber",), everywhere))
         if role in topic.listeners and query:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
-import zenoh
 from google.protobuf.message import Message
 
 from brakeline.messaging import brakeline_pb2 as pb
@@ -16,11 +16,11 @@ from brakeline.messaging.topics import Topic
 class Publisher:
     """A publisher of one topic at one key. It numbers its messages."""
 
-    def __init__(self, topic: Topic, key: str, source: str, run: int, sender: zenoh.Publisher) -> None:
+    def __init__(self, topic: Topic, key: str, source: str, run: int, send: Callable[[bytes], None]) -> None:
         self.topic = topic
         self.key = key
         self.count = 0  # messages put so far; also the sequence number of the last one
-        self._source, self._run, self._sender = source, run, sender
+        self._source, self._run, self._send = source, run, send
         self._stamped = "header" in topic.message.DESCRIPTOR.fields_by_name
         self._lock = threading.Lock()
 
@@ -42,5 +42,5 @@ class Publisher:
                 header.sequence, header.source, header.run = self.count + 1, self._source, self._run
                 header.wall_time = steady_time_ns()
             with as_bus_error(f"cannot publish at {self.key}"):
-                self._sender.put(message.SerializeToString())
+                self._send(message.SerializeToString())
             self.count += 1

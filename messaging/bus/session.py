@@ -11,6 +11,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Self
 
 import zenoh
@@ -18,6 +19,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from brakeline.errors import Malformed
 from brakeline.messaging.bus.access_control import ALIVE
+from brakeline.messaging.bus.bundling import BundlePublisher, Unbundler
 from brakeline.messaging.bus.bus_settings import BusSettings, open_session
 from brakeline.messaging.bus.publisher import Publisher
 from brakeline.messaging.bus.query_client import QueryClient
@@ -27,7 +29,7 @@ from brakeline.messaging.bus.topic_keys import exact_key, key_of, names_of, own_
 from brakeline.messaging.bus.zenoh_sessions import close_sessions
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.messaging.topics import Delivery, Topic
+from brakeline.messaging.topics import BUNDLE, BUNDLED, Delivery, Topic
 
 # A full FIFO queue blocks the link and its publisher; a full RING queue drops the oldest message.
 FIFO = 16384
@@ -54,6 +56,8 @@ class Bus:
         self.rejected = RejectedMessages()
         self._lock = threading.Lock()
         self._publishers: dict[str, Publisher] = {}
+        self._bundles: dict[str, BundlePublisher] = {}  # by robot
+        self._unbundlers: dict[str | None, Unbundler] = {}  # by robot; None: all robots
         self._subscriptions: list[ReceiverThreads] = []
         self._telemetry = open_session(settings, source)
         # A router is one session; the two links of each client end in it separately.
@@ -69,17 +73,19 @@ class Bus:
 
     def close(self, timeout: float = 2.0) -> None:
         """Send waiting messages, leave, and end the handlers; return after `timeout` [s] even if the network hangs."""
-        close_sessions([self._queries, self._telemetry], [one.join for one in self._subscriptions], timeout)
+        sessions = [*self._bundles.values(), self._queries, self._telemetry]
+        close_sessions(sessions, [one.join for one in self._subscriptions], timeout)
 
     @property
     def connected(self) -> bool:
         """Whether there is a link. A client without one waits for its router."""
         return bool(self._telemetry.info.transports())
 
-    def publisher(self, topic: Topic, **names: str) -> Publisher:
+    def publisher(self, topic: Topic, *, bundled: bool = False, **names: str) -> Publisher:
         """Return the publisher of a topic, the same one for the same key.
 
         Args:
+            bundled: whether its messages leave together with others of this process (messaging/bus/bundling.py).
             names: of the key; `source` is this process by default.
 
         Raises:
@@ -89,16 +95,30 @@ class Bus:
             raise ValueError(f"{topic.name} is a query: use `ask`")
         names = {"source": self.source} | names
         key = exact_key(topic, names)
-        block = topic.delivery is Delivery.BLOCK
+        bundle = self._bundle(names["robot"]) if bundled else None
         with self._lock:
             if key not in self._publishers:
-                sender = self._telemetry.declare_publisher(
-                    self._full(key),
-                    encoding=zenoh.Encoding.APPLICATION_PROTOBUF,
-                    congestion_control=zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP,
-                )
-                self._publishers[key] = Publisher(topic, key, names["source"], self.run, sender)
+                send = self._sender(topic, key) if bundle is None else partial(bundle.add, key)
+                self._publishers[key] = Publisher(topic, key, names["source"], self.run, send)
             return self._publishers[key]
+
+    def _sender(self, topic: Topic, key: str) -> Callable[[bytes], None]:
+        block = topic.delivery is Delivery.BLOCK
+        return self._telemetry.declare_publisher(
+            self._full(key),
+            encoding=zenoh.Encoding.APPLICATION_PROTOBUF,
+            congestion_control=zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP,
+        ).put
+
+    def _bundle(self, robot: str) -> BundlePublisher:
+        if robot not in self._bundles:
+            self._bundles[robot] = BundlePublisher(self.publisher(BUNDLE, robot=robot))
+        return self._bundles[robot]
+
+    def flush(self) -> None:
+        """Send the bundled messages that wait. Raises BusError."""
+        for bundle in self._bundles.values():
+            bundle.flush()
 
     def published(self) -> dict[str, int]:
         """Return the number of messages put so far, by key."""
@@ -117,7 +137,18 @@ class Bus:
         receiver: Any = self._telemetry.declare_subscriber(self._full(key), channel)
         listener = Listener(topic, key, receiver, self.settings.prefix, handler, self.rejected)
         self._subscriptions.append(listener)
+        if topic in BUNDLED:
+            self._unbundle(listener, names)
         return listener
+
+    def _unbundle(self, listener: Listener, names: dict[str, str]) -> None:
+        """Let a listener hear the bundled messages of its topic, too. One subscription serves all topics of a robot."""
+        robot = names.get("robot")
+        known = robot in self._unbundlers
+        unbundler = self._unbundlers.setdefault(robot, Unbundler(self.rejected))
+        unbundler.add(listener.topic, names, listener.deliver)
+        if not known:
+            self.subscribe(BUNDLE, unbundler.take, **({} if robot is None else {"robot": robot}))
 
     def serve(self, topic: Topic, handler: Answer, **names: str) -> QueryServer:
         """Answer the queries of a topic, one at a time, of each client in turn, in a thread of its own.

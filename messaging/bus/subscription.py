@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import zenoh
@@ -36,14 +37,18 @@ class Sample:
     received: int  # ns since the Unix epoch
 
     def message(self) -> Any:
-        """Decode the payload as the topic's type.
+        """Return the payload as the topic's type. It is decoded once: do not change it.
 
         Raises:
             Malformed: the payload is invalid, or names another robot or source than the key.
         """
+        return self._decoded
+
+    @cached_property
+    def _decoded(self) -> Any:
         try:
             message = self.topic.message.FromString(self.payload)
-            check(message)
+            check(message, len(self.payload))
             check_names(names_of(self.topic, self.key), message)
         except (DecodeError, Implausible) as error:
             raise Malformed(f"{self.key}: not a {self.topic.message.DESCRIPTOR.name}: {error}") from error
@@ -99,33 +104,43 @@ class Listener(Subscription):
         handler: Callable[[Sample], None],
         rejected: RejectedMessages,
     ) -> None:
-        self._topic, self._cut, self._handler = topic, len(prefix) + 1, handler
+        self.topic, self._cut, self._handler = topic, len(prefix) + 1, handler
+        self._delivering = threading.Lock()  # samples come alone and in bundles, by two threads
         self._keys_of: Counter[str] = Counter()  # by identity
         self._heard: dict[str, float] = {}  # time (time.monotonic) of the latest sample by key
         super().__init__(key, receiver, self._take, rejected)
 
     def stale(self) -> frozenset[str]:
         """Return the keys that had samples, but none in the last three periods of the topic's rate."""
-        limit = math.inf if self._topic.stale_after is None else self._topic.stale_after
+        limit = math.inf if self.topic.stale_after is None else self.topic.stale_after
         now = time.monotonic()
         return frozenset(key for key, moment in self._heard.copy().items() if now - moment > limit)
 
     def _take(self, sample: zenoh.Sample) -> None:
-        key, size = str(sample.key_expr)[self._cut :], len(sample.payload)
-        if size > self._topic.largest:
-            raise Malformed(f"{key[:200]}: {size} bytes; a message has at most {self._topic.largest}")
-        if key not in self._heard:
-            self._admit(key)
-        self._heard[key] = time.monotonic()
-        self._handler(Sample(self._topic, key, sample.payload.to_bytes(), steady_time_ns()))
+        key = str(sample.key_expr)[self._cut :]
+        self._check_size(key, len(sample.payload))
+        self.deliver(key, sample.payload.to_bytes(), steady_time_ns())
+
+    def deliver(self, key: str, payload: bytes, received: int) -> None:
+        """Check a message, and call the handler with it. Raises Malformed."""
+        self._check_size(key, len(payload))
+        with self._delivering:
+            if key not in self._heard:
+                self._admit(key)
+            self._heard[key] = time.monotonic()
+            self._handler(Sample(self.topic, key, payload, received))
+
+    def _check_size(self, key: str, size: int) -> None:
+        if size > self.topic.largest:
+            raise Malformed(f"{key[:200]}: {size} bytes; a message has at most {self.topic.largest}")
 
     def _admit(self, key: str) -> None:
         """Check a new key. Raises Malformed."""
         if not all(NAME.fullmatch(part) for part in key.split("/")):
-            raise Malformed(f"{key[:200]!r} is no key of {self._topic.name}")
+            raise Malformed(f"{key[:200]!r} is no key of {self.topic.name}")
         if len(self._heard) >= MOST_KEYS:
             raise Malformed(f"{key}: there are already {MOST_KEYS} keys")
-        sender = sender_of(self._topic, key)
+        sender = sender_of(self.topic, key)
         if self._keys_of[sender] >= MOST_KEYS_OF_ONE:
             raise Malformed(f"{key[:200]}: {sender} publishes at {MOST_KEYS_OF_ONE} keys already")
         self._keys_of[sender] += 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from brakeline.messaging.bus.identity import identity_of
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.topics import Topic
@@ -42,5 +44,10 @@ def sender_of(topic: Topic, key: str) -> str:
 
 def names_of(topic: Topic, key: str) -> dict[str, str]:
     """Return the names in a key of the topic, by field."""
-    parts = zip(topic.key.split("/"), key.split("/"), strict=False)
-    return {part[1:-1]: name for part, name in parts if part.startswith("{")}
+    return dict(_names_of(topic.key, key))
+
+
+@lru_cache(4096)
+def _names_of(form: str, key: str) -> tuple[tuple[str, str], ...]:
+    parts = zip(form.split("/"), key.split("/"), strict=False)
+    return tuple((part[1:-1], name) for part, name in parts if part.startswith("{"))

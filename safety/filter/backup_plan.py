@@ -191,7 +191,7 @@ def correction_penalty(
     The proposal is first clipped to the bounds and to the slew around the input `before`. NaN and infinity count as
     zero input.
     """
-    low, high, slew = robot.low(), robot.high(), np.asarray(robot.action_slew)
+    low, high, slew = robot.low(), robot.high(), robot.slew
     before = np.asarray(before, float)
     wanted = np.nan_to_num(np.asarray(proposed, float), posinf=0.0, neginf=0.0)
     clipped = np.clip(wanted, np.maximum(low, before - slew), np.minimum(high, before + slew))

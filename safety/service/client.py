@@ -23,12 +23,12 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
-from brakeline.messaging.robot import FEEDBACK, Robot, robot_named
+from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
-from brakeline.safety.service.wire import decision_of, digest, reservation_message, reservation_of
+from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
 
 Array = NDArray[np.float64]
 
@@ -98,11 +98,12 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     if reply.robot != robot.name:
         raise _bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
     decision = reply.decision
-    plan = np.array(decision.plan)
+    plan = array_of(decision.plan)
     if plan.size != robot.horizon * robot.action_dim:
         raise _bad_reply("plan", f"a plan of {plan.size} numbers")
     plan = plan.reshape(robot.horizon, robot.action_dim)
-    if not ((plan >= robot.low() - 1e-9) & (plan <= robot.high() + 1e-9)).all():  # NaN fails too
+    low, high = robot.bounds
+    if not ((plan >= low) & (plan <= high)).all():  # NaN fails too
         raise _bad_reply("plan", "an input out of bounds")
     if not robot.is_stop_input(plan[-1]):
         raise _bad_reply("plan", "a plan that does not end in a stop")
@@ -132,15 +133,16 @@ def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:
     A late robot's plan begins with the input that is in force until the decision arrives. Inputs that feedback computes
     from a future state are not compared.
     """
-    m, slew = robot.action_dim, np.asarray(robot.action_slew) + SAME_INPUT
-    before = np.array(request.plan[:m] if robot.late else request.input_in_force)
-    if before.shape != (m,):
+    m = robot.action_dim
+    before = request.plan[:m] if robot.late else request.input_in_force[:]
+    if len(before) != m:
         return False
-    if robot.late and (np.abs(plan[0] - before) > SAME_INPUT).any():
+    steps = np.abs(plan - np.concatenate(([before], plan[:-1])))
+    if robot.late and (steps[0] > SAME_INPUT).any():
         return False
-    planned = [rule != FEEDBACK for rule in robot.stop]
-    steps = np.abs(np.diff(plan, axis=0))[:, planned]
-    return bool((np.abs(plan[0] - before) <= slew).all() and (steps <= slew[planned]).all())
+    if robot.feedback:
+        steps[1:, robot.stops_by_feedback] = 0.0
+    return bool((steps <= robot.slew + SAME_INPUT).all())
 
 
 def _bad_reply(field: str, message: str) -> SafetyError:

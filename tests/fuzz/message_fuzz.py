@@ -45,10 +45,11 @@ from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import encode
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
+from brakeline.messaging.bus.bundling import Unbundler
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.messaging.topics import DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
+from brakeline.messaging.topics import BUNDLE, DECIDE, FLOW, JOIN, MODEL, RECORDED, TOPICS, WEIGHTS, Topic
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.methods import decode
 from brakeline.safety.service.client import read_reply, request_message
@@ -67,13 +68,15 @@ class Wire:
 
     def __init__(self) -> None:
         self.rejected = RejectedMessages()
-        self.handlers: dict[str, Callable[[Sample], None]] = {}
+        self._unbundler = Unbundler(self.rejected)
+        self.handlers: dict[str, Callable[[Sample], None]] = {BUNDLE.name: self._unbundler.take}
 
     def publisher(self, topic: Topic, **names: str) -> Any:
         return SimpleNamespace(put=lambda message: message.SerializeToString(), count=0)
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> None:
         self.handlers[topic.name] = handler
+        self._unbundler.add(topic, {}, lambda key, payload, received: handler(Sample(topic, key, payload, received)))
 
     def serve(self, topic: Topic, handler: Callable[[bytes], bytes], **names: str) -> None: ...
 
