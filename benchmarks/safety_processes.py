@@ -19,6 +19,7 @@ from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE
+from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 
@@ -30,7 +31,7 @@ Begin = Callable[[Any, BusSettings, str], int]
 def serve(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
     """Run a safety service of the ground robot until `stop` is set."""
     models = ModelRegistry()
-    models.install(situations.model())
+    models.install(situations.model(mode=AUTO))
     authenticator = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
     with Bus(settings, name) as bus:
         bus.serve(DECIDE, BatchHandler(models, ServiceCounts(), authenticator))

@@ -1,4 +1,8 @@
-"""A queue that serves clients in turn: many queries of one client delay another client's query by at most one."""
+"""A queue that serves clients in turn: many queries of one client delay another client's query by at most one.
+
+The newest query of a client comes first. When more is asked than can be answered, a query that has waited for long gets
+its answer too late anyway, and in the order of arrival all of them would.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +35,14 @@ class FairQueue(Generic[T]):
         return waiting.popleft() if len(waiting) > MAX_PER_CLIENT else None
 
     def next(self) -> T:
-        """Remove and return the next query.
+        """Remove and return the newest query of the next client.
 
         Raises:
             StopIteration: the queue is empty.
         """
         client = next(iter(self._waiting))
         waiting = self._waiting.pop(client)
-        query = waiting.popleft()
+        query = waiting.pop()
         if waiting:
             self._waiting[client] = waiting  # behind the other clients
         return query

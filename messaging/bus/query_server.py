@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -20,6 +20,7 @@ from brakeline.messaging.bus.subscription import ReceiverThreads
 from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
 
+MOST_AT_ONCE = 256  # queries that a thread takes over from Zenoh before it looks after the queue
 LONGEST = 10.0  # longest time that a query waits; the default for one without a deadline [s]
 
 
@@ -74,10 +75,10 @@ class QueryServer(ReceiverThreads):
         while True:
             try:
                 with receiving:
-                    query = queries.recv()
+                    arrived = [queries.recv(), *_waiting(queries)]
             except zenoh.ZError:  # closed
                 return
-            answering = self._admit(query)
+            answering = True in [self._admit(query) for query in arrived]
             while answering and (pending := self._next()) is not None:
                 with self._rejected.skip_on_error(self._name):
                     self._answer(pending)
@@ -119,6 +120,17 @@ class QueryServer(ReceiverThreads):
         """Refuse a query that the machine is too slow for; the log has a warning, not an error."""
         _refuse(query, reason)
         self._rejected.reject(self._name, reason, logging.WARNING)
+
+
+def _waiting(queries: Any) -> Iterator[zenoh.Query]:
+    """Yield the queries that have arrived, at most `MOST_AT_ONCE`.
+
+    A thread that receives one at a time waits for the interpreter's lock before each: the one that answers holds it.
+    """
+    for _ in range(MOST_AT_ONCE):
+        if (query := queries.try_recv()) is None:
+            return
+        yield query
 
 
 def _refuse(query: zenoh.Query, error: Exception) -> None:

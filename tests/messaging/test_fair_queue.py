@@ -4,15 +4,19 @@ import contextlib
 import logging
 import threading
 import time
+from collections import deque
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 
 from brakeline.errors import BusError
 from brakeline.messaging.bus import fair_queue as module
 from brakeline.messaging.bus import query_server
 from brakeline.messaging.bus.fair_queue import MAX_PER_CLIENT, FairQueue, T
 from brakeline.messaging.bus.query_client import PATIENT
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import DECIDE
 from tests.messaging.test_bus import Join
 from tests.waiting import PATIENCE, until
@@ -23,9 +27,9 @@ def test_each_askers_questions_are_answered_in_turn() -> None:
     for question in ("a1", "a2", "a3", "b1", "c1", "c2"):
         assert turns.add(question[0], question) is None
     assert len(turns) == 6
-    assert [turns.next() for _ in range(4)] == ["a1", "b1", "c1", "a2"]
+    assert [turns.next() for _ in range(4)] == ["a3", "b1", "c2", "a2"], "the newest first: it can still be in time"
     turns.add("b", "b2")
-    assert [turns.next() for _ in range(3)] == ["c2", "a3", "b2"]
+    assert [turns.next() for _ in range(3)] == ["c1", "a1", "b2"]
     assert not len(turns)
 
 
@@ -104,3 +108,36 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
     assert router.rejected.count == 1
     records = [record for record in caplog.records if "Expired" in record.getMessage()]
     assert [(record.levelno, record.exc_info) for record in records] == [(logging.WARNING, None)]
+
+
+class _Query:
+    """A query of Zenoh that notes its answer."""
+
+    key_expr, attachment = "safety/ground/decide/actor-0", None
+
+    def __init__(self, number: int, answered: list[bytes]) -> None:
+        self.payload = SimpleNamespace(to_bytes=lambda: b"%d" % number)
+        self.reply = lambda key, answer, express: answered.append(answer)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def test_what_has_arrived_is_taken_over_at_once_and_the_newest_is_answered_first() -> None:
+    """A thread that takes one query at a time waits for the interpreter's lock before each, and all come too late."""
+    answered: list[bytes] = []
+    arrived = deque(_Query(number, answered) for number in range(5))
+
+    def recv():
+        if not arrived:
+            raise zenoh.ZError("closed")
+        return arrived.popleft()
+
+    handler = SimpleNamespace(recv=recv, try_recv=lambda: arrived.popleft() if arrived else None)
+    receiver = SimpleNamespace(handler=handler)
+    query_server.QueryServer("q", [receiver], lambda payload, _: payload, lambda _: "a", RejectedMessages())
+    until(lambda: len(answered) == 5)
+    assert answered == [b"4", b"3", b"2", b"1", b"0"]
