@@ -18,12 +18,13 @@ from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.topics import DECIDE
+from brakeline.messaging.topics import DECIDE, JOIN
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.service.plan_token import PlanAuthenticator, write_key
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 
 START_TIMEOUT = 60.0  # s
+GROUND = "ground"
 
 Begin = Callable[[Any, BusSettings, str], int]
 
@@ -35,6 +36,8 @@ def serve(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
     authenticator = None if settings.keys is None else PlanAuthenticator.of(settings.keys)
     with Bus(settings, name) as bus:
         bus.serve(DECIDE, BatchHandler(models, ServiceCounts(), authenticator))
+        if settings.keys is None:  # a query of the bus alone
+            bus.serve(JOIN, lambda payload, asker: payload, robot=GROUND)
         ready.set()
         stop.wait()
 

@@ -1,6 +1,9 @@
-"""Measure what a step of a whole run costs, in processor time, by process; `--against` pairs it with another checkout.
+"""Measure what a step of a whole run costs in processor time: by process in real runs, and by stage in one thread.
 
-python -m benchmarks step --against ../main     # the same runs of both checkouts in turn, and their ratios
+    python -m benchmarks step                       # processes and stages of this checkout
+    python -m benchmarks step --against ../main     # the same runs of both checkouts in turn, and their ratios
+
+The runs train with two actors and a log. The learner makes few updates, so that it does not set the pace.
 """
 
 from __future__ import annotations
@@ -17,10 +20,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from benchmarks.step_stages import stages
 from benchmarks.timing import Figures
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run.processes import ENDPOINT, client_settings
 from brakeline.messaging.bus import Bus, Sample
+from brakeline.messaging.task import robot_with_task
 from brakeline.messaging.topics import HEALTH
 
 HERE = Path(__file__).parents[1]
@@ -111,20 +116,23 @@ def watched(tree: Path, robot: str) -> dict[str, float]:
 
 
 def run(against: Path | None = None) -> Figures:
-    """Return a row for each robot; with another checkout, also its row, and the ratios of `PAIRS` pairs of runs."""
+    """Return a row for the processes and one for the stages of each robot [µs a step].
+
+    Args:
+        against: another checkout. It adds its row of processes, and the ratios of `PAIRS` pairs of runs.
+    """
     figures: Figures = {}
+    trees = {"": HERE} | ({} if against is None else {", against": against.resolve()})
     for robot in ROBOTS:
-        trees = {"": HERE} | ({} if against is None else {", against": against.resolve()})
         rows: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
         for pair in range(1 if against is None else PAIRS):
             for name in list(trees)[:: 1 if pair % 2 else -1]:
                 rows[name].append(watched(trees[name], robot))
         for name, some in rows.items():
-            figures[f"{robot}{name}, µs a step"] = {
-                key: float(np.median([row[key] for row in some])) for key in some[0]
-            }
+            figures[f"{robot}{name}: processes"] = {k: float(np.median([row[k] for row in some])) for k in some[0]}
         if against is not None:
             ratios = {key: [a[key] / b[key] for a, b in zip(*rows.values(), strict=True)] for key in rows[""][0]}
             for what, of in (("median", np.median), ("least", np.min), ("largest", np.max)):
                 figures[f"{robot}: ratio, {what}"] = {key: float(of(some)) for key, some in ratios.items()}
+        figures[f"{robot}: stages"] = stages(robot_with_task(robot))
     return figures
