@@ -1,0 +1,102 @@
+"""Draw how the cost of a decision grows: with obstacles, with the size of a batch, and with the robots of a question.
+
+    python -m benchmarks growth
+
+All figures are processor times of one thread, with the model sets in use and requests of the trained policy. The plot
+is `docs/figures/growth.png`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from benchmarks import situations
+from benchmarks.batch_decide import SIZES, beside, crowded, seconds
+from benchmarks.timing import Figures
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import robot_with_task
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.model_config import AUTO
+from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
+from brakeline.safety.service.wire import MAX_REQUESTS
+
+PLOT = Path(__file__).parents[1] / "docs" / "figures" / "growth.png"
+ROBOTS = ("ground", "quadrotor")
+TOGETHER = (1, 2, 4, 8, 16, 32, MAX_REQUESTS)  # robots of a question
+SINGLE, BATCH = "one by one", "as a batch"
+
+
+def run() -> Figures:
+    """Return the processor time of a decision [µs] for each robot and way, by the number of what grows."""
+    figures: Figures = {}
+    for name in ROBOTS:
+        robot = robot_with_task(name)
+        ready = Filter(situations.model(mode=AUTO, robot=robot))
+        driven = islice(situations.driven("trained", 5, robot, mode=AUTO), SIZES[-1])
+        messages = [outcome.request for _, outcome, _ in driven]
+        requests = list(situations.requests(ready, messages))
+        figures |= _rows(name, "obstacles", crowded(ready, requests))
+        figures |= _rows(name, "requests", [(size, beside(ready, requests[:size])) for size in SIZES])
+        figures[f"{name}, robots of a question, the service"] = _together(ready, messages)
+    _draw(figures)
+    return figures
+
+
+def _rows(name: str, what: str, rows: Sequence[tuple[int, dict[str, float]]]) -> Figures:
+    ways = {SINGLE: "loop 1/s", BATCH: "batch 1/s"}
+    return {f"{name}, {what}, {way}": {str(n): 1e6 / row[key] for n, row in rows} for way, key in ways.items()}
+
+
+def _together(ready: Filter, messages: list[pb.Request]) -> dict[str, float]:
+    """Return the time of a service for each robot of a question, from bytes to bytes [µs]."""
+    models = ModelRegistry()
+    models.install(situations.model(mode=AUTO, robot=robot_with_task(ready.robot.name)))
+    handler = BatchHandler(models, ServiceCounts())
+    row = {}
+    for number in TOGETHER:
+        some = [messages[i : i + number] for i in range(0, 4 * MAX_REQUESTS, number)]
+        payloads = [pb.RequestBatch(requests=one).SerializeToString() for one in some]
+
+        def work(payloads: list[bytes] = payloads) -> None:
+            for payload in payloads:
+                handler(payload)
+
+        work()
+        row[str(number)] = 1e6 * min(seconds(work, 1) for _ in range(5)) / (4 * MAX_REQUESTS)
+    return row
+
+
+def _draw(figures: Figures) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    panels = {
+        "obstacles": "obstacles of a request",
+        "requests": "requests at once",
+        "robots of a question": "robots of a question",
+    }
+    figure, axes = plt.subplots(1, len(panels), figsize=(12.0, 3.6), constrained_layout=True)
+    for (what, label), axis in zip(panels.items(), axes, strict=True):
+        for title, row in figures.items():
+            robot, about, way = title.split(", ")
+            if about == what:
+                _line(axis, robot, way, row)
+        axis.set(xscale="log", yscale="log", xlabel=label)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    axes[0].set_ylabel("processor time of a decision [µs]")
+    figure.savefig(PLOT, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _line(axis: Any, robot: str, way: str, row: dict[str, float]) -> None:
+    color = {"ground": "tab:blue", "quadrotor": "tab:orange"}[robot]
+    style = "--" if way == BATCH else "-"
+    axis.plot(
+        [int(n) for n in row], list(row.values()), style, marker="o", markersize=3, color=color, label=f"{robot}, {way}"
+    )
