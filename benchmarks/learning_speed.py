@@ -66,7 +66,7 @@ class Stacked(Plain):
 
     def __init__(self, config: TD3Config, observations: int, actions: int) -> None:
         super().__init__(config, observations, actions)
-        shapes = [layer.weight.shape for layer in self.critics[0] if isinstance(layer, nn.Linear)]
+        shapes = [layer.weight.shape for layer in self.critics[0].children() if isinstance(layer, nn.Linear)]
         layers = [(shape, shape[1] ** -0.5) for shape in shapes]
         self.weights = [nn.Parameter(torch.empty(2, i, o).uniform_(-most, most)) for (o, i), most in layers]
         self.biases = [nn.Parameter(torch.zeros(2, 1, o)) for (o, _), _ in layers]
@@ -114,6 +114,8 @@ def products(config: TD3Config, inputs: int) -> Callable[[], None]:
     x, wide, narrow = torch.rand(size, width), torch.rand(width, width), torch.rand(inputs, width)
     out, gradient, first = torch.zeros(size, width), torch.zeros(width, width), torch.zeros(inputs, width)
 
+    turn = False
+
     def work() -> None:
         nonlocal turn
         turn = not turn
@@ -128,7 +130,6 @@ def products(config: TD3Config, inputs: int) -> Callable[[], None]:
         for _ in range(2 + 2 * turn):
             torch.mm(x, wide, out=out)
 
-    turn = False
     return work
 
 

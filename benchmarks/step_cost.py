@@ -65,7 +65,7 @@ class Run:
 
     def taken(self, at: float) -> float:
         """Return the number of steps of all actors until a time."""
-        return sum(float(np.interp(at, *zip(*series, strict=True))) for series in self.steps.values())
+        return sum(_at(at, series) for series in self.steps.values())
 
     def figures(self) -> dict[str, float]:
         """Return the processor time of a step by role [µs], in all, and the steps a second, after the warm-up."""
@@ -74,11 +74,15 @@ class Run:
         steps = self.taken(end) - self.taken(begin)
         costs: dict[str, float] = {}
         for name, series in self.used.items():
-            times, seconds = zip(*series, strict=True)
             role = "launcher, router" if name == "launcher" else name.partition("-")[0]
-            spent = float(np.interp(end, times, seconds)) - float(np.interp(begin, times, seconds))
-            costs[role] = costs.get(role, 0.0) + 1e6 * spent / steps
+            costs[role] = costs.get(role, 0.0) + 1e6 * (_at(end, series) - _at(begin, series)) / steps
         return {**costs, "all": sum(costs.values()), "steps/s": steps / (end - begin)}
+
+
+def _at(time: float, series: list[tuple[float, float]]) -> float:
+    """Return the value of a series of times and values at a time."""
+    times, values = np.array(series).T
+    return float(np.interp(time, times, values))
 
 
 @contextmanager
