@@ -117,7 +117,7 @@ class Bus:
 
     def flush(self) -> None:
         """Send the bundled messages that wait. Raises BusError."""
-        for bundle in self._bundles.values():
+        for bundle in list(self._bundles.values()):
             bundle.flush()
 
     def published(self) -> dict[str, int]:
