@@ -107,6 +107,7 @@ class Learner:
             raise
         if self._enough():
             self.surplus += 1
+            self._ledger.refuse(step.actor, step.index)
             return False
         if not self._ledger.record(step.actor, step.episode, step.step, step.index):
             return False

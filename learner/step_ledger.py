@@ -71,6 +71,10 @@ class StepLedger:
             place.last_index = index
         return True
 
+    def refuse(self, actor: str, index: int) -> None:
+        """Note a step that arrived after the last one of the run, so that it does not count as lost."""
+        self.places[actor].last_index = max(self.places[actor].last_index, index)
+
     def join(self, actor: str, index: int, episode: int) -> int:
         """Register an actor that has published `index` steps. Return the episode with which it continues.
 

@@ -161,6 +161,8 @@ def test_a_silent_actor_holds_up_nobody_and_the_run_ends_at_its_last_step():
     assert learner.steps == 300
     assert learner.weights_due()  # the last updates, however few
     assert not learner.insert(step(301)) and learner.surplus == 1
+    learner.join(joining(index=301, episode=1))  # an actor joins again while the last updates are made
+    assert learner.metrics().missing == 0, "a step after the last one is refused, not lost"
     assert learner.metrics().done
 
 
