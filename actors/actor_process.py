@@ -140,7 +140,8 @@ class ActorRunner:
         robot = robot_with_task(settings.robot)
         actor = settings.name if settings.robots == 1 else f"{settings.name}.{offset}"
         identity = ActorIdentity(actor, settings.number + offset, settings.seed)
-        publisher: Callable[..., Publisher] = partial(process.bus.publisher, bundled=True)
+        # A vehicle in real time publishes little, and the last period before a crash must not wait.
+        publisher: Callable[..., Publisher] = partial(process.bus.publisher, bundled=not continuous)
         self.frames = FrameRecorder(publisher(FRAMES, robot=robot.name, source=actor), robot.name, actor)
         tap = self.frames.record if settings.mavlink else None
         env = env or make(robot, settings.arena, settings.seed, tap=tap)

@@ -20,7 +20,7 @@ from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.topics import BUNDLE, BUNDLED, Topic
 
-HOLD = 0.05  # longest time for which a message waits [s]
+HOLD = 0.2  # longest time for which a message waits [s]
 MOST_BUNDLED = 16  # messages of a bundle: half of what a learner permits an actor in advance, with the decisions
 LARGE = 2**18  # bytes from which a bundle leaves at once
 
