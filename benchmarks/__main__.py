@@ -75,7 +75,7 @@ class Bench:
     minutes: float = 10.0
     """Fly each policy of flights for this long in each arena [min]."""
     against: Path | None = None
-    """Run step with the code of this checkout, too, in turn with this one's."""
+    """Run step with the code of this checkout, too, at the same time."""
     folder: Path = Path("runs/flights")
     """Store the data, logs and figures of flights, upsets, cuts and campaign here. What the folder has is not
     repeated."""

@@ -1,9 +1,10 @@
 """Measure what a step of a whole run costs in processor time: by process in real runs, and by stage in one thread.
 
     python -m benchmarks step                       # processes and stages of this checkout
-    python -m benchmarks step --against ../main     # the same runs of both checkouts in turn, and their ratios
+    python -m benchmarks step --against ../main     # the same runs of both checkouts at once, and their ratios
 
-The runs train with two actors and a log. The learner makes few updates, so that it does not set the pace.
+Both run at once, so that other load on the machine slows both alike; the steps a second then say little. The runs train
+with two actors and a log. The learner makes few updates, so that it does not set the pace.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -129,9 +132,10 @@ def run(against: Path | None = None) -> Figures:
     trees = {"": HERE} | ({} if against is None else {", against": against.resolve()})
     for robot in ROBOTS:
         rows: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
-        for pair in range(1 if against is None else PAIRS):
-            for name in list(trees)[:: 1 if pair % 2 else -1]:
-                rows[name].append(watched(trees[name], robot))
+        for _ in range(1 if against is None else PAIRS):
+            with ThreadPoolExecutor(len(trees)) as pool:
+                for name, row in zip(trees, pool.map(partial(watched, robot=robot), trees.values()), strict=True):
+                    rows[name].append(row)
         for name, some in rows.items():
             figures[f"{robot}{name}: processes"] = {k: float(np.median([row[k] for row in some])) for k in some[0]}
         if against is not None:
