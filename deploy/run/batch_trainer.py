@@ -91,7 +91,10 @@ class BatchTrainer:
         self._env.close()
 
     def period(self) -> None:
-        """Run one period of all robots, and make the updates that are due."""
+        """Run one period of all robots, and make the updates that are due. After the last step, only the updates."""
+        if self.learner.steps >= self.learner.config.steps:
+            self.learner.work(ALL_DUE)
+            return
         proposals = self._propose()
         self.learner.flow()  # permits the steps of this period
         seen, steps, index, episodes = self._now, self._steps.copy(), self._index + 1, self._now_in()

@@ -180,6 +180,6 @@ def test_a_whole_run_is_logged_and_analysed_as_others(data_folder: Path, tmp_pat
     with Run(tmp_path / "run", "--steps", 1500, command=command) as run:
         figures = run.end()
         assert run.popen.returncode == 0, run.errors.read_text()
-    assert figures["finished"] and figures["steps"] == 1536 and figures["collisions"] == 0
+    assert figures["finished"] and 1500 <= figures["steps"] <= 1536 and figures["collisions"] == 0
     assert figures["log_messages"]["missing"] == 0 and figures["learners"]["ground"]["steps"] == 1500
     assert (run.folder / "learner" / "policy.safetensors").is_file()
