@@ -121,9 +121,9 @@ class Bus:
             bundle.flush()
 
     def published(self) -> dict[str, int]:
-        """Return the number of messages put so far, by key."""
+        """Return the number of messages put so far, by key. Those in bundles count; bundles do not."""
         with self._lock:
-            return {key: publisher.count for key, publisher in self._publishers.items()}
+            return {key: one.count for key, one in self._publishers.items() if one.topic is not BUNDLE}
 
     def subscribe(self, topic: Topic, handler: Callable[[Sample], None], **names: str) -> Listener:
         """Call a handler with every sample of a topic, in a thread of its own. A missing name matches any.

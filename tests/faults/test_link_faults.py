@@ -115,4 +115,4 @@ def test_one_flight_gives_the_only_model_set_if_its_bound_is_small(
     assert rows["certified by it"] == {"bound_plan": 0.02} and "second flight" not in rows
     assert all(" ".join(words).count("--accept-bound 0.03") == 1 for words in said)
     (certify,) = (words for words in said if words[0] == "certify")
-    assert certify[1].endswith("flown.safetensors") and certify[certify.index("--outside") + 1] == "0.02"
+    assert certify[1].endswith("flown.safetensors") and certify[certify.index("--outside") + 1] == "0.015"

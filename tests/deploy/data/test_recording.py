@@ -99,11 +99,11 @@ def elsewhere(tmp_path, monkeypatch):
     """An empty store, with small recordings only."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     recordings = []
-    original = simulated_recording.collect.record
+    original = collect.record
     monkeypatch.setattr(
         simulated_recording, "load_or_record", partial(simulated_recording.load_or_record, trajectories=8)
     )
-    monkeypatch.setattr(simulated_recording.collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
+    monkeypatch.setattr(collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
 
 
@@ -212,14 +212,14 @@ def test_the_last_steps_of_a_log(tmp_path):
 
 
 def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys):
-    drive = simulated_recording.collect.record
+    drive = collect.record
 
     def interrupted(*given):
         yield from itertools.islice(drive(*given), 2)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulated_recording.collect, "record", interrupted)
+        patch.setattr(collect, "record", interrupted)
         with pytest.raises(KeyboardInterrupt):
             simulated_recording.load_or_record(GROUND, trajectories=4)
     assert not data_paths.record_path(GROUND).exists()
