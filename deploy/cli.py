@@ -34,13 +34,15 @@ class CommandEntry(NamedTuple):
 
 GROUPS: dict[str, dict[str, CommandEntry]] = {
     "See it and train": {
-        "demo": CommandEntry("Train the ground robot for some minutes and watch it.", "brakeline demo"),
+        "demo": CommandEntry(
+            "Drive a policy without and with the filter, then train one for some minutes.", "brakeline demo"
+        ),
         "train": CommandEntry(
             "Run all processes of a training on this machine: actors, safety service, learner, recorder.",
             "brakeline train ground --steps 90000 --actors 2 --seed 0",
         ),
         "evaluate": CommandEntry(
-            "Evaluate a policy behind the filter, in this process, on fresh episodes.",
+            "Evaluate a policy behind the filter on fresh episodes.",
             "brakeline evaluate ground --policy astar --episodes 100 --json",
         ),
         "compare": CommandEntry(

@@ -1,4 +1,4 @@
-"""Implement `brakeline evaluate`: evaluate a policy behind the filter, in this process."""
+"""Implement `brakeline evaluate`: evaluate a policy behind the filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`brakeline evaluate`: run a policy through the filter, in process, on fresh episodes."""
+"""`brakeline evaluate`: drive fresh episodes with a policy behind the filter, without a bus."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ ENDS_IN = 3.0  # s
 
 
 class LivePage:
-    """The live page of the run in a folder, from the time at which this process launches it to the end of the block.
+    """The live page of a run that this process launches. It is served until the block ends.
 
     Attributes:
         notice: what to tell the user: the address of the page, or that there is none. Empty until it is known.
