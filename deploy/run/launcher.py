@@ -255,10 +255,11 @@ class Launcher:
             write_key(self.folder / KEYS)  # so that each service accepts the plans that another one verified
         else:
             sign_models(self.config, self.folder, self.bus.keys)
-        latest = self.folder.parent / "latest"
+        folder = self.folder.resolve()  # it may be given as runs/latest, which must not point to itself
+        latest = folder.parent / "latest"
         if latest.is_symlink() or not latest.exists():
             latest.unlink(missing_ok=True)
-            latest.symlink_to(self.folder.name)
+            latest.symlink_to(folder.name)
 
     def _start_recorder(self, process: Process, show: Callable[[], Any]) -> None:
         """Start the recorder and wait until it listens, so that the log misses no message, not even the launcher's."""

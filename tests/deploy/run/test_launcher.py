@@ -149,6 +149,13 @@ def test_only_a_run_in_which_nothing_has_begun_may_end_at_once(launcher: Launche
     assert launcher._begun()
 
 
+def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) -> None:
+    (tmp_path / "first").mkdir()
+    (tmp_path / "latest").symlink_to("first")
+    Launcher(RunConfig(), tmp_path / "latest", BusSettings(listen=("tcp/127.0.0.1:7447",)))._claim_folder()
+    assert (tmp_path / "latest").readlink() == Path("first")
+
+
 def printed(show: Callable[[Console, object], None], figures: object) -> str:
     console = Console(file=io.StringIO(), width=200)
     show(console, figures)
