@@ -84,9 +84,12 @@ class Bench:
         return process
 
     def said(self, name: str) -> dict[str, Any]:
-        """Return the last JSON object that a process printed; empty before the first one."""
-        lines = (self.folder / f"{name}.out").read_text().splitlines()
-        return json.loads(lines[-1]) if lines else {}
+        """Return the last JSON object that a process printed; empty before the first one.
+
+        A line without its end is still being written, and is left for the next look.
+        """
+        whole, _, _ = (self.folder / f"{name}.out").read_text().rpartition("\n")
+        return json.loads(whole.splitlines()[-1]) if whole else {}
 
     def errors(self, name: str) -> str:
         return (self.folder / f"{name}.err").read_text()[-3000:]
