@@ -83,7 +83,7 @@ class StopPractice:
     """Stops that a robot makes from time to time by following its committed plan to the end.
 
     Such a stop is safe, since the plan was verified. It is the only way to go on recording real stops, which
-    `brakeline certify LOG` needs.
+    `brakeline certify ROBOT --data LOG` needs.
     """
 
     def __init__(self, probability: float) -> None:

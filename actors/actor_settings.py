@@ -12,12 +12,18 @@ class PhysicsChange:
     A value of None changes nothing. A robot kind raises an error for a value that it does not have.
     """
 
-    after: int = -1  # steps until the change; -1: never
+    after: int = -1
+    """Change the physics after this many steps of each robot. -1 never changes them."""
     payload_kg: float | None = None
+    """Put this mass on top of the robot [kg]."""
     floor_friction: float | None = None
-    weak_motor: float | None = None  # share of its force that one motor still has, in (0, 1]
-    wind_speed: float | None = None  # m/s
-    gust: float | None = None  # m/s
+    """Set the friction coefficient of the wheels on the floor."""
+    weak_motor: float | None = None
+    """Leave one motor this share of its force, in (0, 1]."""
+    wind_speed: float | None = None
+    """Blow with this mean wind speed [m/s]."""
+    gust: float | None = None
+    """Let the wind vary on each axis with this standard deviation [m/s]."""
 
     def changes(self) -> dict[str, float]:
         """Return the arguments for a vehicle's `alter`."""

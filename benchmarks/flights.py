@@ -197,7 +197,7 @@ class Flights:
         return figures
 
     def _certify(self, source: Path, data: Path, *words: str) -> str:
-        command = ["certify", str(source), "--robot", "quadrotor-late", *words, "--use", *self._setup.accepting]
+        command = ["certify", "quadrotor-late", "--data", str(source), *words, "--use", *self._setup.accepting]
         return printed_figures([*command, "--json"], data, BEYOND)
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import errno
 import importlib
 import os
 import sys
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import fields, make_dataclass
 from importlib.metadata import version
@@ -22,6 +23,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from brakeline.deploy import progress
+from brakeline.deploy.option_parsing import registry
 from brakeline.extras import missing_extra
 
 
@@ -71,7 +74,7 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
         ),
         "certify": CommandEntry(
             "Validate model sets on held-out data, and put them to use or publish them.",
-            "brakeline certify --robot ground",
+            "brakeline certify ground",
         ),
     },
     "Ask the filter, fly and drive": {
@@ -136,6 +139,12 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "Run a recorder alone.", "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"
         ),
     },
+    "The command line": {
+        "completion": CommandEntry(
+            "Print what a shell evaluates to complete commands and options with the Tab key.",
+            "brakeline completion bash",
+        ),
+    },
 }
 COMMANDS: dict[str, CommandEntry] = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 
@@ -178,7 +187,9 @@ def parse(name: str, arguments: list[str]) -> Any:
     if hasattr(command, "expert") and words == arguments and {"-h", "--help"} & set(words):
         command, description = abridged(command), f"{description}\n\nAll options: brakeline {name} --help-all"
     defaults = {"default": command.defaults(words)} if hasattr(command, "defaults") else {}
-    return tyro.cli(command, **defaults, prog=f"brakeline {name}", description=description, args=words)
+    return tyro.cli(
+        command, **defaults, prog=f"brakeline {name}", description=description, args=words, registry=registry
+    )
 
 
 def reason(error: Exception) -> str:
@@ -213,7 +224,9 @@ def main(arguments: list[str] | None = None) -> int:
         errors.print(f"brakeline: no command is called {name!r}{hint} (`brakeline --help` lists them)", markup=False)
         return 2
     try:
-        return int(parse(name, words[1:]).run())
+        command = parse(name, words[1:])
+        with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
+            return int(command.run())
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the reader of the output, such as `head`, has closed it

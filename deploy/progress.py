@@ -46,6 +46,16 @@ class WorkProgress:
 
 
 @contextmanager
+def silenced() -> Iterator[None]:
+    """Show no progress within the block."""
+    console.quiet = True
+    try:
+        yield
+    finally:
+        console.quiet = False
+
+
+@contextmanager
 def under_way(what: str, total: int | None = None) -> Iterator[Advance]:
     """Show `what` until the block ends. total: number of items; None if it is unknown."""
     with _bar(what, total) if console.is_terminal else _lines(what, total) as advance:

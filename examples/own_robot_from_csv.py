@@ -23,7 +23,7 @@ def main() -> None:
         log = small_log.write_csv(folder / "drive.csv")
 
         brakeline(["import", str(log), "--robot", str(robot)])
-        certify = ["certify", "--robot", str(robot), "--certificates", "residual", "--mode", "direct", "--use"]
+        certify = ["certify", str(robot), "--certificates", "residual", "--mode", "direct", "--use"]
         brakeline([*certify, "--accept-bound", "0.05"])  # from 12 minutes of data, the bound exceeds the limit of 1 %
 
         filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-direct.safetensors"))

@@ -15,22 +15,40 @@ class TD3Config:
     """Settings of TD3."""
 
     hidden: tuple[int, ...] = (256, 256)
+    """Give the hidden layers of actor and critics these widths."""
     actor_rate: float = 3e-4
+    """Train the actor at this learning rate."""
     critic_rate: float = 3e-4
+    """Train the critics at this learning rate."""
     batch: int = 128
+    """Draw this many steps for each update."""
     gamma: float = 0.99
+    """Discount rewards by this factor a period."""
     n_step: int = 3
+    """Sum the rewards of this many periods before the critic estimates the rest."""
     tau: float = 0.005
+    """Move the target networks by this share at each update."""
     policy_delay: int = 2
-    target_noise: float = 0.2  # σ, of the half range of an action
-    target_noise_clip: float = 0.5  # η
-    exploration_noise: float = 0.1  # of the half range; the actors get it with the weights
-    reward_scale: float = 0.1  # keeps |Q| near 10 for rewards of ±100
+    """Update the actor once in this many updates of the critics."""
+    target_noise: float = 0.2
+    """Smooth the target with noise of this standard deviation, as a share of half an input's range."""
+    target_noise_clip: float = 0.5
+    """Clip the noise of the target at this share of half an input's range."""
+    exploration_noise: float = 0.1
+    """Explore with noise of this standard deviation, as a share of half an input's range. The actors get it
+    with the weights."""
+    reward_scale: float = 0.1
+    """Scale rewards by this factor. 0.1 keeps values near 10 for rewards of ±100."""
     updates_per_step: float = 1.0
+    """Update this many times for each step."""
     stored: Stored = "both"
-    symmetric: bool = True  # learn from the images of a step too, if the task is symmetric (`learner/symmetry.py`)
-    warmup: int = 2000  # random steps before the first update
-    precision: Precision = "float32"  # of the products of wide layers
+    """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
+    symmetric: bool = True
+    """Learn also from the mirror images of a step, if the task is symmetric."""
+    warmup: int = 2000
+    """Propose random actions for this many steps before the first update."""
+    precision: Precision = "float32"
+    """Compute the products of wide layers in this precision."""
 
     def __post_init__(self) -> None:
         widths = min(self.hidden, default=0)
@@ -48,13 +66,21 @@ class LearnerConfig:
 
     td3: TD3Config = field(default_factory=TD3Config)
     seed: int = 0
-    steps: int = 100_000  # length of the run; in lockstep the last episode is completed
-    capacity: int = 200_000  # transitions
-    window: int = 16  # steps that an actor may publish ahead of the learner
-    ahead: int = 64  # steps that all actors together may be ahead of the updates
-    publish_every: int = 50  # updates between two versions of the weights
-    checkpoint_every: int = 10_000  # steps
-    lockstep: bool = False  # one actor, with `window` 1, `ahead` 0 and `publish_every` 1
+    """Draw weights and batches from this seed."""
+    steps: int = 100_000
+    """Learn from this many steps. In lockstep the last episode is completed."""
+    capacity: int = 200_000
+    """Keep this many of the newest steps in the replay buffer."""
+    window: int = 16
+    """Let an actor publish this many steps that the learner has not read."""
+    ahead: int = 64
+    """Let all actors together be this many steps ahead of the updates."""
+    publish_every: int = 50
+    """Publish weights after this many updates."""
+    checkpoint_every: int = 10_000
+    """Write a checkpoint after this many steps."""
+    lockstep: bool = False
+    """Learn with one actor, and with window 1, ahead 0 and publish_every 1, so that the run can be repeated exactly."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.capacity, self.window, self.publish_every, self.checkpoint_every) < 1 or self.ahead < 0:

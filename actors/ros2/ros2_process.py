@@ -56,13 +56,21 @@ class Topics:
     """Names of topics, below the namespace unless they begin with a slash."""
 
     odometry: str = "odom"
+    """Read nav_msgs/Odometry from this topic."""
     scan: str = "scan"
+    """Read sensor_msgs/LaserScan from this topic."""
     raw: str = "cmd_vel_raw"
+    """Read the commands to filter from this topic."""
     command: str = "cmd_vel"
+    """Send the filtered commands to this topic."""
     transforms: str = "/tf"
+    """Read transforms from this topic."""
     fixed_transforms: str = "/tf_static"
+    """Read transforms that never change from this topic."""
     diagnostics: str = "/diagnostics"
+    """Send diagnostic_msgs/DiagnosticArray to this topic."""
     markers: str = "~/markers"
+    """Send what the filter sees and plans to this topic, as visualization_msgs/MarkerArray."""
 
 
 @dataclass(frozen=True)

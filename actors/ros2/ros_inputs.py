@@ -29,9 +29,14 @@ class AgeLimits:
     """The greatest age [s] of each input; an older one counts as missing."""
 
     odometry: float = 0.15
-    scan: float = 0.6  # from its first beam: one turn of a slow lidar, and the wait for the next scan
+    """Count odometry as missing if it is older than this [s]."""
+    scan: float = 0.6
+    """Count a scan as missing if its first beam is older than this [s]. That includes one turn of a slow lidar and the
+    wait for the next scan."""
     command: float = 0.5
-    ahead: float = 0.05  # s by which a stamp may be in the future, since clocks differ
+    """Count a command as missing if it is older than this [s]."""
+    ahead: float = 0.05
+    """Let a stamp be in the future by this much, because clocks differ [s]."""
 
 
 @dataclass(frozen=True)

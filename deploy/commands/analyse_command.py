@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.commands.command_output import console, errors, print_json
-from brakeline.deploy.commands.common_options import LATEST, Json, Logs
+from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet, Verbose
 from brakeline.deploy.progress import under_way
 from brakeline.logs.figure_tables import show, show_episode
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
@@ -28,8 +28,8 @@ class AnalyseCommand:
     """Show each step of the episode with this number, of each actor."""
     actor: str | None = None
     """With --episode, show the episode of this actor only."""
-    verbose: bool = False
-    """Show also the conditions of the run: sensor errors, model sets and versions."""
+    verbose: Verbose = False
+    quiet: Quiet = False
     json: Json = False
     csv: bool = False
     """Print a CSV table with one row for each run, or with --episode for each step."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
 from rich.markup import escape
 
 from brakeline.deploy.commands import common_options as options
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from brakeline.safety.model.model_set import ModelSet
     from brakeline.safety.model.validation import ValidationReport
 
+DATA = (".safetensors", ".mcap")  # endings of data sets and logs
 DIVERGENT = 100.0  # m, half-width of a stop that is wider than any arena
 
 
@@ -33,9 +33,10 @@ DIVERGENT = 100.0  # m, half-width of a stop that is wider than any arena
 class CertifyCommand:
     """The options of `brakeline certify`."""
 
-    data: Annotated[Path | None, tyro.conf.Positional] = None
-    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use
-    of --robot."""
+    robot: options.Robot = "ground"
+    data: Path | None = None
+    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use of the
+    robot."""
     certificates: tuple[str, ...] = ()
     """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you
     give --mode direct or recursion."""
@@ -53,8 +54,6 @@ class CertifyCommand:
     and the stated bound larger."""
     until_held: bool = False
     """Widen each envelope until no held-out plan leaves its set, and no further."""
-    robot: str = "ground"
-    """Take the data set in use of this robot or, of a log, its steps."""
     last: int = 20_000
     """Take this many last steps of a log."""
     use: bool = False
@@ -64,8 +63,8 @@ class CertifyCommand:
     """Replace the model set of running safety services by the first of --certificates, in direct mode unless you
     give --mode."""
     endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
-    verbose: bool = False
-    """Show also the conditions of the recording: sensor errors, wind, payload."""
+    verbose: options.Verbose = False
+    quiet: options.Quiet = False
     json: options.Json = False
 
     def run(self) -> int:
@@ -170,6 +169,8 @@ class CertifyCommand:
         from brakeline.deploy.data.simulated_recording import data_for
         from brakeline.safety.model.dataset import Dataset
 
+        if self.robot.endswith(DATA) or Path(self.robot).is_dir():
+            raise ValueError(f"{self.robot} is no robot: `brakeline certify ROBOT --data {self.robot}`")
         robot = robot_maybe_with_task(self.robot)
         if self.data is None:
             path, data = record_path(robot.in_lockstep()), data_for(robot)

@@ -32,6 +32,7 @@ class CollectCommand:
     the box."""
     first: options.Unprefixed[FirstFlightSettings] = field(default_factory=FirstFlightSettings)
     accept_bound: options.AcceptBound = None
+    quiet: options.Quiet = False
     json: options.Json = False
 
     def run(self) -> int:
@@ -47,7 +48,7 @@ class CollectCommand:
         figures = {"path": str(path), "trajectories": len(data.trajectories), "periods": data.periods}
         figures |= {"digest": data.digest(), "about": data.about}
         counts = f"{data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}"
-        print_result(self.json, figures, f"{path}: {counts}", f"next: brakeline certify {path}")
+        print_result(self.json, figures, f"{path}: {counts}", f"next: brakeline certify {self.robot} --data {path}")
         return 0
 
     def _first_flight(self) -> int:
@@ -77,7 +78,7 @@ class CollectCommand:
             if refused:
                 figures["not_used"] = refused
                 errors.print(f"[red]not put to use:[/] {escape(refused)}")
-                errors.print(f"to validate it again: brakeline certify {path} --robot {robot.name} --few", markup=False)
+                errors.print(f"to validate it again: brakeline certify {robot.name} --data {path} --few", markup=False)
             else:
                 used = model_path(model.robot, model.model_config)
                 model.save(used)

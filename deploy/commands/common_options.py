@@ -71,9 +71,18 @@ Pictures = Annotated[
         "intervention. 0 draws none at all."
     ),
 ]
-Verbose = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print all figures at the end.")]
+Verbose = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(aliases=("-v",), help="Print all figures and conditions."),
+]
+Quiet = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.arg(aliases=("-q",), help="Show no progress."),
+]
 Watch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Open a live page in a browser.")]
-Json = Annotated[bool, tyro.conf.arg(help="Print the result as one JSON object on stdout.")]
+Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print one JSON object on stdout.")]
 
 
 @dataclass(frozen=True)

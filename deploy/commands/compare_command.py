@@ -10,8 +10,9 @@ from typing import Annotated, Any
 import tyro
 from rich.markdown import Markdown
 
-from brakeline.deploy.commands.command_output import console, errors, print_json
-from brakeline.deploy.commands.common_options import Json, Unprefixed
+from brakeline.deploy import progress
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
 from brakeline.deploy.experiments.comparison_cells import (
     METHODS,
     NONE,
@@ -61,6 +62,7 @@ class CompareCommand:
     """Store the tables and figures in this folder."""
     runs: Path = RUNS
     """Store the logs and policies of the trainings in this folder."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:
@@ -103,7 +105,7 @@ class CompareCommand:
         return jobs
 
     def _print_progress(self, name: str, text: str) -> None:
-        errors.print(f"[dim]{name}:[/] {text}")
+        progress.console.print(f"[dim]{name}:[/] {text}")
 
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
         """Write the tables and figures of a robot, and return its figures."""

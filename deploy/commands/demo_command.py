@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from brakeline.deploy.commands.command_output import console, errors
-from brakeline.deploy.commands.common_options import Json, RunBusOptions, RunFolder, Seed, Verbose
+from brakeline.deploy.commands.common_options import Json, Quiet, RunBusOptions, RunFolder, Seed, Verbose
 from brakeline.deploy.commands.train_command import dated_folder, train
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import EXPERIMENTS
@@ -24,6 +24,7 @@ class DemoCommand:
     seed: Seed = 0
     out: RunFolder = None
     verbose: Verbose = False
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:

@@ -40,8 +40,8 @@ class EvaluateCommand:
     beside: bool = False
     """With --render, draw the same episode without the filter beside it."""
     engine: options.Unprefixed[Engine] = field(default_factory=Engine)
-    verbose: bool = False
-    """Show also the conditions: sensor errors, wind, payload."""
+    verbose: options.Verbose = False
+    quiet: options.Quiet = False
     json: options.Json = False
 
     def run(self) -> int:

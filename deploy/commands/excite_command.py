@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from brakeline.deploy.commands.command_output import print_result
-from brakeline.deploy.commands.common_options import Json, Robot, Seed
+from brakeline.deploy.commands.common_options import Json, Quiet, Robot, Seed
 from brakeline.deploy.data import excitation_plan
 from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.progress import under_way
@@ -27,6 +27,7 @@ class ExciteCommand:
     drive: Path | None = None
     """Drive the inputs in the robot's simulator instead of printing them, and record this log (.mcap). The measured
     position then keeps the robot in the region."""
+    quiet: Quiet = False
     json: Json = False
     """With --drive, print the result as one JSON object on stdout."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.commands.command_output import print_result
-from brakeline.deploy.commands.common_options import LATEST, Json, Logs
+from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet
 from brakeline.deploy.progress import under_way
 from brakeline.messaging.task import robot_with_task
 
@@ -27,6 +27,7 @@ class ExportCommand:
     """Write each MAVLink frame to this file, which ground stations and pymavlink can read."""
     robot: str = "ground"
     """With --csv and --minari, export the steps of this robot. Give its name, or the path of a description (.toml)."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:

@@ -51,7 +51,7 @@ class FlyCommand:
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     practice: float = 0.0
     """At this share of the steps, let a vehicle begin to follow its backup plan to the stop. The log then has the stops
-    that `brakeline certify LOG` needs."""
+    that `brakeline certify ROBOT --data LOG` needs."""
     adapt: bool = False
     """Certify the vehicle anew in flight: if it needs wider sets than its model set states for long, a certifier
     process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
@@ -62,6 +62,7 @@ class FlyCommand:
     out: options.RunFolder = None
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
     verbose: options.Verbose = False
+    quiet: options.Quiet = False
     json: options.Json = False
 
     def run(self) -> int:

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from brakeline.deploy.commands.command_output import errors, print_result
-from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
+from brakeline.deploy.commands.common_options import Json, Quiet, ReadGib, ReadSeconds
 from brakeline.deploy.data.resample import HOLD
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 
@@ -45,6 +45,7 @@ class ImportCommand:
     read_gib: ReadGib = 4.0
     picture: Path | None = None
     """Draw what was driven into this image (.png)."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:
@@ -73,7 +74,8 @@ class ImportCommand:
         figures |= {"report": asdict(imported.report), "coverage": asdict(covered), "refused": covered.refused}
         counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
         missing = [Text.from_markup(f"[yellow]missing:[/] {escape(text)}") for text in covered.missing]
-        following = [] if covered.refused else [f"{path}: {counts}", f"next: brakeline certify {path} --use"]
+        next_command = f"brakeline certify {self.robot} --data {path} --use"
+        following = [] if covered.refused else [f"{path}: {counts}", f"next: {next_command}"]
         print_result(self.json, figures, *imported.report.notes, coverage_table(covered), *missing, *following)
         if covered.refused and not self.json:
             errors.print(f"[red]refused:[/] no model set can be made of this: {escape(covered.refused)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from brakeline.deploy.commands.command_output import console, errors, print_result
-from brakeline.deploy.commands.common_options import Json, Robot
+from brakeline.deploy.commands.common_options import Json, Quiet, Robot
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.rival_tuning import ThresholdTrial
@@ -31,6 +31,7 @@ class PretrainCommand:
     """Try values of the method's threshold in closed loop, and name the best. This stores nothing."""
     episodes: int = 60
     """With --tune, drive this many episodes for each policy and value."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:

@@ -28,6 +28,11 @@ from brakeline.safety.service.filter_client import Answer
 
 Array = NDArray[np.float64]
 
+# Attributes of an answer that --json prints.
+SHOWN = (
+    *("kind", "action", "plan", "tube_center", "tube_half_width", "margin", "at_least", "for_clearance", "reason"),
+    *("verified", "bound", "model", "time_ms"),
+)
 OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
 
 
@@ -38,11 +43,14 @@ class QueryCommand:
     robot: Robot = "ground"
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     state: tuple[float, ...] = ()
-    """Ask about this measured state, in the order of the robot description. Defaults to rest at the origin."""
+    """Ask about this measured state, in the order and the units that `brakeline robot show ROBOT` lists. Defaults to
+    rest at the origin."""
     action: tuple[float, ...] = ()
-    """Propose this action, in the order of the robot description. Defaults to the highest inputs."""
+    """Propose this action, in the order and the units that `brakeline robot show ROBOT` lists. Defaults to the highest
+    inputs."""
     obstacle: str = ""
-    """Describe the obstacles, separated by commas, such as "cylinder 0.4 0 0.1, wall 1 0 3.14"."""
+    """Describe the obstacles [m, rad], separated by commas: "cylinder X Y RADIUS, box X Y LENGTH WIDTH YAW, wall X Y
+    YAW"."""
     scan: Path | None = None
     """Read a scan from this JSON file, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}: the fields of Scan,
     or in the air of RangeImage (see docs/perception.md). Space that the scan does not show to be free counts as
@@ -58,25 +66,23 @@ class QueryCommand:
         robot = robot_named(self.robot)
         parts = (part.split() for part in self.obstacle.split(",") if part.strip())
         obstacles = [parse_obstacle(tuple(words), robot.position_dim) for words in parts]
+        if not (obstacles or self.scan or self.known_free or not robot.position_dim):
+            raise ValueError("nothing is known of the space around the robot: give --obstacle, --scan or --known-free")
         state = self.state or (0.0,) * robot.state_dim
         action = self.action or robot.action_high
         scan = None if self.scan is None else load_scan(self.scan, robot.position_dim)
         with Bus(self.endpoints.bus(), f"client.query-{time.time_ns() % 10**6}") as bus:
             client = SafetyClient(bus, robot, self.timeout)
             answer = client.decide(state, action, obstacles, scan=scan, known_free=self.known_free)
-        names = ("margin", "at_least", "for_clearance", "time_ms", "model", "reason", "verified", "bound")
-        figures = {name: getattr(answer, name) for name in names} | {
-            "decision": answer.kind,
-            "plan": answer.plan.tolist(),
-        }
-        figures["plan"] = answer.plan.tolist()
-        figures["tube"] = {"center": answer.tube_center.tolist(), "half_width": answer.tube_half_width.tolist()}
+        figures = {name: getattr(answer, name) for name in SHOWN}
+        figures |= {name: value.tolist() for name, value in figures.items() if isinstance(value, np.ndarray)}
         clearance = " for clearance: the proposal is verified too," if answer.for_clearance else ""
         margin = f"{'> ' if answer.at_least else ''}{answer.margin:.4f}{' m' if robot.position_dim else ''}"
         print_result(
             self.json,
             figures,
             Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}"),
+            "execute " + ", ".join(map(quantity, robot.action, answer.action)),
             describe_verification(answer.verified, answer.bound),
             plan_table(answer, robot.action),
             f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}",
@@ -92,6 +98,12 @@ def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:
         tube = (_numbers(answer.tube_center[k]), _numbers(answer.tube_half_width[k])) if has_tube else ()
         table.add_row(str(k), *(f"{value:.4f}" for value in values), *tube)
     return table
+
+
+def quantity(name: str, value: float) -> str:
+    """Return an input as text: `speed 0.25 m/s` for the name `speed [m/s]`."""
+    word, _, unit = name.partition(" [")
+    return f"{word} {value:.4g} {unit.removesuffix(']')}".rstrip()
 
 
 def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:

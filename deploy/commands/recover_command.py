@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from brakeline.deploy.commands.command_output import console, print_json
-from brakeline.deploy.commands.common_options import Json
+from brakeline.deploy.commands.common_options import Json, Quiet
 from brakeline.deploy.progress import under_way
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import find
@@ -24,6 +24,7 @@ class RecoverCommand:
     beside it as *.mcap.damaged."""
     out: Path | None = None
     """Write the repaired log (of one file) here, and leave the damaged one as it is."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands.command_output import console, print_json
-from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode
+from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, Quiet
 from brakeline.deploy.progress import under_way
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 
@@ -38,6 +38,7 @@ class ReplayCommand:
     """Decide with a model set of this data set (a file that `brakeline collect` wrote) instead."""
     margin: float | None = None
     """Decide with this clearance margin [m] instead of the one of the model set."""
+    quiet: Quiet = False
     json: Json = False
 
     def run(self) -> int:

@@ -35,6 +35,7 @@ class TrainCommand(RunConfig):
     meeting: options.Unprefixed[options.RunBusOptions] = field(default_factory=options.RunBusOptions)
     watch: options.Watch = False
     verbose: options.Verbose = False
+    quiet: options.Quiet = False
     json: options.Json = False
 
     # Options that `--help` leaves to `--help-all`.

@@ -92,7 +92,7 @@ def _existing(path: Path, robot: Robot) -> ModelSet:
     except BadModel as error:
         raise BadModel(
             f"there is no model set of this vehicle: {error}. `brakeline collect {robot.kind} --url URL` flies it for "
-            f"the first time; `brakeline certify DATA --robot {robot.name} --use` puts a model set of its data to use"
+            f"the first time; `brakeline certify {robot.name} --data DATA --use` puts a model set of its data to use"
         ) from error
 
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from brakeline.deploy import progress
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.live_page import LivePage
 from brakeline.deploy.run.verdict import verdict
@@ -31,7 +32,7 @@ class Display:
 
     def __init__(self, console: Console, steps: int, page: LivePage | None = None) -> None:
         """steps: of all robot kinds. page: the run's live page, whose address it shows."""
-        self.console, self._page = console, page
+        self.console, self._page = progress.console if progress.console.quiet else console, page
         self._bar = Progress(
             TextColumn("steps"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         )

@@ -87,7 +87,7 @@ class RunConfig:
     draws none at all."""
     practice: float = 0.0
     """At this share of the steps, let a robot begin to follow its backup plan to the stop. The log then has the stops
-    that `brakeline certify LOG` needs."""
+    that `brakeline certify ROBOT --data LOG` needs."""
     change: PhysicsChange = field(default_factory=PhysicsChange)
     """Change the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1."""
     adapt: bool = False

@@ -64,5 +64,5 @@ def check_adaptable(model: Model) -> None:
     if not isinstance(model, ModelSet) or model.one_step is None:
         raise ValueError(
             f"--adapt needs a model set of mode {ONE_STEP}, for {model.robot.name} another one is in use: give --mode "
-            f"{ONE_STEP}, or certify with `brakeline certify --robot {model.robot.kind} --use`"
+            f"{ONE_STEP}, or certify with `brakeline certify {model.robot.kind} --use`"
         )

@@ -71,7 +71,7 @@ def certified(folder: Path, robot: str, log: Path, mode: str) -> tuple[ModelSet,
     brakeline(folder, "robot", "check", description)
     brakeline(folder, "import", str(log), "--robot", description)
     how = [] if mode == "one-step" else ["--mode", mode, "--certificates", "residual"]
-    said = brakeline(folder, "certify", "--robot", description, "--use", "--accept-bound", "1", "--json", *how)
+    said = brakeline(folder, "certify", description, "--use", "--accept-bound", "1", "--json", *how)
     (path,) = (folder / "data").glob(f"*/residual-{mode}.safetensors")
     (report,) = (value for value in json.loads(said).values() if isinstance(value, dict) and "windows" in value)
     return ModelSet.load(path), report

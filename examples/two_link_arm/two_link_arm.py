@@ -118,8 +118,10 @@ def record(path: Path, minutes: float, generator: np.random.Generator) -> Path:
 def certify(log: Path, folder: Path, accept_bound: float) -> ModelSet:
     """Import the log and certify a model set, with the two commands that a user types."""
     os.environ["BRAKELINE_DATA"] = str(folder / "data")
-    for words in (["import", str(log)], ["certify", "--use", "--accept-bound", str(accept_bound)]):
-        if brakeline([*words, "--robot", str(DESCRIPTION)]):
+    robot = str(DESCRIPTION)
+    accepting = ["--accept-bound", str(accept_bound)]
+    for words in (["import", str(log), "--robot", robot], ["certify", robot, "--use", *accepting]):
+        if brakeline(words):
             raise SystemExit(f"brakeline {words[0]} failed")
     return ModelSet.load(folder / "data" / ROBOT.name / "residual-one-step.safetensors")
 

@@ -122,14 +122,17 @@ def test_a_typing_error_is_answered_with_a_suggestion(command):
             "no policy is called '[bold]' and no such file exists; there are: trained, trained-by-scan, untrained,",
         ),
         ("analyse {folder}/none", "no log at"),
-        ("certify {folder}/none.mcap", "no log at"),
+        ("certify --data {folder}/none.mcap", "no log at"),
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
         ("query ground --connect tcp/127.0.0.1:1 --scan {folder}/none", "none"),
         ("status", "no run at runs/latest: give --connect tls/HOST:PORT"),
-        ("query ground", "no run at runs/latest"),
+        ("query ground --known-free", "no run at runs/latest"),
         ("safety ground --listen tcp/0.0.0.0:7447", "is open to other machines: give --keys FOLDER"),
-        ("query ground --connect tcp/127.0.0.1:1 --keys {folder}", "with keys a bus is at tls/HOST:PORT"),
-        ("query ground --connect tls/127.0.0.1:1 --keys {folder}", "ca.pem is missing: no keys of client here"),
+        ("query ground --known-free --connect tcp/127.0.0.1:1 --keys {folder}", "with keys a bus is at tls/HOST:PORT"),
+        (
+            "query ground --known-free --connect tls/127.0.0.1:1 --keys {folder}",
+            "ca.pem is missing: no keys of client here",
+        ),
         ("keys {folder}/keys bob", "'bob' begins with no role"),
         ("keys {folder}/none --sign {folder}/none", "no key to sign models with"),
     ],
@@ -172,7 +175,7 @@ def read_only(monkeypatch):
         "robot new my.toml",
         "import {log} --robot {robot}",
         "collect ground",
-        "certify --robot ground",
+        "certify ground",
         "keys keys router",
         "train ground --steps 100",
     ],
@@ -223,16 +226,16 @@ def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
 
 def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_path):
     figures("collect", "--trajectories", 2, "--out", tmp_path / "few.safetensors")
-    words = ("certify", tmp_path / "few.safetensors", "--mode", "direct", "--certificates", "residual", "--json")
-    status, out, err = command(*words)
+    words = ("certify", "--data", tmp_path / "few.safetensors", "--mode", "direct", "--certificates", "residual")
+    status, out, err = command(*words, "--json")
     assert status == 1 and "at least" in err
     assert "refused" in json.loads(out)["residual"]
-    assert "encoder ticks" not in command(*words[:-1])[1], "the conditions need --verbose"
+    assert "encoder ticks" not in command(*words)[1], "the conditions need --verbose"
 
 
 def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(command, data_folder, monkeypatch):
     monkeypatch.setattr(progress, "FIRST", 0.01)
-    words = ("certify", data_folder / "ground" / "record.safetensors", "--mode", "direct")
+    words = ("certify", "--data", data_folder / "ground" / "record.safetensors", "--mode", "direct")
     bounds = json.loads(command(*words, "--json")[1])
     for name in ("residual", "set-membership", "matrix-zonotope"):
         assert bounds[name].keys() >= STATED
@@ -283,7 +286,7 @@ def test_the_same_seed_gives_the_same_figures(figures, data_folder):
 
 def test_a_mistyped_data_set_is_not_recorded_anew(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    status, out, err = command("certify", "nothere.safetensors")
+    status, out, err = command("certify", "--data", "nothere.safetensors")
     assert (status, out) == (1, "") and "no data set at nothere.safetensors" in err and err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 

@@ -28,7 +28,7 @@ def few(data_folder, tmp_path_factory):
         yield folder
 
 
-CERTIFY = ("certify", "--robot", "ground", "--certificates", "residual", "--mode", "direct", "--use")
+CERTIFY = ("certify", "ground", "--certificates", "residual", "--mode", "direct", "--use")
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_le
     few, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    words = ("certify", few / "ground" / "record.safetensors", "--robot", "ground-late", "--accept-bound", "0.5")
+    words = ("certify", "ground-late", "--data", few / "ground" / "record.safetensors", "--accept-bound", "0.5")
     found = [
         json.loads(run(capsys, *words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
         for outside in ("0.001", "0.1")
@@ -81,7 +81,7 @@ def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_le
     assert ModelSet.load(tmp_path / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
     assert found[1]["inflation"] < found[0]["inflation"] and found[1]["half_width_rest"] < found[0]["half_width_rest"]
     assert found[1]["bound_plan"] > found[0]["bound_plan"] and found[1]["marginal"] > found[0]["marginal"]
-    status, _, err = run(capsys, "certify", "--robot", "ground", "--outside", "0.5")
+    status, _, err = run(capsys, "certify", "ground", "--outside", "0.5")
     assert status == 1 and "between 0 and 0.1" in err and not (tmp_path / "ground").exists()
 
 

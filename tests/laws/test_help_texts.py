@@ -5,10 +5,19 @@ tyro begins a new line before a line that begins with no letter.
 
 import ast
 import itertools
+import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
+import tyro
+
+from brakeline.deploy.cli import COMMANDS, command_class, main
+from brakeline.deploy.commands.completion_command import completion
+from brakeline.deploy.option_parsing import registry
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 
@@ -24,6 +33,18 @@ def _options(tree: ast.AST) -> Iterator[tuple[int, str]]:
                 and isinstance(after.value, ast.Constant)
             ):
                 yield after.lineno, str(after.value.value)
+
+
+def options_of(name: str) -> dict[str, str]:
+    """Return the help of each option of a command, by its name."""
+    command = command_class(name)
+    defaults = {"default": command.defaults([])} if hasattr(command, "defaults") else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other way to list the options
+        parser = tyro.extras.get_parser(command, registry=registry, **defaults)
+    named = {"/".join(action.option_strings) or action.dest: action.help or "" for action in parser._actions}
+    del named["-h/--help"]
+    return named
 
 
 def test_no_line_of_a_fields_help_begins_without_a_letter():
@@ -42,7 +63,7 @@ HEAVY = {"numba", "scipy", "mujoco", "torch", "matplotlib", "gymnasium", "proxsu
 SIMULATING = {"autopilot", "bridge-sim"}
 IMPORTED = """
 import sys
-from brakeline.deploy.cli import COMMANDS, command_class
+from brakeline.deploy.cli import COMMANDS, command_class, main
 for name in COMMANDS:
     if name not in {simulating!r}:
         command_class(name)
@@ -55,3 +76,28 @@ def test_no_command_imports_anything_heavy_before_it_runs():
     text = IMPORTED.format(simulating=SIMULATING, heavy=HEAVY)
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_has_a_sentence(name):
+    for option, text in options_of(name).items():
+        sentence = re.sub(r"\s*\((default: .*|required)\)$", "", text, flags=re.DOTALL)
+        assert sentence[:1].isupper() and sentence.endswith((".", ".)")), f"{name} {option}: {text!r}"
+
+
+def test_work_that_shows_progress_can_be_quiet():
+    showing = {path for path in (DEPLOY / "commands").glob("*_command.py") if "under_way(" in path.read_text()}
+    assert showing and all("quiet: " in path.read_text() for path in showing)
+
+
+def test_a_missing_value_is_never_called_by_its_python_type(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["certify", "--accept-bound", "much"])
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and "--accept-bound FLOAT" in said and "None" not in said
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_the_shells_complete_every_command(shell):
+    text = completion(shell)
+    assert all(name in text for name in COMMANDS) and "--accept-bound" in text

@@ -28,7 +28,7 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
         metrics = run.watch()
         run.until_steps(BEFORE + DURING)
         words = ("--last", DURING - 400, "--certificates", "residual", "--mode", "direct", "--publish", "--json")
-        certify = brakeline("certify", run.folder, *words, *WORDS, *run.there)
+        certify = brakeline("certify", "--data", run.folder, *words, *WORDS, *run.there)
         assert certify.returncode == 0, certify.stderr
         published = json.loads(certify.stdout)["residual"]
         processes = metrics.processes

@@ -146,14 +146,14 @@ def _is_asked(there: tuple[object, ...], folder: Path) -> None:
     near = ("query", "ground", *there, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
     answer = json.loads(brakeline(*near, "--json").stdout)
     assert answer.keys() >= {"decision", "plan", "tube", "margin", "time_ms", "model"}
-    assert answer["decision"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
-    assert len(answer["plan"]) == len(answer["tube"]["center"]) == len(answer["tube"]["half_width"]) == GROUND.horizon
-    assert answer["decision"] in brakeline(*near).stdout
+    assert answer["kind"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
+    assert len(answer["plan"]) == len(answer["tube_center"]) == len(answer["tube_half_width"]) == GROUND.horizon
+    assert answer["kind"] in brakeline(*near).stdout
     for far, said in ((3.5, ("allowed",)), (0.0, ("adjusted", "failsafe"))):  # all free about it; nothing seen
         scan = {"ranges": [far] * 360, "angles": np.radians(range(360)).tolist(), "pose": [0.0, 0.0, 0.0]}
         (folder / "scan.json").write_text(json.dumps(scan))
         query = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
-        assert json.loads(query.stdout)["decision"] in said
+        assert json.loads(query.stdout)["kind"] in said
     wrong = brakeline("query", "ground", *there, "--state", 1, 2)
     assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
 

@@ -33,7 +33,7 @@ def certified(tmp_path_factory):
         imported = brakeline("import", log, "--robot", FILE, "--json")
         assert imported.returncode == 0, imported.stderr
         words = ("--use", *WORDS, "--certificates", "residual", "--mode", "direct", "--json")
-        certify = brakeline("certify", "--robot", FILE, *words)
+        certify = brakeline("certify", FILE, *words)
         assert certify.returncode == 0, certify.stderr
         yield folder, json.loads(imported.stdout), json.loads(certify.stdout)
 
@@ -65,7 +65,7 @@ def test_four_commands_from_a_csv_to_an_answer(certified, tmp_path):
         finally:
             service.terminate()
             service.wait()
-    assert answer["decision"] == "adjusted" and len(answer["plan"]) == porter().horizon
+    assert answer["kind"] == "adjusted" and len(answer["plan"]) == porter().horizon
     assert 0.0 <= answer["plan"][0][0] < 0.6 and answer["margin"] >= 0.0
 
 

@@ -34,8 +34,8 @@ def test_a_service_with_the_keys_that_were_handed_out_to_it(start, data_folder, 
             until(lambda: "safety" in bus.living(), "the service lives")
         monkeypatch.setitem(os.environ, "BRAKELINE_KEYS", str(parts / "client"))
         answer = brakeline("query", "ground", "--connect", endpoint, "--known-free", "--timeout", 10, "--json")
-        assert answer.returncode == 0 and '"decision": "allowed"' in answer.stdout, answer.stderr
-        stranger = brakeline("query", "ground", "--connect", endpoint, "--keys", parts / "actor-0")
+        assert answer.returncode == 0 and '"kind": "allowed"' in answer.stdout, answer.stderr
+        stranger = brakeline("query", "ground", "--known-free", "--connect", endpoint, "--keys", parts / "actor-0")
         assert stranger.returncode == 1 and "no keys of client" in stranger.stderr
         node = Ros2Command(connect=(endpoint,), keys=parts / "client")
         with node._asker(Ros2Settings("ground", lead=30.0)) as question:

@@ -326,7 +326,7 @@ def test_certify_shows_the_share_that_is_done_and_the_time_left(tmp_path, monkey
     path, out = tmp_path / "drive.safetensors", io.StringIO()
     imported(write_csv(tmp_path / "drive.csv", *drive(seconds=150.0))).save(path)
     monkeypatch.setattr(progress, "console", Console(file=out, force_terminal=True, width=100))
-    main(["certify", str(path), "--robot", str(FILE), "--few"])
+    main(["certify", str(FILE), "--data", str(path), "--few"])
     shown = [int(count) for count in re.findall(r"(\d+)/100", out.getvalue())]
     assert shown == sorted(shown) and len({*shown} - {0, 100}) >= 3, shown
     assert re.search(r"\d:\d\d:\d\d", out.getvalue())
