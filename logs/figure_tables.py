@@ -43,7 +43,7 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
         verbose: also show the metadata of the log.
     """
     several = len(figures.get("runs", {})) > 1
-    parts = [_runs(figures["runs"])] if several else [_table((), _summary(figures)), *_times(figures)]
+    parts = _several(figures) if several else [_table((), _summary(figures)), *_times(figures)]
     parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
     if figures.get("processes") and figures.get("topics"):
         parts.append(_processes(figures["processes"]))
@@ -54,6 +54,51 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
     if verbose and figures.get("metadata"):
         parts.append(_metadata(figures["metadata"]))
     return Group(*parts, *(Text(cut, "yellow") for cut in figures.get("cuts", ())))
+
+
+def _several(figures: Figures) -> list[RenderableType]:
+    """Return the tables of several runs: each run, groups of seeds, and in what the runs differ."""
+    parts: list[RenderableType] = [_runs(figures["runs"])]
+    if groups := figures.get("groups"):
+        parts.append(_groups(groups))
+    if pairs := [pair for pair in figures.get("improvements", ()) if pair["probability"] is not None]:
+        rows = [(f"{pair['of']} over {pair['over']}", pair["robot"], _estimate(pair, "probability")) for pair in pairs]
+        parts.append(_table(("a run scores better", "robot", "probability"), rows))
+    if differing := figures.get("differences"):
+        labels = list(figures["runs"])
+        settings = [(name, *(_setting(row[label]) for label in labels)) for name, row in differing.items()]
+        parts.append(_table(("setting", *labels), settings))
+    return parts
+
+
+def _groups(groups: list[Figures]) -> Table:
+    """Format the scores of groups of runs. A group of one run has no interval."""
+    scores = {"goals": 100.0, "collisions": 100.0, "interventions": 100.0, "reward": 1.0}
+    rows = []
+    for group in groups:
+        cells = []
+        for name, factor in scores.items():
+            score, unit, digits = group["scores"][name], " %" if factor > 1.0 else "", 1
+            if score["iqm"] is None:
+                cells.append("–")
+                continue
+            interval = score["iqm_interval"]
+            within = "" if interval is None else " [" + ", ".join(f"{factor * v:.{digits}f}" for v in interval) + "]"
+            cells.append(f"{factor * score['iqm']:.{digits}f}{unit}{within}")
+        steps = " ".join(f"{count:,}" for count in sorted(set(group["steps"])))
+        rows.append((group["name"], group["robot"], str(len(group["runs"])), steps, *cells))
+    table = _table(("group", "robot", "runs", "steps", *scores), rows)
+    table.caption = "interquartile means over runs, of their last 100 episodes; 95 % bootstrap intervals over runs"
+    return table
+
+
+def _estimate(row: Figures, name: str) -> str:
+    interval = "" if row["interval"] is None else " [{:.2f}, {:.2f}]".format(*row["interval"])
+    return f"{row[name]:.2f}{interval}"
+
+
+def _setting(value: Any) -> str:
+    return "–" if value is None else str(value)
 
 
 def show_episode(episode: Figures) -> RenderableType:

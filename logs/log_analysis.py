@@ -16,6 +16,7 @@ from brakeline.logs.mcap_container import LogChannel
 from brakeline.logs.metrics import Metrics, merge_runs
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, Paths, by_run, find
+from brakeline.logs.run_groups import GroupedRun, compare_groups, differences
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LEARNER, LOG, STEP
@@ -178,7 +179,8 @@ class LogAnalysis:
         """Return all figures; `runs` has one row for each run.
 
         With several runs, the label of the run is the prefix of actors, learners, processes and of the robot kinds in
-        `training`.
+        `training`. Then there are also the figures of `compare_groups`, and `differences`: the settings in which the
+        runs differ.
         """
         rows = {part.label: part.about() for part in self.parts}
         logs = [part.log for part in self.parts]
@@ -202,7 +204,22 @@ class LogAnalysis:
             "cuts": [cut for log in logs for cut in cuts_in(log)],
             "malformed": sum(log.malformed for log in logs),
             **({} if episode is None else {"episode": episode, "episode_detail": details}),
+            **(self._comparison(rows) if len(self.parts) > 1 else {}),
         }
+
+    def _comparison(self, rows: Mapping[str, Figures]) -> Figures:
+        """Return what several runs have in common, and in what they differ. rows: by run."""
+        settings = {
+            label: {name: row[name] for name in SETUP} | (given if isinstance(given, dict) else {})
+            for label, row in rows.items()
+            for given in (row["metadata"].get("configuration"),)
+        }
+        runs = [
+            GroupedRun(part.label, robot, settings[part.label], part.training[robot].figures())
+            for part in self.parts
+            for robot in sorted(part.training)
+        ]
+        return {**compare_groups(runs), "differences": differences(settings)}
 
     def by_label(self) -> dict[str, tuple[Figures, Figures]]:
         """Return figures and pictures of each run, by its label."""

@@ -1,14 +1,19 @@
-"""Plot goals, reward and interventions over a training."""
+"""Plot goals, reward and interventions over a training, of one run or of groups of runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.logs.episode_stats import Figures
+from brakeline.logs.run_groups import METHOD_COLORS
+
+OTHER_COLORS = ("#56b4e9", "#cc79a7", "#5d6b7c", "#b39800")  # of groups that share their method with another
 
 
 def _value_or_nan(name: str) -> Callable[[Figures], float]:
@@ -26,27 +31,85 @@ SETS: tuple[tuple[str, Callable[[Figures], float]], ...] = (
     ("widening of the sets", _value_or_nan("widening")),
     ("half-width of a tube [m]", _value_or_nan("half_width")),
 )
+OF_GROUPS = {"goals": "goals reached", "reward": "reward of an episode", "interventions": "interventions"}
 
 
-def draw(training: Figures, png: Path) -> None:
-    """Plot the learning curves `figures["training"]` to `png`, one column for each robot kind.
+def draw(figures: Figures, path: Path) -> None:
+    """Plot learning curves to a file, one column for each robot kind; its ending says the format (png, pdf, svg).
 
-    If the sets could be widened, three more rows show how; a line marks the first decision of each model set.
+    Several runs are drawn as groups of runs that differ only in their seed: the mean, and the 95 % interval over runs.
+
+    Args:
+        figures: of `LogAnalysis`.
+        path: the file; its folder is created.
     """
-    robots = list(training) or [""]
+    if figures.get("groups"):
+        picture = _groups(figures["groups"])
+    else:
+        picture = _run({robot: training for robot, training in figures["training"].items() if training["bins"]})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(path, dpi=200)
+
+
+def group_colors(groups: list[Figures]) -> list[str]:
+    """Return a color for each group: that of its method, unless another group of its robot kind has it already."""
+    colors: list[str] = []
+    others, taken = cycle(OTHER_COLORS), set()
+    for group in groups:
+        color = METHOD_COLORS.get(group["method"])
+        if color is None or (group["robot"], color) in taken:
+            color = next(others)
+        taken.add((group["robot"], color))
+        colors.append(color)
+    return colors
+
+
+def _run(training: Figures) -> Figure:
+    """Draw one run. If its sets could be widened, three more rows show how; a line marks each new model set."""
     adapts = any(row["widening"] is not None for robot in training.values() for row in robot["bins"])
     shown = ROWS + SETS if adapts else ROWS
-    picture = Figure(figsize=(8.0 * len(robots), 7.0 * len(shown) / len(ROWS)), layout="constrained")
-    grid = picture.subplots(len(shown), len(robots), sharex="col", squeeze=False)
-    for column, robot in zip(grid.T, robots, strict=True):
-        bins = training[robot]["bins"] if robot else []
-        for axes, (label, value) in zip(column, shown, strict=True):
+    picture, grid = _panels(list(training) or [""], [label for label, _ in shown])
+    for column, robot in zip(grid, training, strict=False):
+        bins = training[robot]["bins"]
+        for axes, (_, value) in zip(column, shown, strict=True):
             axes.plot([row["until"] for row in bins], [value(row) for row in bins])
-            axes.set_ylabel(label)
-            axes.grid(alpha=0.3)
-            for model in training[robot]["models"][1:] if robot else []:
+            for model in training[robot]["models"][1:]:
                 axes.axvline(model["from"], color="black", linestyle=":")
-        column[0].set_title(robot)
-        column[-1].set_xlabel("steps of all actors")
-    png.parent.mkdir(parents=True, exist_ok=True)
-    picture.savefig(png, dpi=120)
+    return picture
+
+
+def _groups(groups: list[Figures]) -> Figure:
+    """Draw groups of runs: mean and interval, thin where fewer than all runs of a group go on."""
+    robots = list(dict.fromkeys(group["robot"] for group in groups))
+    picture, grid = _panels(robots, list(OF_GROUPS.values()))
+    for group, color in zip(groups, group_colors(groups), strict=True):
+        column, curves, runs = grid[robots.index(group["robot"])], group["curves"], len(group["runs"])
+        for axes, name in zip(column, OF_GROUPS, strict=True):
+            if curves["step"]:
+                _curve(axes, curves, name, color, f"{group['name']}, {runs} run{'s' if runs > 1 else ''}")
+    for column in grid:
+        column[0].legend(loc="best", frameon=False, fontsize=8)
+    return picture
+
+
+def _curve(axes: Axes, curves: Figures, name: str, color: str, label: str) -> None:
+    value = _value_or_nan("mean")
+    all_runs = max(curves["runs"])
+    whole = [value(p) if runs == all_runs else math.nan for p, runs in zip(curves[name], curves["runs"], strict=True)]
+    axes.plot(curves["step"], [value(point) for point in curves[name]], color=color, linewidth=0.8)
+    axes.plot(curves["step"], whole, color=color, linewidth=1.8, label=label)
+    low, high = ([_value_or_nan(end)(point) for point in curves[name]] for end in ("low", "high"))
+    axes.fill_between(curves["step"], low, high, color=color, alpha=0.2, linewidth=0)
+
+
+def _panels(robots: list[str], labels: list[str]) -> tuple[Figure, list[list[Axes]]]:
+    """Return an empty picture with its panels: a list for each robot kind, from top to bottom."""
+    picture = Figure(figsize=(5.0 * len(robots), 2.0 * len(labels) + 0.5), layout="constrained")
+    grid = picture.subplots(len(labels), len(robots), sharex="col", squeeze=False)
+    for robot, column in zip(robots, grid.T, strict=True):
+        for axes, label in zip(column, labels, strict=True):
+            axes.set_ylabel(label, fontsize=9)
+            axes.grid(alpha=0.3)
+        column[0].set_title(robot, fontsize=10)
+        column[-1].set_xlabel("steps of all actors", fontsize=9)
+    return picture, [list(column) for column in grid.T]

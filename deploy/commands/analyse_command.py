@@ -22,8 +22,9 @@ class AnalyseCommand:
     logs: Logs = (LATEST,)
     html: Path | None = None
     """Write a report to this file: one page that needs no network."""
-    png: Path | None = None
-    """Draw the learning curves into this image."""
+    figure: Path | None = None
+    """Draw the learning curves into this file (.png, .pdf or .svg): several runs as mean and 95 % interval of those
+    that differ only in their seed."""
     episode: int | None = None
     """Show each step of the episode with this number, of each actor."""
     actor: str | None = None
@@ -49,11 +50,11 @@ class AnalyseCommand:
 
             write(self.html, figures, analysis.by_label())
             errors.print(f"report: {self.html}", markup=False)
-        if self.png is not None:
+        if self.figure is not None:
             from brakeline.logs.run_plots import draw  # imports Matplotlib, which takes a second
 
-            draw(figures["training"], self.png)
-            errors.print(f"learning curves: {self.png}", markup=False)
+            draw(figures, self.figure)
+            errors.print(f"learning curves: {self.figure}", markup=False)
         self._print(figures)
         return 0
 

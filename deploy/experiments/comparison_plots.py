@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
 from brakeline.deploy.experiments.comparison_cells import METHODS
 from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW
+from brakeline.logs.run_groups import METHOD_COLORS
 
 Array = NDArray[np.float64]
 
-COLOURS = dict(
-    zip(METHODS, ("#0072b2", "#e69f00", "#009e73", "#d55e00"), strict=True)
-)  # a palette for colour-blind readers
 POINTS = 200  # per curve
 
 
@@ -59,8 +57,8 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
             if not own:
                 continue
             lines = _lines(own, name, grid)
-            axes.plot(grid, lines.T, color=COLOURS[method], alpha=0.3, linewidth=0.8)
-            axes.plot(grid, lines.mean(axis=0), color=COLOURS[method], linewidth=2.0, label=NAMES[method])
+            axes.plot(grid, lines.T, color=METHOD_COLORS[method], alpha=0.3, linewidth=0.8)
+            axes.plot(grid, lines.mean(axis=0), color=METHOD_COLORS[method], linewidth=2.0, label=NAMES[method])
         axes.set_title(label, fontsize=10)
         axes.grid(alpha=0.3)
         axes.margins(x=0.01)
@@ -86,7 +84,7 @@ def seeds_as_points(found: dict[str, Any], png: Path) -> None:
                 axes.set_axis_off()
                 continue
             for place, (method, estimate) in enumerate(methods.items()):
-                _point(axes, place, estimate, COLOURS[method])
+                _point(axes, place, estimate, METHOD_COLORS[method])
             axes.set_xticks(range(len(methods)), [NAMES[m] for m in methods])
             axes.set_title(f"{part}: {name} [%]", fontsize=10)
             axes.grid(axis="y", alpha=0.3)

@@ -200,8 +200,8 @@ def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
     training = LearningCurve()
     for step in some_steps() * 20:
         training.step(step)
-    draw({"ground": training.figures()}, tmp_path / "pictures" / "curve.png")
-    draw({}, tmp_path / "pictures" / "none.png")
+    draw({"training": {"ground": training.figures()}}, tmp_path / "pictures" / "curve.png")
+    draw({"training": {}}, tmp_path / "pictures" / "none.svg")
     assert (tmp_path / "pictures" / "curve.png").stat().st_size > 10_000
 
 

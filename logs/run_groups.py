@@ -1,0 +1,249 @@
+"""Compare groups of runs: runs that differ only in their seed form a group.
+
+The definitions are those of rliable (Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
+Precipice", 2021) with one task: interquartile mean, percentile bootstrap over runs, performance profile and probability
+of improvement. The score of a run is the share of its last episodes that reached the goal.
+
+>>> float(interquartile_mean(np.array([0.0, 0.5, 0.7, 1.0])))
+0.6
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.logs.episode_stats import Figures
+
+Array = NDArray[np.float64]
+
+METHOD_COLORS = {  # a palette for colour-blind readers
+    **{"ddpc": "#0072b2", "sailr": "#e69f00", "secas": "#009e73", "none": "#d55e00"}
+}
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+POINTS = 60  # steps of a curve
+WINDOW = 0.1  # of the longest run: a curve's value is the rate over this many steps before
+LEVELS = np.linspace(0.0, 1.0, 101)  # of a performance profile
+SCORES = ("goals", "collisions", "interventions", "reward")  # of the last episodes of a run
+CURVES: dict[str, tuple[str, str]] = {  # name: what is counted, over what
+    "goals": ("goals", "episodes"),
+    "interventions": ("interventions", "steps"),
+    "reward": ("reward", "episodes"),
+}
+
+
+@dataclass(frozen=True)
+class GroupedRun:
+    """What a comparison reads of one run and robot kind.
+
+    Attributes:
+        label: name of the run.
+        robot: kind.
+        setup: configuration by name, with the seed; nested values are joined by dots.
+        training: figures of the run's `LearningCurve`.
+    """
+
+    label: str
+    robot: str
+    setup: Mapping[str, Any]
+    training: Figures
+
+
+def interquartile_mean(values: Array) -> Array:
+    """Return the mean of the middle half of the values (..., n), as `scipy.stats.trim_mean(values, 0.25)` does."""
+    count = values.shape[-1]
+    cut = int(0.25 * count)
+    return np.asarray(np.sort(values, axis=-1)[..., cut : count - cut].mean(axis=-1))
+
+
+def mean(values: Array) -> Array:
+    """Return the mean of the values (..., n)."""
+    return np.asarray(values.mean(axis=-1))
+
+
+def compare_groups(runs: Sequence[GroupedRun]) -> Figures:
+    """Return the groups of several runs, and how likely a run of one group scores better than one of another.
+
+    Returns:
+        `groups`: a row for each robot kind and configuration, with its runs, seeds, scores, performance profile and
+        curves. `improvements`: for each two groups of a robot kind, the probability that a run of the first scores
+        better than a run of the second; ties count half. An interval is None for a group of one run.
+    """
+    members: defaultdict[tuple[str, tuple[tuple[str, str], ...]], list[GroupedRun]] = defaultdict(list)
+    for run in runs:
+        setup = dict(_flat(run.setup))
+        members[run.robot, tuple((name, str(value)) for name, value in setup.items() if not _seed(name))].append(run)
+    names = _names([dict(setup) for _, setup in members])
+    groups = [_group(robot, name, group) for ((robot, _), group), name in zip(members.items(), names, strict=True)]
+    pairs = itertools.combinations(groups, 2)
+    return {
+        "groups": groups,
+        "improvements": [_improvement(a, b) for a, b in pairs if a["robot"] == b["robot"]],
+    }
+
+
+def _seed(name: str) -> bool:
+    return name.rpartition(".")[2] == "seed"
+
+
+def differences(configurations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the settings in which runs differ: for each, its value in every run; None where a run does not have it.
+
+    Args:
+        configurations: by run; nested values are joined by dots.
+    """
+    flat = {run: dict(_flat(values)) for run, values in configurations.items()}
+    names = dict.fromkeys(name for values in flat.values() for name in values)
+    rows = {name: {run: values.get(name) for run, values in flat.items()} for name in names}
+    return {name: row for name, row in rows.items() if len({repr(value) for value in row.values()}) > 1}
+
+
+def _flat(values: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    if not isinstance(values, dict):
+        return [(prefix.removesuffix("."), values)] if prefix else []
+    return [item for name, value in values.items() for item in _flat(value, f"{prefix}{name}.")]
+
+
+def _names(setups: list[dict[str, str]]) -> list[str]:
+    """Return short names of configurations: the method, and further values until all names differ."""
+    keys = dict.fromkeys(key for setup in setups for key in setup)
+    differing = [key for key in keys if len({setup.get(key) for setup in setups}) > 1] or ["method"]
+    names = [[str(setup.get(differing[0]))] for setup in setups]
+    distinct = len({tuple(setup.items()) for setup in setups})  # two robot kinds may have the same
+    for key in differing[1:]:
+        if len({tuple(name) for name in names}) == distinct:
+            break
+        for name, setup in zip(names, setups, strict=True):
+            name.append(f"{key} {setup.get(key)}")
+    return [", ".join(name) for name in names]
+
+
+def _group(robot: str, name: str, runs: list[GroupedRun]) -> Figures:
+    scores = {score: np.array([_score(run, score) for run in runs], float) for score in SCORES}
+    return {
+        "robot": robot,
+        "name": name,
+        "method": runs[0].setup.get("method"),
+        "runs": [run.label for run in runs],
+        "seeds": [run.setup.get("seed") for run in runs],
+        "steps": [sum(row["steps"] for row in run.training["bins"]) for run in runs],
+        "scores": {name: _aggregate(values) for name, values in scores.items()},
+        "profile": _profile(scores["goals"]),
+        "curves": _curves([run.training["bins"] for run in runs]),
+    }
+
+
+def _score(run: GroupedRun, name: str) -> float:
+    last = run.training["last"]
+    value = last["collisions"] / last["episodes"] if name == "collisions" and last["episodes"] else last[name]
+    return float("nan") if value is None or not last["episodes"] else float(value)
+
+
+def _aggregate(values: Array) -> Figures:
+    """Return mean and interquartile mean of the runs' scores, with intervals; NaN scores are left out."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"values": [], "mean": None, "iqm": None, "mean_interval": None, "iqm_interval": None}
+    return {
+        "values": values.tolist(),
+        "mean": float(values.mean()),
+        "iqm": float(interquartile_mean(values)),
+        "mean_interval": _interval(values, mean),
+        "iqm_interval": _interval(values, interquartile_mean),
+    }
+
+
+def _interval(values: Array, statistic: Callable[[Array], Array]) -> list[float] | None:
+    """Return the percentile bootstrap interval of a statistic over runs. A mean of shares stays within 0 and 1."""
+    if len(values) < 2:
+        return None
+    return _percentiles(statistic(values[_resampled(len(values))]))
+
+
+def _resampled(count: int) -> NDArray[np.intp]:
+    """Return the runs (RESAMPLES, count) of each resample; the same for each call."""
+    return np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+
+
+def _percentiles(drawn: Array) -> list[float]:
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(drawn, (tail, 100.0 - tail))
+    return [float(low), float(high)]
+
+
+def _profile(values: Array) -> Figures:
+    """Return the share of runs whose score is above each level, with its interval."""
+    values = values[np.isfinite(values)]
+    above = (values[:, None] > LEVELS).astype(float) if len(values) else np.zeros((0, len(LEVELS)))
+    profile: Figures = {"level": LEVELS.tolist(), "share": above.mean(axis=0).tolist() if len(values) else []}
+    if len(values) > 1:
+        drawn = above[_resampled(len(values))].mean(axis=1)
+        tail = 50.0 * (1.0 - CONFIDENCE)
+        profile["low"], profile["high"] = np.percentile(drawn, (tail, 100.0 - tail), axis=0).tolist()
+    return profile
+
+
+def _improvement(a: Figures, b: Figures) -> Figures:
+    """Return the probability that a run of group `a` scores better than one of group `b`."""
+    first, second = (np.array(group["scores"]["goals"]["values"]) for group in (a, b))
+    row: Figures = {"robot": a["robot"], "of": a["name"], "over": b["name"], "probability": None, "interval": None}
+    if not len(first) or not len(second):
+        return row
+    better = (first[:, None] > second) + 0.5 * (first[:, None] == second)
+    row["probability"] = float(better.mean())
+    if min(len(first), len(second)) > 1:
+        generator = np.random.default_rng(0)
+        rows = generator.integers(len(first), size=(RESAMPLES, len(first)))
+        columns = generator.integers(len(second), size=(RESAMPLES, len(second)))
+        row["interval"] = _percentiles(better[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
+    return row
+
+
+def _curves(runs: list[list[Figures]]) -> Figures:
+    """Return the mean curves of a group over steps, with intervals where at least two runs have a value.
+
+    `runs` counts the runs at each step. A run that ended earlier than the others leaves the mean there, and does not
+    cut it.
+    """
+    ends = [sum(row["steps"] for row in bins) for bins in runs]
+    end = max(ends, default=0)
+    if not end:
+        return {"step": [], "runs": []}
+    grid = np.linspace(0.0, end, POINTS + 1)[1:]
+    curves: Figures = {"step": grid.tolist(), "runs": [sum(bool(last >= step) for last in ends) for step in grid]}
+    for name, (counted, over) in CURVES.items():
+        lines = np.array([_rates(bins, counted, over, grid, WINDOW * end) for bins in runs])
+        curves[name] = [_point(line[np.isfinite(line)]) for line in lines.T]
+    return curves
+
+
+def _point(values: Array) -> Figures:
+    low, high = _interval(values, mean) or (None, None)
+    return {"mean": float(values.mean()) if len(values) else None, "low": low, "high": high}
+
+
+def _rates(bins: list[Figures], counted: str, over: str, grid: Array, window: float) -> Array:
+    """Return the rate over the window before each step of the grid; NaN after the end, or if nothing ended in it."""
+    ends = np.concatenate([[0.0], np.cumsum([row["steps"] for row in bins])])
+    above = np.concatenate([[0.0], np.cumsum([_count(row, counted) for row in bins])])
+    below = np.concatenate([[0.0], np.cumsum([row[over] for row in bins])])
+    start = np.maximum(grid - window, 0.0)
+    total = np.interp(grid, ends, below) - np.interp(start, ends, below)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rates: Array = (np.interp(grid, ends, above) - np.interp(start, ends, above)) / total
+    rates[(grid > ends[-1] + 1e-9) | (total < 1e-9)] = np.nan
+    return rates
+
+
+def _count(row: Figures, name: str) -> float:
+    """Return how much a bin adds to a rate."""
+    if name == "interventions":
+        return float(row["adjusted"] + row["failsafes"]) * float(row["steps"])
+    return float(row[name] or 0.0) * float(row["episodes"])

@@ -1,0 +1,125 @@
+"""Groups of runs by rliable's definitions, against independent computations; nothing is cut or pooled in silence."""
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import mannwhitneyu, trim_mean
+
+from brakeline.logs.run_groups import GroupedRun, compare_groups, differences, interquartile_mean
+from brakeline.logs.run_plots import draw, group_colors
+
+SHARES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12)
+
+
+def run(label: str, method: str, seed: int, goals: float, steps: int = 2000) -> GroupedRun:
+    """A run of 100 steps a bin, with two episodes in each."""
+    share = {"adjusted": 0.1, "failsafes": 0.05, "reward": 100.0 * goals, "goals": goals}
+    bins = [{"steps": 100, "episodes": 2, "until": 100 * k, **share} for k in range(1, steps // 100 + 1)]
+    last = {"episodes": 40, "goals": goals, "collisions": 2, "interventions": 0.15, "reward": 100.0 * goals}
+    setup = {"method": method, "seed": seed, "learner": {"seed": seed, "td3": {"batch": 128}}}
+    return GroupedRun(label, "ground", setup, {"bins": bins, "last": last, "models": []})
+
+
+def four_methods(steps: int = 2000) -> list[GroupedRun]:
+    """Three seeds of each of four methods; the last seed of each ended early."""
+    return [
+        run(f"{method}-{seed}", method, seed, 0.3 * place + 0.05 * seed, steps if seed < 2 else steps // 2)
+        for place, method in enumerate(("none", "secas", "sailr", "ddpc"))
+        for seed in range(3)
+    ]
+
+
+@given(SHARES)
+def test_the_interquartile_mean_is_that_of_scipy(values: list[float]) -> None:
+    assert interquartile_mean(np.array(values)) == pytest.approx(trim_mean(values, 0.25))
+
+
+@given(SHARES, SHARES)
+def test_scores_of_groups_are_those_of_their_runs(first: list[float], second: list[float]) -> None:
+    runs = [run(f"a{k}", "ddpc", k, goals) for k, goals in enumerate(first)]
+    runs += [run(f"b{k}", "none", k, goals) for k, goals in enumerate(second)]
+    found = compare_groups(runs)
+    for group, values in zip(found["groups"], (first, second), strict=True):
+        goals = group["scores"]["goals"]
+        assert goals["values"] == values and goals["mean"] == pytest.approx(np.mean(values))
+        assert group["seeds"] == list(range(len(values))) and group["scores"]["collisions"]["mean"] == pytest.approx(
+            0.05
+        )
+        for statistic in ("mean", "iqm"):
+            interval = goals[f"{statistic}_interval"]
+            if len(values) == 1:
+                assert interval is None, "one run says nothing about others"
+            else:
+                assert 0.0 <= interval[0] <= goals[statistic] + 1e-9 and goals[statistic] - 1e-9 <= interval[1] <= 1.0
+        profile = group["profile"]
+        assert profile["share"] == [np.mean([value > level for value in values]) for level in profile["level"]]
+    (pair,) = found["improvements"]
+    better = mannwhitneyu(first, second).statistic / (len(first) * len(second))
+    assert (pair["of"], pair["over"]) == ("ddpc", "none") and pair["probability"] == pytest.approx(better)
+
+
+def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
+    """With ten runs the percentile bootstrap covers somewhat less than 95 %."""
+    generator, covered = np.random.default_rng(1), 0
+    for _ in range(200):
+        values = generator.uniform(0.0, 1.0, 10)
+        (group,) = compare_groups([run(str(k), "ddpc", k, value, 100) for k, value in enumerate(values)])["groups"]
+        low, high = group["scores"]["goals"]["mean_interval"]
+        covered += low <= 0.5 <= high
+    assert 0.85 <= covered / 200 <= 0.98
+
+
+def test_a_run_that_ended_early_cuts_no_other() -> None:
+    (group,) = compare_groups([run("long", "ddpc", 0, 0.9), run("short", "ddpc", 1, 0.5, steps=1000)])["groups"]
+    curves, steps = group["curves"], group["steps"]
+    assert steps == [2000, 1000] and curves["step"][-1] == 2000.0
+    assert {runs for step, runs in zip(curves["step"], curves["runs"], strict=True) if step <= 1000.0} == {2}
+    first, last = curves["goals"][0], curves["goals"][-1]
+    assert first["mean"] == pytest.approx(0.7) and first["low"] == pytest.approx(0.5)
+    assert last == {"mean": pytest.approx(0.9), "low": None, "high": None} and curves["runs"][-1] == 1
+    assert curves["interventions"][0]["mean"] == pytest.approx(0.15)
+
+
+def test_runs_that_differ_in_more_than_the_seed_are_not_pooled() -> None:
+    other = run("c", "ddpc", 2, 0.5)
+    other.setup["learner"]["td3"]["batch"] = 256  # type: ignore[index]
+    groups = compare_groups([run("a", "ddpc", 0, 0.5), run("b", "ddpc", 1, 0.5), other])["groups"]
+    assert [group["runs"] for group in groups] == [["a", "b"], ["c"]]
+    assert [group["name"] for group in groups] == ["128", "256"]
+    assert len(set(group_colors(groups))) == 2
+
+
+def test_differences_name_each_setting_and_each_run() -> None:
+    settings = {"a": {"steps": 10, "td3": {"batch": 128, "tau": 0.1}}, "b": {"steps": 10, "td3": {"batch": 256}}}
+    assert differences(settings) == {"td3.batch": {"a": 128, "b": 256}, "td3.tau": {"a": 0.1, "b": None}}
+
+
+def test_groups_are_json_and_a_picture_in_each_format(tmp_path: Path) -> None:
+    found = compare_groups(four_methods())
+    assert len(json.dumps(found, allow_nan=False)) < 100_000
+    assert [group["name"] for group in found["groups"]] == ["none", "secas", "sailr", "ddpc"]
+    assert len(found["improvements"]) == len(list(itertools.combinations(range(4), 2)))
+    for ending in ("png", "pdf", "svg"):
+        draw(found, tmp_path / f"curves.{ending}")
+        assert (tmp_path / f"curves.{ending}").stat().st_size > 10_000
+
+
+def test_runs_without_an_episode_have_no_score() -> None:
+    idle = GroupedRun(
+        "idle",
+        "ground",
+        {"method": "ddpc"},
+        {
+            "bins": [],
+            "last": dict.fromkeys(("goals", "collisions", "interventions", "reward")) | {"episodes": 0},
+            "models": [],
+        },
+    )
+    found = compare_groups([idle, run("a", "none", 0, 0.5)])
+    assert found["groups"][0]["scores"]["goals"]["iqm"] is None and found["improvements"][0]["probability"] is None
+    json.dumps(found, allow_nan=False)
