@@ -117,16 +117,21 @@ def save(films: Sequence[Film], path: Path) -> None:
     """
     check_ending(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure = Figure(figsize=(7.0 * len(films), 7.4), layout="constrained")
+    still = path.suffix == ".png"
+    figure = Figure(figsize=(7.0 * len(films), 7.4 if still else 8.2), layout="constrained" if still else None)
     panels = [_FilmAxes(film, axes) for film, axes in zip(films, np.ravel(figure.subplots(1, len(films))), strict=True)]
-    if path.suffix == ".png":
+    if still:
         for panel in panels:
             panel.all_at_once()
         figure.savefig(path, dpi=130)
         return
+    if not panels[0].flies:  # a color bar has a place of its own
+        figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=0.85, wspace=0.04)
+    for panel in panels:
+        panel.zoom(np.concatenate([panel.path for panel in panels]))
     last = max(len(film.frames) for film in films)
     writer = _writer(path, round(SPEED / films[0].robot.period))
-    with writer.saving(figure, str(path), dpi=90 // len(films)):
+    with writer.saving(figure, str(path), dpi=100 // len(films)):
         for k in range(last + 1):
             for panel in panels:
                 panel.show(k)
@@ -156,6 +161,7 @@ class _FilmAxes:
         self.lines = LineCollection([], linewidths=2.2, zorder=4)
         self.axes.add_collection(self.lines)
         self._moving: list[Any] = []
+        self._font, self._width = 10, 80  # of the title: size, and characters in a line
 
     def _room(self) -> None:
         axes, arena = self.axes, self.film.arena
@@ -185,6 +191,22 @@ class _FilmAxes:
         axes.plot(*goal[:2], marker="*", color="#009e73", markersize=12, zorder=3)
         axes.plot(*self.path[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
 
+    def zoom(self, paths: Array) -> None:
+        """Show the part of the room that holds these positions (k, d) and the goal, and enlarge the text for a film."""
+        goal, radius = np.array(self.film.arena.goal[:2]), self.film.arena.goal_radius
+        points = np.concatenate([paths[:, :2], [goal - radius, goal + radius]])
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        half = 0.5 * float((points.max(axis=0) - points.min(axis=0)).max()) + 3.0 * self.robot.footprint
+        self.axes.set(
+            xlim=(middle[0] - half, middle[0] + half),
+            ylim=(middle[1] - half, middle[1] + half),
+            xlabel="",
+            ylabel="",
+            xticks=[],
+            yticks=[],
+        )
+        self._font, self._width = 19, 44
+
     def show(self, k: int) -> None:
         """Draw the start of period k with its plan; after the last period, the whole path and the outcome."""
         for artist in self._moving:
@@ -206,10 +228,11 @@ class _FilmAxes:
         ]
         if explained is None or frame.kind == "allowed":
             return self._title(k, frame.kind)
-        return self._title(k, textwrap.fill(f"{frame.kind}: {explained.said}", 80))
+        return self._title(k, textwrap.fill(f"{frame.kind}: {explained.said}", self._width))
 
     def _title(self, k: int, said: str) -> None:
-        self.axes.set_title(f"{self._name()}{k * self.robot.period:5.1f} s\n{said}", fontsize=10, loc="left")
+        title = f"{self._name()}{k * self.robot.period:5.1f} s\n{said}"
+        self.axes.set_title(title, fontsize=self._font, loc="left")
 
     def _line(self, points: Sequence[Array], **style: Any) -> list[Any]:
         """Draw a line through points, from above."""
@@ -264,7 +287,7 @@ class _FilmAxes:
 
     def _name(self) -> str:
         unfiltered = all(frame.kind == "no filter" for frame in self.film.frames)
-        return f"{self.robot.name}, {self.film.arena.name}{', without the filter' if unfiltered else ''}: "
+        return f"{self.robot.name}, {self.film.arena.name}, {'without' if unfiltered else 'with'} the filter: "
 
     def _draw_path(self, k: int) -> None:
         """Draw the path up to period k, coloured by decision; in space, by height."""
