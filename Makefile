@@ -60,7 +60,7 @@ test-fast: setup
 bench: setup
 	$(BIN)/python -m benchmarks
 
-# docs/ as a static site with a search, in site/; to search in it, serve it: `.venv/bin/mkdocs serve`.
+# docs/ as a static site with a search, in site/. Open site/index.html; it needs no server and no network.
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 

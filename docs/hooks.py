@@ -1,7 +1,15 @@
-"""For `make docs`: pictures in results/ are in the site too; links to the repository's other files are words."""
+"""For `make docs`: what the site shows from elsewhere in the repository.
+
+- Pictures in results/ are part of the site. Links to the repository's other files become words.
+- `<!-- README: TITLE -->` becomes that section of the README, `<!-- README -->` its text above the first section.
+- `<!-- HELP -->` becomes the help of each command.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +18,8 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!results/)[^)]*\)")
+QUOTED = re.compile(r"<!-- README(?:: (?P<title>.+?))? -->")
+COLUMNS = "76"  # of the help
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -20,5 +30,32 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Pages are read in the repository too, where those pictures are a folder up."""
+    """Fill in the quoted parts, and turn links that are right in the repository into links of the site."""
+    markdown = QUOTED.sub(lambda found: readme_section(found["title"]), markdown)
+    if "<!-- HELP -->" in markdown:
+        markdown = markdown.replace("<!-- HELP -->", help_of_commands())
     return OUTSIDE.sub(r"\1", markdown).replace("](../results/", "](results/")
+
+
+def readme_section(title: str | None) -> str:
+    """Return a section of the README without its heading, with links as a page in docs/ has them."""
+    first, *sections = re.split(r"^#+ ", (ROOT / "README.md").read_text(), flags=re.MULTILINE)[1:]
+    texts = dict(section.split("\n", 1) for section in sections)
+    text = first.split("\n", 1)[1] if title is None else texts[title]
+    return re.sub(r"\]\((?!https?:)", "](../", text.strip()).replace("](../docs/", "](")
+
+
+def help_of_commands() -> str:
+    """Return a heading for each group and command, and what `brakeline COMMAND --help-all` prints."""
+    from brakeline.deploy.cli import GROUPS, main
+
+    os.environ |= {"COLUMNS": COLUMNS, "NO_COLOR": "1"}
+    parts = []
+    for group, commands in GROUPS.items():
+        parts.append(f"## {group}\n")
+        for name, entry in commands.items():
+            shown = io.StringIO()
+            with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+                main([name, "--help-all"])
+            parts.append(f"### {name}\n\n{entry.summary}\n\n```text\n{shown.getvalue().strip()}\n```\n")
+    return "\n".join(parts)

@@ -29,7 +29,9 @@ class Prediction:
     True
 
     Attributes:
-        center, half_width (n,): the position in center is in the world; its box is turned by heading [rad].
+        center (n,): center of the set; its position is in the world.
+        half_width (n,): half-widths of the set.
+        heading: angle by which the box of the position is turned [rad].
     """
 
     center: Array

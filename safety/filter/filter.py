@@ -70,10 +70,11 @@ class Filter:
         tube: the exact tube, for the final check. The QP uses an outer tube (docs/method.md §2).
         constraints: holds the tube of any plan against a map of the surroundings.
         in_place: bounds of z (2, nz), and the constraints for plans in place within them; None without such plans.
-        standing (m,): inputs that leave the robot in place. translating (nz,): 1 for free inputs that move it, else 0.
+        standing (m,): inputs that leave the robot in place.
+        translating (nz,): 1 for free inputs that move it, else 0.
         domain (2, r): recorded range of [x_0; input in force], with room for rounding.
-        clearance_margin [m]: distance to obstacles that the QP keeps.
-        reach [m]: an obstacle farther away cannot decide anything.
+        clearance_margin: distance to obstacles that the QP keeps [m].
+        reach: an obstacle farther away cannot decide anything [m].
         bound: the share of plans outside their tubes that the model set states.
         start: factor on the sets of a request without past window (see `OneStep.start`).
     """

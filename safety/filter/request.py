@@ -113,11 +113,12 @@ class Decision:
     Attributes:
         kind: allowed, adjusted, failsafe or recovering (never verified).
         plan (N, m): the first row is for now; in real time it is in force, and the second row is for the next period.
-        tube_center, tube_half_width (N, d): boxes of the true positions at the ends of the periods, world.
+        tube_center (N, d): centers of the boxes of the true positions at the ends of the periods, in the world.
+        tube_half_width (N, d): half-widths of these boxes.
         predicted: set of the next measured state.
-        margin [m]: distance of the tube to the nearest half-space, or to a limit in the limit's own unit. The margin of
-            a failsafe may be negative although the plan is verified: an earlier decision verified it, but this margin
-            starts from the new measurement.
+        margin: distance of the tube to the nearest half-space [m], or to a limit in the limit's own unit. The margin
+            of a failsafe may be negative although the plan is verified: an earlier decision verified it, but this
+            margin starts from the new measurement.
         at_least: the margin is only a lower bound, since nothing is within reach.
         model: version of the model set.
         broken: number of moving obstacles that a sensor saw outside their bounds of motion.

@@ -8,10 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import matplotlib
 import pytest
 
-from brakeline import BusError, SafetyClient
+from brakeline import BusError, Filter, SafetyClient, SafetyWrapper
 from brakeline.messaging.free_ports import free_endpoint
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
@@ -44,6 +45,13 @@ def test_the_cart_stops_before_the_wall(capsys):
     runpy.run_path(str(EXAMPLES / "own_policy_in_gymnasium.py"))
     distance = float(re.search(r"stands (\S+) m before it", capsys.readouterr().out)[1])
     assert 0.2 < distance < 0.4  # the radius of its body is 0.2 m
+
+
+def test_the_filter_ends_the_collisions_of_a_policy_that_knows_no_obstacles():
+    names = runpy.run_path(str(EXAMPLES / "my_policy.py"))
+    env = gymnasium.make("brakeline.envs:brakeline/Ground-v0", arena="dense")
+    assert " 2 collisions, 0 steps changed" in names["drive"](env, 2)
+    assert " 0 collisions, " in names["drive"](SafetyWrapper(env, Filter.load("ground")), 2)
 
 
 def test_the_notebook_runs_from_top_to_bottom(data_folder, capsys):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from brakeline.deploy.cli import COMMANDS
 from tests.browser import CHROMIUM, Page
 
 ROOT = Path(__file__).parent.parent.parent
@@ -32,6 +33,28 @@ def test_every_page_is_in_the_menu(site: Path) -> None:
         assert (site / f"{page.stem}.html").exists()
         assert f'href="{page.stem}.html"' in start, f"{page.name} is a row of mkdocs.yml's nav"
     assert (site / "results" / "ground" / "curves.png").exists()
+
+
+def test_the_start_page_shows_what_the_readme_shows(site: Path) -> None:
+    start = (site / "index.html").read_text()
+    assert "Three uses" in start and "quadrotor, after 40,000 steps: goals" in start
+    assert "<!-- README" not in start and 'href="results_scans.html"' in start
+
+
+def test_the_reference_shows_docstrings_and_help(site: Path) -> None:
+    python, line = (site / "api.html").read_text(), (site / "cli.html").read_text()
+    assert "Request the decision on an action and commit to its plan." in python, "the protocol of the clients"
+    assert '<span class="gp">' in python, "examples are code"
+    for command, entry in COMMANDS.items():
+        assert f'id="{command}"' in line and f"usage: brakeline {command} " in line and entry.summary in line, command
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the site was not searched")
+def test_the_search_finds_in_pages_that_are_opened_as_files(site: Path, tmp_path: Path) -> None:
+    with Page(tmp_path) as page:
+        page.open((site / "faq.html").as_uri() + "?q=cite")
+        page.until("document.querySelectorAll('.md-search-result__item').length > 0")
+        assert _asked_elsewhere(page, site.as_uri()) == []
 
 
 @pytest.fixture
@@ -57,6 +80,16 @@ def test_the_search_finds_and_nothing_is_asked_of_others(served: str, tmp_path: 
         shown = page.value("document.querySelector('.md-search-result__list').textContent")
         assert "Glossary" in shown
         assert _asked_elsewhere(page, served) == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: no code was copied")
+def test_every_command_of_the_tutorial_can_be_copied(served: str, tmp_path: Path) -> None:
+    with Page(tmp_path) as page:
+        page.open(served + "tutorial_4_policy.html")
+        page.until("document.querySelectorAll('.md-clipboard, .md-code__button').length > 0")
+        blocks = page.value("document.querySelectorAll('article pre').length")
+        assert page.value("document.querySelectorAll('.md-clipboard, .md-code__button').length") == blocks
+        assert page.value("document.querySelectorAll('article pre .k').length") > 0, "Python is highlighted"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: no formula was drawn")

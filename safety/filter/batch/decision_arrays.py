@@ -47,16 +47,28 @@ class DecisionArrays:
 
     Attributes:
         kind (B,): index in `KINDS`: 0 allowed, 1 adjusted, 2 failsafe, 3 recovering.
-        plan (B, N, m), tube_center, tube_half_width (B, N, d), margin, verified, at_least, contained, compared (B,):
-            see `Decision`.
-        predicted_center, predicted_half_width (B, n), predicted_heading (B,): the set of the next measured state.
+        plan (B, N, m): see `Decision`.
+        tube_center (B, N, d): see `Decision`.
+        tube_half_width (B, N, d): see `Decision`.
+        margin (B,): see `Decision`.
+        verified (B,): see `Decision`.
+        at_least (B,): see `Decision`.
+        contained (B,): see `Decision`.
+        compared (B,): see `Decision`.
+        predicted_center (B, n): center of the set of the next measured state.
+        predicted_half_width (B, n): its half-widths.
+        predicted_heading (B,): heading of its frame [rad].
         for_clearance (B,): see `Decision`; false where that is None.
-        score (B,), scored (B,): see `Decision`; a row that is not scored has no score.
-        steps (B,): of the solver.
-        proposal_margin (B,) [m]: the margin of the proposal; NaN where the single path decided.
+        score (B,): see `Decision`.
+        scored (B,): whether the row has a score.
+        steps (B,): number of steps of the solver.
+        proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
         blocked: what the proposals of adjusted rows violated.
         singly: the decisions of the rows that the single path decided, by row.
-        obstacles: those of the requests. model, bound, judges: see `Decision`.
+        obstacles: those of the requests.
+        model: see `Decision`.
+        bound: see `Decision`.
+        judges: see `Decision`.
         time_ms: time for the whole batch, divided by its rows.
     """
 

@@ -34,8 +34,13 @@ class ObstacleArrays:
     [1, 0]
 
     Attributes:
-        center, half, round (B, K, d), axes (B, K, d, d), rho, margin (B, K): see `Shapes`.
-        count (B,): integers.
+        center (B, K, d): see `Shapes`.
+        axes (B, K, d, d): see `Shapes`.
+        half (B, K, d): see `Shapes`.
+        rho (B, K): see `Shapes`.
+        round (B, K, d): see `Shapes`.
+        margin (B, K): see `Shapes`.
+        count (B,): number of obstacles of each request, integers.
     """
 
     center: Array

@@ -25,7 +25,9 @@ class PredictionArrays:
     np.int64(1)
 
     Attributes:
-        center, half_width (B, n), heading (B,).
+        center (B, n): see `Prediction`.
+        half_width (B, n): see `Prediction`.
+        heading (B,): see `Prediction`.
         given (B,): whether the robot has one; the other rows are ignored.
     """
 
@@ -44,7 +46,9 @@ class PastArrays:
     (2, 4, 2)
 
     Attributes:
-        states (B, N, n), inputs (B, N + 1, m), from_start (B,).
+        states (B, N, n): see `PastWindow`.
+        inputs (B, N + 1, m): see `PastWindow`.
+        from_start (B,): see `PastWindow`.
         given (B,): whether the robot has one; the other rows are ignored.
     """
 
@@ -69,12 +73,16 @@ class RequestArrays:
     (3, (3, 3, 2), [0.2, 0.0])
 
     Attributes:
-        state (B, n), action (B, m), input_in_force (B, m), plan (B, N, m): float64.
+        state (B, n): float64, as the other arrays of numbers.
+        action (B, m): proposals.
+        input_in_force (B, m): inputs of the period before.
+        plan (B, N, m): rests of the backup plans.
         obstacles: at least those within `Filter.reach`.
         known_free (B,): all space within reach is free, apart from the obstacles; bool.
         widening (B,): factor on every set, at least 1. None: 1 for all.
         model: version of the model set that verified the plan, for each robot or for all of them.
-        predicted, past: None if no robot has one.
+        predicted: None if no robot has one.
+        past: None if no robot has one.
     """
 
     state: Array

@@ -1,0 +1,130 @@
+"""Laws of README and pages: no dead link, no missing file, no figure or message that the code does not give."""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+import brakeline
+from brakeline import ModelSet
+
+pytestmark = pytest.mark.fast
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+PARTS = ("actors", "brakeline", "deploy", "learner", "logs", "messaging", "safety", "sim")
+METHODS = ("ddpc", "sailr", "secas", "none")  # in the order of the tables
+
+LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
+CODE = re.compile(r"`([^`\n]+)`")
+FILE = re.compile(r"[\w.+-]+/[\w./+-]*|[\w-]+\.(?:py|md|toml|proto|yaml|js)")
+
+
+def dead_links(page: Path) -> list[str]:
+    """Return the relative links of a page that lead to no file."""
+    return [link for link in LINK.findall(page.read_text()) if not (page.parent / link).exists()]
+
+
+def missing_files(table: str) -> list[str]:
+    """Return the files and folders that the rows of a table name in code, and that the repository does not have."""
+    missing = []
+    for row in table.splitlines():
+        folder = ROOT
+        for code in CODE.findall(row if row.startswith("|") else ""):
+            if not FILE.fullmatch(code) or code.isupper() or any(word.isupper() for word in re.split(r"[/._]", code)):
+                continue  # a name that stands for a name: `policies/ROBOT/NAME.safetensors`
+            if (ROOT / code).exists() or (folder / code).exists() or (ROOT / "brakeline" / code).exists():
+                folder = ROOT / code if (ROOT / code).is_dir() else folder
+            else:
+                missing.append(code)
+    return missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_link_is_dead(page: Path) -> None:
+    assert dead_links(page) == []
+
+
+def test_a_dead_link_is_found(tmp_path: Path) -> None:
+    (tmp_path / "page.md").write_text("[a](page.md#top), [b](https://b.org/c), [d](gone.md)")
+    assert dead_links(tmp_path / "page.md") == ["gone.md"]
+
+
+@pytest.mark.parametrize("page", [README, ROOT / "docs" / "extending.md"], ids=lambda page: page.name)
+def test_the_tables_name_files_that_exist(page: Path) -> None:
+    assert missing_files(page.read_text()) == []
+
+
+def test_a_missing_file_is_found() -> None:
+    table = "| `sim/` | `batch/`, `sim/arena.py` |\n| a row | `sim/gone.py` of `policies/ROBOT/NAME.safetensors` |"
+    assert missing_files(table) == ["sim/gone.py"]
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.read_text().splitlines()) <= 150
+
+
+def cells(text: str, row: str) -> list[str]:
+    """Return the cells of the first row of a table that begins with `row`."""
+    line = next(line for line in text.splitlines() if line.startswith(f"| {row} |"))
+    return [cell.split("*")[0].strip() for cell in line.strip("| ").split(" | ")[1:]]
+
+
+@pytest.mark.parametrize("robot", ["ground", "quadrotor"])
+def test_the_readme_has_the_figures_of_the_comparison(robot: str) -> None:
+    table = json.loads((ROOT / "results" / robot / "table.json").read_text())
+    default, training = table["parts"]["default"], table["parts"]["training"]
+    text = README.read_text()
+    goals = [f"{100 * default[method]['goal rate']['value']:.1f} %" for method in METHODS]
+    collisions = [f"{100 * default[method]['collision rate']['value']:.1f} %" for method in METHODS]
+    periods = [f"{training[method]['pre-training samples']:,}" for method in METHODS]
+    assert cells(text, f"{robot}, after {table['steps']:,} steps: goals") == goals
+    assert cells(text, f"{robot}: collisions") == collisions
+    assert cells(text, f"{robot}: recorded periods before training") == periods
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/faq.md", "docs/index.md"])
+def test_the_pages_state_the_bounds_of_the_shipped_model_sets(name: str) -> None:
+    """A bound is rounded up."""
+    text = (ROOT / name).read_text()
+    for robot in ("ground", "quadrotor"):
+        bound = float(ModelSet.load(robot).about["bound_plan"])
+        assert f"{math.ceil(1e4 * bound) / 100:.2f} %" in text, robot
+
+
+def texts_in_code() -> str:
+    """Return every string of the package, with … in place of each value that is filled in."""
+    found = []
+    for part in PARTS:
+        for file in (ROOT / part).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.JoinedStr):
+                    found.append("".join(v.value if isinstance(v, ast.Constant) else "…" for v in node.values))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    found.append(node.value)
+    return "\n".join(found)
+
+
+def test_every_message_of_troubleshooting_is_in_the_code() -> None:
+    page, code = (ROOT / "docs" / "troubleshooting.md").read_text(), texts_in_code()
+    messages = re.findall(r"^\| `([^`]+(?:`[^`|]+`[^`|]*)*)` \|", page, re.MULTILINE)
+    assert len(messages) > 20
+    parts = [part.strip() for message in messages for part in message.split("…")]
+    assert [part for part in parts if part and part not in code] == []
+
+
+def test_the_tutorial_shows_the_example_as_it_is() -> None:
+    page = (ROOT / "docs" / "tutorial_4_policy.md").read_text()
+    assert f"```python\n{(ROOT / 'examples' / 'my_policy.py').read_text()}```" in page
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    shown = re.findall(r"^::: brakeline\.(\w+)$", page, re.MULTILINE)
+    assert sorted(shown) == sorted(set(brakeline.__all__) - {"__version__"})
