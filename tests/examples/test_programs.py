@@ -50,7 +50,7 @@ def test_the_cart_stops_before_the_wall(capsys):
 def test_the_filter_ends_the_collisions_of_a_policy_that_knows_no_obstacles():
     names = runpy.run_path(str(EXAMPLES / "my_policy.py"))
     env = gymnasium.make("brakeline.envs:brakeline/Ground-v0", arena="dense")
-    assert " 2 collisions, 0 steps changed" in names["drive"](env, 2)
+    assert names["drive"](env, 2) == "1 goals, 1 collisions, 0 steps changed"
     assert " 0 collisions, " in names["drive"](SafetyWrapper(env, Filter.load("ground")), 2)
 
 

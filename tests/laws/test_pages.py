@@ -6,12 +6,14 @@ import ast
 import json
 import math
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import brakeline
 from brakeline import ModelSet
+from brakeline.deploy.cli import parse
 
 pytestmark = pytest.mark.fast
 
@@ -122,6 +124,19 @@ def test_every_message_of_troubleshooting_is_in_the_code() -> None:
 def test_the_tutorial_shows_the_example_as_it_is() -> None:
     page = (ROOT / "docs" / "tutorial_4_policy.md").read_text()
     assert f"```python\n{(ROOT / 'examples' / 'my_policy.py').read_text()}```" in page
+
+
+def commands(page: str) -> list[str]:
+    """Return the commands of a page without redirections and comments; not those with a … in them."""
+    lines = re.findall(r"^ *(brakeline [^\n]+)$", page, re.MULTILINE)
+    return [line.partition(" > ")[0] for line in lines if "…" not in line and "..." not in line]
+
+
+@pytest.mark.parametrize("page", [README, *sorted((ROOT / "docs").glob("t*.md"))], ids=lambda page: page.name)
+def test_every_command_of_readme_and_tutorial_can_be_parsed(page: Path) -> None:
+    for command in commands(page.read_text()):
+        name, *words = shlex.split(command, comments=True)[1:]
+        parse(name, words)
 
 
 def test_every_public_name_is_in_the_reference() -> None:
