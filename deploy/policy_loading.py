@@ -34,19 +34,24 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
     policies = robot.task.policies
     if name in policies:
         return scripted(name, robot, np.random.default_rng(seed))
-    if name == UNTRAINED:
-        return driving(MLP.untrained(robot, seed))
     if name.endswith(".csv"):
         return replayed(Path(name), robot)
+    return driving(network_named(name, robot, seed))
+
+
+def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
+    """Return the network with this name or file; see `policy_named`."""
+    if name == UNTRAINED:
+        return MLP.untrained(robot, seed)
     stored = _stored(robot)
     path = stored.get(name, Path(name))
     if not path.is_file():
-        names = ", ".join([*sorted(stored), UNTRAINED, *policies])
+        names = ", ".join([*sorted(stored), UNTRAINED, *robot.task.policies])
         raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
     if robot.late:
         with suppress(BadWeights):  # the weights may be of a training in lockstep
-            return driving(MLP.load(path, robot.in_lockstep()))
-    return driving(MLP.load(path, robot))
+            return MLP.load(path, robot.in_lockstep())
+    return MLP.load(path, robot)
 
 
 def _stored(robot: RobotWithTask) -> dict[str, Path]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, errors, print_result
@@ -32,6 +32,8 @@ class EvaluateCommand:
     """Drive this many episodes. A fleet counts those of all its robots, and completes each world."""
     fleet: int = 0
     """Let this many robots share one world and avoid each other. 0 evaluates one robot alone."""
+    backend: Literal["single", "batch"] = "single"
+    """Simulate one robot after the other, or many ground robots at once (batch: several times faster, for networks)."""
     seed: options.Seed = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
@@ -28,9 +28,11 @@ from brakeline.sim.sim_conditions import Conditions
 
 FRESH = 1_000_000  # added to the seed, so that no training run has the same episodes
 EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
+EPISODES_OF_A_BATCH = 1000  # the same for a batch, which waits for its last episodes at the end of a part
 POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
 
 Each = Callable[[EpisodeStats], Any]
+Backend = Literal["single", "batch"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Evaluation:
     seed: int = 0
     conditions: Conditions = field(default_factory=Conditions)
     fleet: int = 0  # robots in one world; 0: each episode's robot is alone
+    backend: Backend = "single"  # batch: many robots at once, each alone (deploy/experiments/batch_evaluation.py)
     accept_bound: float | None = None  # the largest stated bound that is accepted; None: the robot's own limit
 
 
@@ -176,6 +179,11 @@ class EvaluationPart:
     def drive(self, each: Each) -> DrivenEpisodes:
         """Drive the episodes. Calls `each` after every episode with the statistics so far."""
         robot, what, world = self.robot_with_task, self.what, None
+        if what.backend == "batch":
+            from brakeline.deploy.experiments.batch_evaluation import drive_batch
+
+            stats, periods = drive_batch(robot, what, self.first, self.rounds, each)
+            return DrivenEpisodes(stats, periods, 0)
         if what.fleet:
             group, world, policies, question = prepare_fleet(robot, what, self.first)
         else:
@@ -205,7 +213,8 @@ def parts_of(robot: RobotWithTask, what: Evaluation) -> list[EvaluationPart]:
     robots.
     """
     rounds = -(-what.episodes // max(what.fleet, 1))
-    size = max(rounds, 1) if what.policy.endswith(".csv") else EPISODES_A_PART
+    size = EPISODES_OF_A_BATCH if what.backend == "batch" else EPISODES_A_PART
+    size = max(rounds, 1) if what.policy.endswith(".csv") else size
     content = path.read_bytes() if (path := Path(what.policy)).is_file() else None
     firsts = range(0, rounds, size)
     return [EvaluationPart(robot, what, first, min(size, rounds - first), content) for first in firsts]
@@ -257,5 +266,6 @@ def _figures(robot: RobotWithTask, what: Evaluation, parts: Sequence[DrivenEpiso
         "arena": what.arena,
         "perception": perception_in(what.conditions.describe()),
         "seed": what.seed,
+        "backend": what.backend,
         "conditions": what.conditions.describe(),
     }

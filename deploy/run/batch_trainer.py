@@ -7,25 +7,19 @@ the same weights.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.episode_runner import EPISODE_STRIDE, ActorIdentity
+from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.errors import LaunchError
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.batch.decision_arrays import KINDS
-from brakeline.safety.filter.batch.plan_batch import BatchOutcome
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.gym_batch import BatchSafetyWrapper
-from brakeline.safety.service.wire import KIND_NUMBERS
-from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.scripted_policies import RandomPolicy
 from brakeline.sim.sim_conditions import Conditions
 
@@ -74,21 +68,26 @@ class BatchTrainer:
         self.actors = actor_names(name, size)
         self._episodes = [self._join(actor) for actor in self.actors]
         self._identities = [ActorIdentity(actor, i, seed) for i, actor in enumerate(self.actors)]
-        env = BatchNavigationEnv(
-            robot, size, arena, conditions=conditions, seed_key=seed, episode_seeds=self._next_episode_seed
+        self._robots = BatchRobots(
+            robot,
+            self.actors,
+            safety,
+            self._next_episode,
+            arena=arena,
+            seed_key=seed,
+            penalty=penalty,
+            accept_bound=accept_bound,
+            conditions=conditions,
         )
-        self._env = BatchSafetyWrapper(env, safety, penalty, accept_bound)
-        self._steps, self._index = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         # A resumed run draws other noise than the interrupted one: it begins with other episodes, too.
         self._rng = np.random.default_rng((seed, EPISODE_STRIDE, learner.steps))
         self._random = [RandomPolicy(robot, rng) for rng in self._rng.spawn(size)]
         self._load()
-        self._now, infos = self._env.reset()
-        self._announce(range(size), infos)
+        self._announce(range(size))
 
     def close(self) -> None:
         """End the threads of the environment."""
-        self._env.close()
+        self._robots.close()
 
     def period(self) -> None:
         """Run one period of all robots, and make the updates that are due. After the last step, only the updates."""
@@ -97,60 +96,26 @@ class BatchTrainer:
             return
         proposals = self._propose()
         self.learner.flow()  # permits the steps of this period
-        seen, steps, index, episodes = self._now, self._steps.copy(), self._index + 1, self._now_in()
-        outcome = self._env.begin_step(proposals)
+        self._robots.begin_period(proposals)
         self.learner.work(ALL_DUE)
         if self.learner.weights_due():
             self.learner.publish()
-        version = self.policy.version
-        self._now, rewards, terminated, truncated, infos = self._env.end_step()
-        after = infos.get("final_info", infos)
-        columns = {
-            "episode": episodes,
-            "step": steps,
-            "index": index,
-            "observation": seen,
-            "proposed": np.where(outcome.decided[:, None] | np.isfinite(proposals), proposals, outcome.inputs),
-            "action": outcome.inputs,
-            "next_observation": infos.get("final_obs", self._now),
-            "reward": rewards + infos["penalty"],
-            "penalty": infos["penalty"],
-            "terminated": terminated,
-            "truncated": truncated,
-            "goal": after["at_goal"],
-            "state": after["state"],
-            "true_state": after["true_state"],
-            "path": after["subsamples"].reshape(self._size, -1),
-            **{name: after[name] for name in ("collision", "speed", "clearance", "outside", "turned")},
-            **{name: infos[name] for name in ("compared", "contained")},
-            **_decisions(outcome),
-        }
-        for i, step in enumerate(self._messages(columns, after["time"], version)):
+        steps, begun = self._robots.end_period(self.policy.version)
+        for i, step in enumerate(steps):
             self.learner.insert(step)
             self._sink(i, step)
-        self._steps, self._index = self._steps + 1, index
-        ended = np.flatnonzero(terminated | truncated)
-        self._steps[ended] = 0
-        self._announce(ended.tolist(), infos)
+        self._announce(begun)
         if self.learner.weights().version != self.policy.version:
             self._load()
 
     def _propose(self) -> Array:
         """Return the exploring policy's actions (N, m); during warm-up, random ones."""
+        now = self._robots.observations
         if self.learner.warming_up:
-            inputs = zip(self._random, self._now, self._steps * self._robot.period, strict=True)
+            inputs = zip(self._random, now, self._robots.steps * self._robot.period, strict=True)
             return np.array([policy(observation, {"time": time}) for policy, observation, time in inputs])
         noise = self.policy.noise * self._rng.standard_normal((self._size, self._robot.action_dim))
-        return self.policy.of_many(self._now, noise)
-
-    def _messages(self, columns: dict[str, Any], times: Array, version: int) -> Iterator[pb.Step]:
-        """Yield the message of each robot's step, from columns with a row for each robot."""
-        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        common: dict[str, Any] = {"robot": self._robot.name, "weights_version": version}
-        for actor, time, row in zip(self.actors, times.tolist(), rows, strict=True):
-            step = pb.Step(actor=actor, **common, **dict(zip(columns, row, strict=True)))
-            step.header.time = time
-            yield step
+        return self.policy.of_many(now, noise)
 
     def _join(self, actor: str) -> int:
         """Let a robot join. Returns the number of its next episode."""
@@ -160,31 +125,16 @@ class BatchTrainer:
             raise LaunchError(f"the learner refuses {actor}: {reply.error.message}")
         return reply.episode
 
-    def _now_in(self) -> NDArray[np.int64]:
-        """Return the number (N,) of each robot's present episode. The environment begins the next one by itself."""
-        return np.array(self._episodes) - 1
-
-    def _next_episode_seed(self, number: int) -> int:
-        """Return the seed of a robot's next episode, which begins now."""
+    def _next_episode(self, number: int) -> tuple[int, int]:
+        """Return number and seed of a robot's next episode, which begins now."""
         self._episodes[number] += 1
-        return self._identities[number].episode_seed(self._episodes[number] - 1)
+        episode = self._episodes[number] - 1
+        return episode, self._identities[number].episode_seed(episode)
 
-    def _announce(self, rows: Any, infos: dict[str, Any]) -> None:
+    def _announce(self, robots: Iterable[int]) -> None:
         """Publish the episodes that have begun."""
-        for i in rows:
-            arena = infos["arena"][i]
-            message = pb.Episode(
-                robot=self._robot.name,
-                actor=self.actors[i],
-                episode=self._episodes[i] - 1,
-                arena=arena.name,
-                obstacles=obstacle_messages(arena.obstacles),
-                goal=arena.goal,
-                goal_radius=arena.goal_radius,
-                start=infos["state"][i].tolist(),
-                seed=int(infos["episode_seed"][i]),
-            )
-            self._sink(i, message)
+        for i in robots:
+            self._sink(i, self._robots.episode_message(i))
 
     def _load(self) -> None:
         """Take over the learner's weights."""
@@ -194,18 +144,3 @@ class BatchTrainer:
 def actor_names(process: str, size: int) -> list[str]:
     """Return the names of the robots of a process on the bus."""
     return [f"{process}.{i}" for i in range(size)]
-
-
-def _decisions(outcome: BatchOutcome) -> dict[str, Any]:
-    """Return what a step records of its decision. A row without one brakes."""
-    answers, decided = outcome.answers, outcome.decided
-    if answers is None:
-        failsafe = np.full(len(decided), pb.FAILSAFE)
-        return {"fallback": ~decided, "decision": failsafe, "decide_ms": np.zeros(len(decided))}
-    numbers = np.array([KIND_NUMBERS[kind] for kind in KINDS])
-    return {
-        "fallback": ~decided,
-        "decision": np.where(decided, numbers[answers.kind], pb.FAILSAFE),
-        "decide_ms": np.full(len(decided), answers.time_ms),
-        "for_clearance": answers.for_clearance,
-    }

@@ -110,7 +110,7 @@ def test_consecutive_steps_of_a_robot_continue_each_other_over_the_ends_of_episo
 
 def infos(trainer: BatchTrainer) -> list[dict[str, Any]]:
     """Return what a scripted policy needs of each robot."""
-    env = trainer._env.unwrapped
+    env = trainer._robots._env
     return [{"state": state, "goal": goal} for state, goal in zip(env._robots.measured, env._goals, strict=True)]
 
 
