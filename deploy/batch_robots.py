@@ -93,7 +93,7 @@ class BatchRobots:
         self.observations, rewards, terminated, truncated, infos = end_step()
         after, size = infos.get("final_info", infos), len(self.names)
         penalty = infos.get("penalty", np.zeros(size))
-        columns: dict[str, NDArray[Any]] = {
+        columns: dict[str, Any] = {
             "episode": episodes,
             "step": steps,
             "index": index,
