@@ -33,13 +33,17 @@ from brakeline.errors import (
 )
 
 if TYPE_CHECKING:
+    from brakeline.deploy.data.certification import certify
+    from brakeline.deploy.data.environment_episodes import collect
     from brakeline.messaging.bus import BusSettings
     from brakeline.messaging.obstacle import Obstacle, Shapes
     from brakeline.messaging.obstacle_motion import Motion
     from brakeline.messaging.range_image import RangeImage
     from brakeline.messaging.robot import Disc, Limit, Robot, robot_named
+    from brakeline.messaging.robot_description import robot_from_description
     from brakeline.messaging.scan import Scan
     from brakeline.messaging.task import RobotWithTask, Task, robot_with_task
+    from brakeline.safety.action_mapping import ActionMapping, normalised
     from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
     from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
     from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
@@ -59,13 +63,17 @@ if TYPE_CHECKING:
 
 # The modules of the names that are imported at their first use; the same as above, for the interpreter.
 PLACES = {
+    "brakeline.deploy.data.certification": ("certify",),
+    "brakeline.deploy.data.environment_episodes": ("collect",),
     "brakeline.messaging.bus": ("BusSettings",),
     "brakeline.messaging.obstacle": ("Obstacle", "Shapes"),
     "brakeline.messaging.obstacle_motion": ("Motion",),
     "brakeline.messaging.range_image": ("RangeImage",),
     "brakeline.messaging.robot": ("Disc", "Limit", "Robot", "robot_named"),
+    "brakeline.messaging.robot_description": ("robot_from_description",),
     "brakeline.messaging.scan": ("Scan",),
     "brakeline.messaging.task": ("RobotWithTask", "Task", "robot_with_task"),
+    "brakeline.safety.action_mapping": ("ActionMapping", "normalised"),
     "brakeline.safety.filter.backup_plan": ("BackupPlan", "Prediction"),
     "brakeline.safety.filter.batch.decision_arrays": ("DecisionArrays",),
     "brakeline.safety.filter.batch.obstacle_arrays": ("ObstacleArrays",),
@@ -87,13 +95,14 @@ _PLACE_OF = {name: module for module, names in PLACES.items() for name in names}
 
 # fmt: off
 __all__ = [
-    "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan", "BadShape", "BusError",
-    "BusSettings", "Dataset", "Decision", "DecisionArrays", "Disc", "ErrorBoundError", "Filter", "FilterClient",
-    "FleetClient", "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion", "NoReply", "Obstacle",
-    "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage", "Refused", "Request",
-    "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper", "Scan", "Shapes", "Task",
-    "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__",
-    "filled", "fit_model_set", "memory_of", "robot_named", "robot_with_task", "validate",
+    "ActionMapping", "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan",
+    "BadShape", "BusError", "BusSettings", "Dataset", "Decision", "DecisionArrays", "Disc", "ErrorBoundError",
+    "Filter", "FilterClient", "FleetClient", "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion",
+    "NoReply", "Obstacle", "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage", "Refused",
+    "Request", "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper", "Scan",
+    "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__", "certify",
+    "collect", "filled", "fit_model_set", "memory_of", "normalised", "robot_from_description", "robot_named",
+    "robot_with_task", "validate",
 ]
 # fmt: on
 

@@ -3,14 +3,16 @@
 import gymnasium
 import numpy as np
 
-from brakeline.deploy.data.certification import certify
-from brakeline.deploy.data.environment_episodes import collect
-from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot_description import robot_from_description
-from brakeline.safety.action_mapping import normalised
-from brakeline.safety.filter.filter import Filter
-from brakeline.safety.gym import SafetyWrapper
-from brakeline.safety.model.model_set import ModelConfig
+from brakeline import (
+    Filter,
+    ModelConfig,
+    Obstacle,
+    SafetyWrapper,
+    certify,
+    collect,
+    normalised,
+    robot_from_description,
+)
 
 
 class Cart(gymnasium.Env):

@@ -143,7 +143,18 @@ def _parse(text: str, source: str) -> Robot:
 def robot_from_description(values: Any, source: str = "this") -> Robot:
     """Return the robot that a description, as nested dicts, defines.
 
+    >>> cart = {
+    ...     "name": "cart", "period": 0.1, "sight": 3.0, "plan": {"horizon": 6, "brake": 1},
+    ...     "state": {axis: {"unit": "m", "role": "position", "error": 0.0} for axis in "xy"}
+    ...     | {"vx": {"unit": "m/s", "error": 0.0}, "vy": {"unit": "m/s", "error": 0.0}},
+    ...     "input": {name: {"unit": "m/s", "low": -1.0, "high": 1.0} for name in ("to vx", "to vy")},
+    ...     "body": [{"at": [0.0, 0.0], "radius": 0.2}],
+    ... }
+    >>> robot_from_description(cart).action
+    ('to vx [m/s]', 'to vy [m/s]')
+
     Args:
+        values: the tables of a description's file.
         source: name of the description in error messages.
 
     Raises:

@@ -22,6 +22,10 @@ SAME_BOUND = 1e-6  # of an input's range: rounding error of bounds in single pre
 class ActionMapping:
     """A mapping and its inverse. For a vector environment, both also map k actions at once, (k, m).
 
+    >>> in_cm = ActionMapping(lambda action: action / 100.0, lambda control: 100.0 * control)
+    >>> in_cm.action_to_control(np.array([25.0, 0.0])).tolist()
+    [0.25, 0.0]
+
     Attributes:
         action_to_control: from an action of the environment to an input (m,) of the robot.
         control_to_action: from an input (m,) to an action.
@@ -35,7 +39,12 @@ IDENTITY = ActionMapping(lambda action: action, lambda control: control)
 
 
 def normalised(robot: Robot) -> ActionMapping:
-    """Return the mapping for actions in [-1, 1]: -1 is each input's lowest value, 1 its highest."""
+    """Return the mapping for actions in [-1, 1]: -1 is each input's lowest value, 1 its highest.
+
+    >>> from brakeline import robot_named
+    >>> normalised(robot_named("ground")).action_to_control([1.0, 0.0]).tolist()
+    [0.25, 0.0]
+    """
     low, width = robot.low(), robot.high() - robot.low()
     return ActionMapping(
         lambda action: low + 0.5 * width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0),
@@ -55,7 +64,7 @@ def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMa
         f"{name} from {low:g} to {high:g}"
         for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
     )
-    give = "give actions=Actions(action_to_control, control_to_action)"
+    give = "give actions=ActionMapping(action_to_control, control_to_action)"
     if not isinstance(space, gymnasium.spaces.Box) or space.shape != (robot.action_dim,):
         raise Mismatch(f"the action space {space} is not that of {robot.name}'s inputs ({inputs}): {give}")
     near = SAME_BOUND * (robot.high() - robot.low())

@@ -43,6 +43,10 @@ def certify(
     widened sets. Nothing is widened if there are too few plans for the limit, or if the factor would be above
     `MAX_INFLATION`.
 
+    >>> model, report = certify(Dataset.load(RECORDING), ModelConfig())
+    >>> model.about["bound_plan"] == f"{report.bound_plan:g}"
+    True
+
     Args:
         data: the recorded trajectories.
         model_config: error bound, mode, windows and first inflation.

@@ -52,7 +52,17 @@ def collect(
     If an episode ends with `terminated` (for example by a collision), its last period is dropped. If `disturbed`
     returns True, something else than the input moved the robot, and the trajectory ends before that period.
 
+    >>> from brakeline import robot_named
+    >>> env = gymnasium.make("brakeline.envs:brakeline/Ground-v0")
+    >>> data = collect(env, robot_named("ground"), periods=30, shown=False)
+    >>> sum(len(trajectory.inputs) for trajectory in data.trajectories)
+    30
+
     Args:
+        env: the environment.
+        robot: the robot's description.
+        periods: number of periods to record.
+        seed: draws the inputs and the episodes.
         held: largest number of periods for which an input is held: enough to reach the top speed.
         state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.
         actions: mapping between actions and inputs, as in `SafetyWrapper`.

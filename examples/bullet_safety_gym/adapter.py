@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from brakeline.messaging.obstacle import Obstacle
+from brakeline import Obstacle
 from examples.foreign.adapter import Adapter, Array
 
 ROOM = 9.9  # m from the middle to each wall

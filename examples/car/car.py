@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot, robot_named
+from brakeline import Robot, robot_named
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.planar_robot import PlanarRobot

@@ -12,9 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import WALL, Obstacle
-from brakeline.messaging.robot import robot_named
-from brakeline.safety.action_mapping import ActionMapping
+from brakeline import ActionMapping, Obstacle, robot_named
 
 Array = NDArray[np.float64]
 
@@ -75,7 +73,7 @@ class Adapter(ABC):
         return [
             o
             for o in self.obstacles(env, observation, info)
-            if o.kind == WALL or math.dist(o.position, position) - o.size[0] - max(o.margin, 0.0) <= self.robot.sight
+            if o.kind == "wall" or math.dist(o.position, position) - o.size[0] - max(o.margin, 0.0) <= self.robot.sight
         ]
 
     def actions(self) -> ActionMapping:

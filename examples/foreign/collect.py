@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from brakeline.deploy.data.environment_episodes import collect
+from brakeline import collect
 from examples.foreign.adapter import load_adapter
 
 

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from brakeline.messaging.obstacle import CYLINDER, Obstacle
+from brakeline import Obstacle
 from examples.foreign.adapter import Adapter, Array
 
 CELL = 0.25  # edge of a cell, and extra clearance from the discs, as shares of the body's radius
@@ -30,7 +30,7 @@ class DistanceField:
         x, y = np.meshgrid(axis, axis, indexing="ij")
         cost = np.ones((count, count))
         for o in obstacles:
-            if o.kind == CYLINDER:
+            if o.kind == "cylinder":
                 reach = o.size[0] + o.margin + body + self.cell
                 cost[np.hypot(x - o.position[0], y - o.position[1]) < reach] = DISC_COST
         self.distance = np.full((count, count), np.inf)

@@ -22,8 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from brakeline.safety.gym import SafetyWrapper
-from brakeline.safety.service.client import SafetyClient
+from brakeline import SafetyClient, SafetyWrapper
 from examples.foreign.adapter import FOLDERS, Adapter, load_adapter
 from examples.foreign.policies import POLICIES
 

@@ -19,12 +19,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from brakeline import SafetyClient
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.learner.td3 import TD3
 from brakeline.safety import action_mapping
-from brakeline.safety.service.client import SafetyClient
 from examples.foreign.adapter import FOLDERS, Adapter, load_adapter
 from examples.foreign.run import DEADLINE, EpisodeFigures, filtered_task, report
 from examples.foreign.trained import TrainedPolicy, Vector, mean_and_spread, normalised

@@ -10,7 +10,7 @@ import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline import Robot
 from examples.foreign.adapter import Array
 
 Vector = NDArray[np.float32]

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from brakeline.messaging.obstacle import Obstacle
+from brakeline import Obstacle
 from examples.foreign.adapter import Adapter, Array
 
 STEP = {"car": 0.04, "point": 0.02}  # s, of the environment

@@ -17,9 +17,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from brakeline import Filter, InProcess, ModelSet
+from brakeline import Filter, InProcess, ModelSet, robot_named
 from brakeline.deploy.cli import main as brakeline
-from brakeline.messaging.robot import robot_named
 
 DESCRIPTION = Path(__file__).with_name("two_link_arm.toml")
 ROBOT = robot_named(str(DESCRIPTION))

@@ -54,7 +54,7 @@ def test_the_filter_ends_the_collisions_of_a_policy_that_knows_no_obstacles():
     assert " 0 collisions, " in names["drive"](SafetyWrapper(env, Filter.load("ground")), 2)
 
 
-def test_the_notebook_runs_from_top_to_bottom(data_folder, capsys):
+def test_the_notebook_runs_from_top_to_bottom(capsys):
     matplotlib.use("Agg")
     names: dict[str, object] = {}
     for cell in json.loads((EXAMPLES / "a_decision.ipynb").read_text())["cells"]:
