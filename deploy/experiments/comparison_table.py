@@ -175,9 +175,14 @@ def markdown(figures: dict[str, Any]) -> str:
     lines = [
         f"# {robot}",
         "",
-        f"{figures['steps']} training steps, seeds {seeds}; {figures['episodes']} episodes a seed, the same for all "
-        "methods. In brackets: 95 % intervals by the hierarchical bootstrap (seed, then episode). In italics: the "
-        "paper's figures, of its own task. Decision times are of policy and method together.",
+        f"Every method after {figures['steps']} training steps, seeds {seeds}; {figures['episodes']} episodes for "
+        "each seed, the same for all methods. In brackets: 95 % intervals by the hierarchical bootstrap (seed, then "
+        "episode). In italics: the paper's figures, for its own task. Decision times are of policy and method "
+        "together.",
+        "",
+        "Before training, the methods knew the robot from the recorded periods in the row *pre-training samples*. If "
+        f"a seed did not reach 90 % of goals, {figures['steps']} counts as its steps to 90 %. Ours gets obstacles from "
+        "the arena's map. SAILR and SECAS decide by the rays that the policy observes.",
         "",
     ]
     for part, methods in figures["parts"].items():
