@@ -3,12 +3,14 @@
 - Pictures in results/ are part of the site. Links to the repository's other files become words.
 - `<!-- README: TITLE -->` becomes that section of the README, `<!-- README -->` its text above the first section.
 - `<!-- HELP -->` becomes the help of each command.
+- `<!-- NOTEBOOK: PATH -->` becomes the cells of a notebook with their outputs.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 from pathlib import Path
@@ -19,6 +21,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parent.parent
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!results/)[^)]*\)")
 QUOTED = re.compile(r"<!-- README(?:: (?P<title>.+?))? -->")
+NOTEBOOK = re.compile(r"<!-- NOTEBOOK: (.+?) -->")
 COLUMNS = "76"  # of the help
 
 
@@ -32,6 +35,7 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in the quoted parts, and turn links that are right in the repository into links of the site."""
     markdown = QUOTED.sub(lambda found: readme_section(found["title"]), markdown)
+    markdown = NOTEBOOK.sub(lambda found: cells_of(ROOT / found[1]), markdown)
     if "<!-- HELP -->" in markdown:
         markdown = markdown.replace("<!-- HELP -->", help_of_commands())
     return OUTSIDE.sub(r"\1", markdown).replace("](../results/", "](results/")
@@ -43,6 +47,20 @@ def readme_section(title: str | None) -> str:
     texts = dict(section.split("\n", 1) for section in sections)
     text = first.split("\n", 1)[1] if title is None else texts[title]
     return re.sub(r"\]\((?!https?:)", "](../", text.strip()).replace("](../docs/", "](")
+
+
+def cells_of(notebook: Path) -> str:
+    """Return the cells of a notebook after its title cell, with links as a page in docs/ has them."""
+    parts = []
+    for cell in json.loads(notebook.read_text())["cells"][1:]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            if picture := output.get("data", {}).get("image/png"):
+                parts.append(f"![output](data:image/png;base64,{picture.strip()})")
+            elif "text" in output:
+                parts.append(f"```text\n{''.join(output['text']).strip()}\n```")
+    return "\n\n".join(parts).replace("](../docs/", "](")
 
 
 def help_of_commands() -> str:

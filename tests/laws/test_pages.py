@@ -68,6 +68,15 @@ def test_a_missing_file_is_found() -> None:
     assert missing_files(table) == ["sim/gone.py"]
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_page_names_a_file_that_is_missing(page: Path) -> None:
+    """Take code that begins with a folder of the repository. `brakeline/` also begins the topics of the bus."""
+    codes = CODE.findall(page.read_text())
+    named = [code for code in codes if FILE.fullmatch(code) and not re.search("[A-Z]{3}", code)]
+    top = {folder.name for folder in ROOT.iterdir() if folder.is_dir()} - {"brakeline", "runs", "data"}
+    assert [code for code in named if code.partition("/")[0] in top and not (ROOT / code).exists()] == []
+
+
 def test_the_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 150
 
