@@ -52,6 +52,10 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "Train and evaluate each method from the same seeds, as tables and figures. Resumes from results/.",
             "brakeline compare ground --quick",
         ),
+        "campaign": CommandEntry(
+            "Drive many episodes of many kinds behind the filter, and search for the worst case. Can be resumed.",
+            "brakeline campaign ground --episodes 10000 --search 1000",
+        ),
         "pretrain": CommandEntry(
             "Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"
         ),

@@ -13,9 +13,9 @@ import numpy as np
 
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
-from brakeline.sim.arena_generator import arena_kind
+from brakeline.sim.arena_generator import arena_kind, draw_arena
 from brakeline.sim.delayed_vehicle import simulated_vehicle
-from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.navigation_env import DrawArena, NavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Vehicle
 
@@ -28,7 +28,13 @@ EMPTY_ARENA_SIZE = {2: 50.0, 3: 500.0}
 
 
 def environment(
-    robot: RobotWithTask, arena: str, seed: int, conditions: Conditions | None = None, *, tap: FrameTap | None = None
+    robot: RobotWithTask,
+    arena: str,
+    seed: int,
+    conditions: Conditions | None = None,
+    *,
+    tap: FrameTap | None = None,
+    draw: DrawArena = draw_arena,
 ) -> NavigationEnv:
     """Return the Gymnasium environment of a robot in an arena.
 
@@ -36,6 +42,7 @@ def environment(
         seed: separates its episodes from those of another seed.
         conditions: differences from the recorded robot; None: none.
         tap: is called with each MAVLink frame of a robot that has any.
+        draw: draws the arena of an episode.
 
     Raises:
         UnknownTask: the robot has no simulator.
@@ -44,7 +51,7 @@ def environment(
     conditions = conditions or Conditions()
     make = simulated_vehicle(robot, conditions, tap)
     arena_kind(robot, arena)
-    return NavigationEnv(robot, arena, make, conditions=conditions, seed_key=seed)
+    return NavigationEnv(robot, arena, make, conditions=conditions, seed_key=seed, draw=draw)
 
 
 def fleet_world(

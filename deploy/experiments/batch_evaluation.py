@@ -8,14 +8,14 @@ decision has no time of its own; its time is the batch's, divided by its robots.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from brakeline.actors.episode_runner import EPISODE_STRIDE
 from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import network_named
 from brakeline.errors import NoBatch
-from brakeline.logs.episode_stats import EpisodeStats
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.model_config import DDPC
@@ -30,17 +30,14 @@ ONE_BY_ONE = "evaluate without --backend batch"
 
 
 def drive_batch(
-    robot: RobotWithTask, what: Evaluation, first: int, episodes: int, each: Callable[[EpisodeStats], Any]
-) -> tuple[dict[str, EpisodeStats], int]:
+    robot: RobotWithTask, what: Evaluation, first: int, episodes: int, take: Callable[[pb.Step], object]
+) -> None:
     """Drive episodes `first`, `first + 1`, …; whichever robot is free begins the next one.
 
     A robot that finds no episode left drives one that does not count, until all others have ended.
 
     Args:
-        each: called at the end of each episode with the statistics of its robot.
-
-    Returns:
-        The statistics by robot, and the number of control periods.
+        take: called with each step of these episodes. The steps of a robot (`step.actor`) come in order.
 
     Raises:
         NoBatch: this robot, policy, method, arena or fleet can only be evaluated one by one.
@@ -48,46 +45,36 @@ def drive_batch(
     """
     from brakeline.deploy.experiments.evaluate import FRESH
 
-    filter_ = _filter(robot, what)
-    policy = network_named(what.policy, robot, what.seed)
-    left = iter(range(first, first + episodes))
-    spare = iter(range(first + episodes, 10**9))
+    safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
+    numbers = iter(range(first, 2**31))
 
     def next_episode(_: int) -> tuple[int, int]:
-        number = next(left, None)
-        number = next(spare) if number is None else number
+        number = next(numbers)
         return number, number * EPISODE_STRIDE
 
-    names = [f"evaluate.{i}" for i in range(min(-(-episodes // TURNS), MOST_ROBOTS))]
-    stats = {name: EpisodeStats() for name in names}
     robots = BatchRobots(
         robot,
-        names,
-        filter_,
+        [f"evaluate.{i}" for i in range(min(-(-episodes // TURNS), MOST_ROBOTS))],
+        safety,
         next_episode,
         arena=what.arena,
         seed_key=FRESH + what.seed,
         accept_bound=what.accept_bound,
         conditions=what.conditions,
     )
-    ended = periods = 0
+    ended = 0
     try:
         while ended < episodes:
             robots.begin_period(policy.of_many(robots.observations))
             for step in robots.end_period()[0]:
-                if step.episode >= first + episodes:
-                    continue
-                periods += 1
-                stats[step.actor].step(step)
-                if step.terminated or step.truncated:
-                    ended += 1
-                    each(stats[step.actor])
+                if step.episode < first + episodes:
+                    take(step)
+                    ended += step.terminated or step.truncated
     finally:
         robots.close()
-    return stats, periods
 
 
-def _filter(robot: RobotWithTask, what: Evaluation) -> Filter | None:
+def batch_filter(robot: RobotWithTask, what: Evaluation) -> Filter | None:
     """Return the filter, or None for the method `none`. Raises NoBatch if no batch decides by this method."""
     if what.fleet:
         raise NoBatch(f"robots of a fleet see each other, which no batch simulates: {ONE_BY_ONE}")

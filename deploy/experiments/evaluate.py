@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -180,10 +181,7 @@ class EvaluationPart:
         """Drive the episodes. Calls `each` after every episode with the statistics so far."""
         robot, what, world = self.robot_with_task, self.what, None
         if what.backend == "batch":
-            from brakeline.deploy.experiments.batch_evaluation import drive_batch
-
-            stats, periods = drive_batch(robot, what, self.first, self.rounds, each)
-            return DrivenEpisodes(stats, periods, 0)
+            return self._drive_batch(each)
         if what.fleet:
             group, world, policies, question = prepare_fleet(robot, what, self.first)
         else:
@@ -198,6 +196,19 @@ class EvaluationPart:
             for actor in stats.values():
                 each(actor)
         return DrivenEpisodes(stats, periods, 0 if world is None else world.touches)
+
+    def _drive_batch(self, each: Each) -> DrivenEpisodes:
+        from brakeline.deploy.experiments.batch_evaluation import drive_batch
+
+        stats: defaultdict[str, EpisodeStats] = defaultdict(EpisodeStats)
+
+        def take(step: pb.Step) -> None:
+            stats[step.actor].step(step)
+            if step.terminated or step.truncated:
+                each(stats[step.actor])
+
+        drive_batch(self.robot_with_task, self.what, self.first, self.rounds, take)
+        return DrivenEpisodes(dict(stats), sum(one.steps for one in stats.values()), 0)
 
 
 def progress_line(stats: EpisodeStats) -> str:

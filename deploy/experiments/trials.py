@@ -8,7 +8,7 @@ the same schema, without observations.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from operator import add
 from pathlib import Path
@@ -28,7 +28,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.task import RobotWithTask
-from brakeline.messaging.topics import EPISODE, STEP, Topic
+from brakeline.messaging.topics import EPISODE, EXCHANGE, STEP, Topic
 from brakeline.sim.scripted_policies import Policy, scripted
 
 FLUSH = 2000  # messages per write
@@ -44,6 +44,7 @@ class Column:
     value: Callable[[pb.Step], float]
     combine: Callable[[float, float], float] = add
     count: bool = False
+    start: float = 0  # before the first step
 
 
 COLUMNS = {
@@ -62,21 +63,30 @@ COLUMNS = {
 
 
 class TrialLog:
-    """Writes steps and episodes to an MCAP file as the recorder does. An existing file is replaced."""
+    """Writes steps, episodes and exchanges to an MCAP file as the recorder does. An existing file is replaced."""
 
-    def __init__(self, path: Path, metadata: dict[str, dict[str, str]]) -> None:
+    def __init__(
+        self, path: Path, metadata: dict[str, dict[str, str]], attachments: dict[str, bytes] | None = None
+    ) -> None:
         path.unlink(missing_ok=True)
         self.path = path
-        self._segment = open_segment(path, metadata)
+        self._segment = open_segment(path, metadata, attachments)
         self._waiting: list[Entry] = []
         self._count: dict[str, int] = {}
 
+    def put_exchange(self, exchange: pb.Exchange) -> None:
+        """Add a request with its reply."""
+        self._put(EXCHANGE, exchange, exchange.request.robot, exchange.request.actor)
+
     def put(self, topic: Topic, message: pb.Step | pb.Episode) -> None:
         """Add a message, and number it."""
-        key = topic.at(robot=message.robot, source=message.actor)
+        self._put(topic, message, message.robot, message.actor)
+
+    def _put(self, topic: Topic, message: pb.Step | pb.Episode | pb.Exchange, robot: str, actor: str) -> None:
+        key = topic.at(robot=robot, source=actor)
         self._count[key] = number = self._count.get(key, 0) + 1
         header, now = message.header, steady_time_ns()
-        header.sequence, header.source, header.run, header.wall_time = number, message.actor, RUN, now
+        header.sequence, header.source, header.run, header.wall_time = number, actor, RUN, now
         self._waiting.append(
             Entry(key, type(message), message.SerializeToString(), now, int(header.time * 1e9) or now, number)
         )
@@ -106,17 +116,24 @@ class TrialLog:
 
 @dataclass
 class EpisodeTable:
-    """One row per finished episode with the values of `COLUMNS`, and statistics of the decision times."""
+    """One row per finished episode with the values of its columns, and statistics of the decision times."""
 
+    which: Mapping[str, Column] = field(default_factory=lambda: COLUMNS)
     rows: list[dict[str, float]] = field(default_factory=list)
     decisions: int = 0
     milliseconds: float = 0.0
     squares: float = 0.0  # ms²
-    _running: dict[str, float] = field(default_factory=lambda: dict.fromkeys(COLUMNS, 0))
+    _running: dict[str, float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._running = {name: column.start for name, column in self.which.items()}
 
     def step(self, step: pb.Step) -> None:
         """Add the next step."""
-        for name, column in COLUMNS.items():
+        for name, column in self.which.items():
             self._running[name] = column.combine(self._running[name], column.value(step))
         spent = COLUMNS["milliseconds"].value(step)
         self.decisions += 1
@@ -124,13 +141,13 @@ class EpisodeTable:
         self.squares += spent * spent
         if step.terminated or step.truncated:
             self.rows.append(self._running)
-            self._running = dict.fromkeys(COLUMNS, 0)
+            self._begin()
 
     def columns(self) -> dict[str, list[float]]:
         """Return the columns, rounded to four digits; counts are integers."""
         return {
             name: [int(row[name]) if column.count else round(float(row[name]), 4) for row in self.rows]
-            for name, column in COLUMNS.items()
+            for name, column in self.which.items()
         }
 
     def decision_ms(self) -> dict[str, float]:

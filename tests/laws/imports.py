@@ -63,6 +63,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "deploy.data.sources.ardupilot_log",
     ),
     "ray": ("deploy.experiments.ray_tasks",),
+    "cma": ("deploy.experiments.worst_case_search",),
     "pyulog": ("deploy.data.sources.px4_log",),
     "pyarrow": ("deploy.data.sources.parquet_files", "deploy.data.sources.csv_file"),
     "numba": ("safety.compilation",),

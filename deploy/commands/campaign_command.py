@@ -1,0 +1,129 @@
+"""Implement `brakeline campaign`: many episodes of many kinds, and a search for the worst ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from brakeline.deploy import progress
+from brakeline.deploy.commands import common_options as options
+from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.experiments.task_engine import Engine
+from brakeline.logs.stacking_table import PLAIN, StackingTable
+
+COLLIDED = 3  # exit status
+
+
+@dataclass(frozen=True)
+class CampaignCommand:
+    """The options of `brakeline campaign`."""
+
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    """Drive these robots."""
+    arenas: tuple[str, ...] = ("default", "dense")
+    """Drive in arenas of these names."""
+    policies: tuple[str, ...] = ("trained", "random", "adversary")
+    """Drive by these policies, as `brakeline evaluate` names them."""
+    model_sets: tuple[str, ...] = ("auto",)
+    """Filter with these model sets: auto (the one in use), one-step, residual, set-membership or matrix-zonotope (in
+    the mode direct), or none for no filter."""
+    perturbations: tuple[str, ...] = ("as-recorded",)
+    """Change the robot like this: as-recorded, noisy, payload, slippery (ground robots), wind (in the air), scan or
+    faulty-scan."""
+    episodes: int = 1000
+    """Drive this many episodes of each cell. A later campaign with more of them goes on after these."""
+    search: int = 0
+    """Also search for the worst case of each arena, model set and perturbation, for this many episodes."""
+    near: float | None = None
+    """Keep the log of each episode that comes nearer than this to something [m]. Defaults to 5 % of the radius of the
+    robot."""
+    accept_bound: options.AcceptBound = None
+    engine: options.Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
+    again: bool = False
+    """Drive again what has results already."""
+    results: Path = Path("results/campaign")
+    """Store the tables in this folder."""
+    runs: Path = Path("runs/campaign")
+    """Store the rows of all episodes, and the logs of those that came too near, in this folder."""
+    quiet: options.Quiet = False
+    json: options.Json = False
+
+    def run(self) -> int:
+        """Drive what is missing and write the tables. Returns the exit status: 3 if a filtered robot hit something."""
+        tables = {robot: self._campaign(robot) for robot in self.robots}
+        if self.json:
+            print_json(tables)
+        filtered = [cell for table in tables.values() for cell in table["cells"] if cell["model_set"] != "none"]
+        searches = [one for table in tables.values() for one in table["searches"] if one["model_set"] != "none"]
+        return COLLIDED if any(one["collisions"] for one in (*filtered, *searches)) else 0
+
+    def _campaign(self, name: str) -> dict[str, Any]:
+        """Drive the episodes of a robot, write its table, and return its figures."""
+        from brakeline.deploy.experiments import campaign
+        from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cells_of, parts_of_cell
+        from brakeline.deploy.experiments.experiment_jobs import complete
+        from brakeline.messaging.task import address, robot_with_task
+
+        robot = robot_with_task(name)
+        near = campaign.NEAR * robot.footprint if self.near is None else self.near
+        cells = [
+            CampaignPart(address(name), arena, policy, model_set, perturbation, near, 0, 1, self.accept_bound)
+            for arena, policy, model_set, perturbation in product(
+                self.arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim == 3)
+            )
+        ]
+        for cell in cells:  # a mistyped name ends the campaign before it begins; models are made once
+            self._prepare(robot, cell)
+        parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
+        results = complete(parts, self.runs, self.runs, self.engine, self.again, self._say)
+        searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
+        searches = [CampaignSearch(cell, self.search) for cell in searched.values()]
+        found = complete(searches, self.runs, self.runs, self.engine, self.again, self._say)
+        driven = cells_of(parts, results)
+        table = {"robot": robot.name, "cells": driven, "searches": found}
+        self.results.mkdir(parents=True, exist_ok=True)
+        (self.results / f"{robot.name}.md").write_text(campaign.markdown(robot.name, driven, found))
+        (self.results / f"{robot.name}.json").write_text(json.dumps(table, indent=1) + "\n")
+        if not self.json:
+            console.print(_table(campaign.HEADS, campaign.rows_of(driven)))
+            if found:
+                console.print(_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
+            console.print(f"[dim]{self.results}: {robot.name}.md, {robot.name}.json[/]")
+        return table
+
+    def _perturbations(self, flies: bool) -> list[str]:
+        """Return the perturbations that this kind of robot has. Raises ValueError for an unknown one."""
+        from brakeline.deploy.experiments.campaign import AIR_ONLY, GROUND_ONLY, PERTURBATIONS
+
+        for name in self.perturbations:
+            if name not in PERTURBATIONS:
+                raise ValueError(f"no perturbation is called {name!r}; there are: {', '.join(PERTURBATIONS)}")
+        others = GROUND_ONLY if flies else AIR_ONLY
+        return [name for name in self.perturbations if name not in others]
+
+    def _prepare(self, robot: Any, cell: Any) -> None:
+        """Check the names of a cell, and make the model set that it needs."""
+        from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.policy_loading import policy_named
+        from brakeline.sim.arena_generator import arena_kind
+
+        arena_kind(robot, cell.arena)
+        policy_named(cell.policy, robot, 0)
+        what = cell.evaluation()
+        if what.method != "none":
+            method_for(robot, what.method, what.model_config, what.accept_bound)
+
+    def _say(self, name: str, text: str) -> None:
+        progress.console.print(f"[dim]{name}:[/] {text}")
+
+
+def _table(heads: tuple[str, ...], rows: list[list[str]]) -> StackingTable:
+    table = StackingTable(*heads, **PLAIN)
+    for row in rows:
+        table.add_row(*row)
+    return table

@@ -1,0 +1,298 @@
+"""`brakeline campaign`: a table over robots, arenas, policies, model sets and perturbations; a search for the worst.
+
+runs/campaign/<robot>/<cell>-<first>.json        a part of a cell: one row per episode; a campaign goes on after them
+runs/campaign/<robot>/near/<cell>/<episode>.mcap the log of an episode that came too near to something
+results/campaign/<robot>.md, <robot>.json        the table
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from brakeline.deploy.commands.common_options import PhysicsOptions
+from brakeline.deploy.experiments.comparison_table import markdown_table
+from brakeline.errors import ResultError
+from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson
+from brakeline.safety.model.model_config import KINDS, ModelConfig
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.evaluate import Evaluation
+
+PART = 500  # episodes of a part
+NEAR = 0.05  # of the footprint: an episode that comes nearer is kept
+
+# What differs from the robot that was recorded. Names say the change; a value of None does nothing.
+PERTURBATIONS = {
+    "as-recorded": PhysicsOptions(),
+    "noisy": PhysicsOptions(noise=1.5),
+    "payload": PhysicsOptions(payload=1.0),
+    "slippery": PhysicsOptions(friction=0.3),
+    "wind": PhysicsOptions(wind=2.0, gust=0.5),
+    "scan": PhysicsOptions(perception="scan"),
+    "faulty-scan": PhysicsOptions(perception="scan", dropped=0.1, ghosts=0.01),
+}
+GROUND_ONLY, AIR_ONLY = ("payload", "slippery"), ("wind",)
+MODEL_SETS = ("auto", "one-step", *KINDS)  # the mode one-step, or an error bound in the mode direct
+
+
+def model_config_of(name: str) -> ModelConfig:
+    """Return the configuration of a model set by its name in `MODEL_SETS`. Raises ValueError."""
+    if name not in MODEL_SETS:
+        raise ValueError(f"no model set is called {name!r}; there are: {', '.join(MODEL_SETS)}")
+    return ModelConfig(name, "direct") if name in KINDS else ModelConfig(mode=name)
+
+
+@dataclass(frozen=True)
+class CampaignPart:
+    """Some episodes of a cell, as a job of `deploy/experiments/experiment_jobs.py`.
+
+    Attributes:
+        robot: name, or the path of a description.
+        arena, policy: names.
+        model_set: see `MODEL_SETS`; "none" drives without a filter.
+        perturbation: see `PERTURBATIONS`.
+        near: distance [m] below which an episode's log is kept.
+        first, episodes: number of the first episode, and how many there are.
+    """
+
+    robot: str
+    arena: str
+    policy: str
+    model_set: str
+    perturbation: str
+    near: float
+    first: int
+    episodes: int
+    accept_bound: float | None = None
+
+    @property
+    def cell(self) -> str:
+        """The name of the cell."""
+        return f"{self.arena}-{Path(self.policy).stem}-{self.model_set}-{self.perturbation}"
+
+    @property
+    def name(self) -> str:
+        """The name of the part."""
+        return f"{self.cell}-{self.first:06d}-{self.episodes}"
+
+    def evaluation(self) -> Evaluation:
+        """Return the settings of the cell. Raises ValueError for an unknown model set."""
+        from brakeline.deploy.experiments.evaluate import Evaluation
+
+        filtered = self.model_set != "none"
+        return Evaluation(
+            policy=self.policy,
+            method="ddpc" if filtered else "none",
+            model_config=model_config_of(self.model_set) if filtered else ModelConfig(),
+            arena=self.arena,
+            conditions=PERTURBATIONS[self.perturbation].conditions(),
+            accept_bound=self.accept_bound,
+        )
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        """Drive the episodes, and keep the logs of those that came too near to something."""
+        from brakeline.deploy.experiments.campaign_episodes import CampaignDriver, too_near
+        from brakeline.deploy.experiments.experiment_jobs import configuration
+        from brakeline.messaging.task import robot_with_task
+
+        driver, ended = CampaignDriver.of(robot_with_task(self.robot), self.evaluation()), 0
+
+        def each() -> None:
+            nonlocal ended
+            ended += 1
+            if ended % 20 == 0:
+                say(f"{ended} of {self.episodes} episodes")
+
+        rows = driver.drive(self.first, self.episodes, each)
+        near = []
+        for number, row in enumerate(rows, self.first):
+            if driver.model is not None and too_near(row, self.near):
+                path = folder.parent / "near" / self.cell / f"{number}.mcap"
+                again = driver.record(number, path)
+                near.append({"episode": number, "closest": row["closest"], "again": again["closest"], "log": str(path)})
+        columns = {name: [row[name] for row in rows] for name in rows[0]}
+        version = "none" if driver.model is None else driver.model.version
+        return {"study": configuration(self), "model": version, "episodes": columns, "near": near}
+
+
+@dataclass(frozen=True)
+class CampaignSearch:
+    """A search for the worst episode of an arena, a model set and a perturbation, as a job.
+
+    Attributes:
+        cell: its robot, arena, model set and perturbation.
+        episodes: that it may drive.
+    """
+
+    cell: CampaignPart
+    episodes: int
+
+    @property
+    def robot(self) -> str:
+        """The robot."""
+        return self.cell.robot
+
+    @property
+    def name(self) -> str:
+        """The name of the search."""
+        return f"search-{self.cell.arena}-{self.cell.model_set}-{self.cell.perturbation}-{self.episodes}"
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        """Search, and keep the log of the worst episode."""
+        from brakeline.deploy.experiments.experiment_jobs import configuration
+        from brakeline.deploy.experiments.worst_case_search import search
+        from brakeline.messaging.task import robot_with_task
+
+        path = folder.parent / "near" / f"{self.name}.mcap"
+        found = search(robot_with_task(self.robot), self.cell.evaluation(), self.episodes, path, say)
+        about = {"arena": self.cell.arena, "model_set": self.cell.model_set, "perturbation": self.cell.perturbation}
+        return {"study": configuration(self), **about, **found}
+
+
+@dataclass
+class CellFigures:
+    """The figures of a cell, over all its parts.
+
+    Attributes:
+        cell: arena, policy, model set, perturbation.
+        count: sums over the episodes, by the name of a column.
+        closest: m.
+        near: the episodes whose logs are kept.
+    """
+
+    cell: tuple[str, str, str, str]
+    model: str
+    episodes: int = 0
+    count: dict[str, int] = field(default_factory=dict)
+    closest: float = float("inf")
+    near: list[dict[str, Any]] = field(default_factory=list)
+    _interventions: ClusteredProportion = field(default_factory=ClusteredProportion)
+
+    def add(self, result: dict[str, Any]) -> None:
+        """Add a part. Raises ResultError if another model set decided in it."""
+        if result["model"] != self.model:
+            raise ResultError(
+                f"parts of {'-'.join(self.cell)} have other model sets ({self.model}, {result['model']}): "
+                "run the campaign again with --again, or give it another --runs folder"
+            )
+        columns = result["episodes"]
+        self.episodes += len(columns["steps"])
+        for name, values in columns.items():
+            if name != "closest":
+                self.count[name] = self.count.get(name, 0) + int(sum(values))
+        self.closest = min(self.closest, *columns["closest"])
+        self.near += result["near"]
+        for interventions, steps in zip(columns["interventions"], columns["steps"], strict=True):
+            self._interventions.add(interventions, steps)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures with exact 95 % intervals (`logs/proportion_intervals.py`)."""
+        arena, policy, model_set, perturbation = self.cell
+        touched = self.count["collision"] + self.count["contact_moving"]
+        return {
+            "arena": arena,
+            "policy": policy,
+            "model_set": model_set,
+            "perturbation": perturbation,
+            "model": self.model,
+            "episodes": self.episodes,
+            "steps": self.count["steps"],
+            "goals": self.count["goal"],
+            "goals_interval": clopper_pearson(self.count["goal"], self.episodes),
+            "collisions": touched,
+            "collisions_interval": clopper_pearson(touched, self.episodes),
+            "timeouts": self.count["timeout"],
+            "interventions": self.count["interventions"],
+            "interventions_interval": self._interventions.interval(),
+            "failsafes": self.count["failsafes"],
+            "compared": self.count["compared"],
+            "violations": self.count["violations"],
+            "violations_interval": clopper_pearson(self.count["violations"], self.count["compared"]),
+            "closest": self.closest,
+            "near": self.near,
+        }
+
+
+def parts_of_cell(cell: CampaignPart, episodes: int) -> list[CampaignPart]:
+    """Cut a cell of so many episodes into parts. A longer campaign later goes on after the same parts."""
+    return [replace(cell, first=first, episodes=min(PART, episodes - first)) for first in range(0, episodes, PART)]
+
+
+def cells_of(parts: Sequence[CampaignPart], results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the figures of each cell, in the order of the parts. Raises ResultError: see `CellFigures.add`."""
+    cells: dict[str, CellFigures] = {}
+    for part, result in zip(parts, results, strict=True):
+        key = part.arena, Path(part.policy).stem, part.model_set, part.perturbation
+        cells.setdefault(part.cell, CellFigures(key, result["model"])).add(result)
+    return [cell.figures() for cell in cells.values()]
+
+
+HEADS = (
+    *("arena", "policy", "model set", "perturbation", "episodes", "goals", "collisions", "interventions"),
+    *("steps outside", "closest [mm]", "near misses"),
+)
+SEARCH_HEADS = ("arena", "model set", "perturbation", "episodes", "collisions", "closest [mm]", "log")
+
+
+def rows_of(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return the texts of the table of cells, below `HEADS`."""
+    return [
+        [
+            *(cell[name] for name in ("arena", "policy", "model_set", "perturbation")),
+            f"{cell['episodes']:,}",
+            _percent(cell["goals"], cell["episodes"], cell["goals_interval"]),
+            f"{cell['collisions']}: {_percent(cell['collisions'], cell['episodes'], cell['collisions_interval'])}",
+            _percent(cell["interventions"], cell["steps"], cell["interventions_interval"]),
+            _percent(cell["violations"], cell["compared"], cell["violations_interval"]),
+            f"{1e3 * cell['closest']:.1f}",
+            str(len(cell["near"])),
+        ]
+        for cell in cells
+    ]
+
+
+def search_rows(searches: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Return the texts of the table of searches, below `SEARCH_HEADS`."""
+    return [
+        [
+            *(search[name] for name in ("arena", "model_set", "perturbation")),
+            f"{search['episodes']:,}",
+            str(search["collisions"]),
+            f"{1e3 * search['closest']:.1f}",
+            search["log"],
+        ]
+        for search in searches
+    ]
+
+
+def markdown(robot: str, cells: Sequence[dict[str, Any]], searches: Sequence[dict[str, Any]] = ()) -> str:
+    """Return the tables of a robot as Markdown."""
+    lines = [
+        f"# {robot}",
+        "",
+        "Fresh episodes, each independent of the others. In brackets: 95 % intervals, exact (Clopper–Pearson) for "
+        "episodes and steps, clustered by episode for interventions. A step is outside if the measured state left the "
+        "set that the filter predicted.",
+        "",
+        *markdown_table(HEADS, rows_of(cells)),
+        "",
+    ]
+    if searches:
+        lines += [
+            "## Worst cases that a search found",
+            "",
+            "CMA-ES moves the obstacles and chooses the proposed inputs so that the robot comes as near as possible.",
+            "",
+            *markdown_table(SEARCH_HEADS, search_rows(searches)),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def _percent(count: int, of: int, interval: Sequence[float] | None) -> str:
+    if not of or interval is None:
+        return "–"
+    return f"{100.0 * count / of:.2f} % [{100.0 * interval[0]:.2f}, {100.0 * interval[1]:.2f}]"

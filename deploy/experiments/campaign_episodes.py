@@ -1,0 +1,163 @@
+"""Drive the episodes of a campaign. Each depends on its number alone, so any of them can be driven again and logged.
+
+Many robots at once drive what a batch can simulate (`deploy/experiments/batch_evaluation.py`), one after the other the
+rest. An episode that came too near to something is driven again, and its log kept: `brakeline replay` decides each of
+its requests anew, `brakeline analyse --html` shows it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from brakeline.actors.decision_guard import Ask
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_batch
+from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process
+from brakeline.deploy.experiments.trials import COLUMNS, Column, EpisodeTable, TrialLog
+from brakeline.deploy.policy_loading import network_named
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import NoBatch
+from brakeline.logs.mcap_container import model_attachment_name
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.topics import EPISODE
+from brakeline.safety.methods import Model
+from brakeline.sim.batch.batch_env import check_batch
+from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.scripted_policies import Policy, scripted
+
+ACTOR = "campaign"
+Row = dict[str, float]
+
+ROWS: dict[str, Column] = {
+    **{name: COLUMNS[name] for name in ("steps", "goal", "collision", "timeout", "interventions")},
+    **{name: COLUMNS[name] for name in ("contact_moving", "contact_standing")},
+    "failsafes": Column(lambda step: step.fallback or step.decision == pb.FAILSAFE, count=True),
+    "compared": Column(lambda step: step.compared, count=True),
+    "violations": Column(lambda step: step.compared and not step.contained, count=True),
+    "closest": Column(lambda step: step.clearance, min, start=math.inf),  # m
+}
+
+
+@dataclass(frozen=True)
+class CampaignDriver:
+    """The robot, policy and filter of a cell.
+
+    Attributes:
+        robot: the robot.
+        what: policy, method, model set, arena, conditions and seed.
+        model: of the filter; None without one.
+        ask: asks the filter; None without one.
+        env: its environment.
+    """
+
+    robot: RobotWithTask
+    what: Evaluation
+    model: Model | None
+    ask: Ask | None
+    env: NavigationEnv
+
+    @staticmethod
+    def of(robot: RobotWithTask, what: Evaluation) -> CampaignDriver:
+        """Load the model set and the environment. Raises what `in_process` and `environment` raise."""
+        model = None
+        if what.method != "none":
+            model = method_for(robot, what.method, what.model_config, what.accept_bound)
+        ask = None if model is None else in_process(model, what.accept_bound)
+        return CampaignDriver(
+            robot, what, model, ask, environment(robot, what.arena, FRESH + what.seed, what.conditions)
+        )
+
+    def drive(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
+        """Drive episodes and return a row of each, in order. Calls `each` after every episode."""
+        if self._in_a_batch():
+            return self._drive_batch(first, episodes, each)
+        rows = []
+        for number in range(first, first + episodes):
+            table = EpisodeTable(ROWS)
+            for step in self.steps(number):
+                table.step(step)
+            rows.append(table.rows[0])
+            each()
+        return rows
+
+    def steps(self, number: int, log: TrialLog | None = None, policy: Policy | None = None) -> Iterator[pb.Step]:
+        """Yield the steps of an episode, which a log may record with all requests. policy: instead of the cell's."""
+        runner = EpisodeRunner(self.robot, self.env, ActorIdentity(ACTOR, 0, self.what.seed), filtered=bool(self.ask))
+        policy = policy or self.policy(number)
+        message = runner.begin(number)
+        if log is not None:
+            log.put(EPISODE, message)
+        while runner.running:
+            time = float(runner.info["time"])
+            proposal = np.asarray(policy(runner.observation, runner.info), dtype=float)
+            outcome = runner.decide(proposal, self.ask)
+            if log is not None and outcome is not None:
+                log.put_exchange(outcome.exchange(time))
+            step = runner.execute(proposal, outcome)
+            if log is not None:
+                log.put_step(step)
+            yield step
+
+    def policy(self, number: int) -> Policy:
+        """Return the policy of an episode. A scripted one draws from the episode's own seed."""
+        name = self.what.policy
+        if name in self.robot.task.policies:
+            return scripted(name, self.robot, np.random.default_rng((self.what.seed, number)))
+        network = network_named(name, self.robot, self.what.seed)
+        return lambda observation, info: network(observation)
+
+    def log(self, path: Path, **about: str) -> TrialLog:
+        """Open the log of an episode, with all that a replay needs. about: further entries of its `run`."""
+        what, files = self.what, {}
+        run = {"method": what.method, "policy": what.policy, "arena": what.arena, "seed": str(what.seed)} | about
+        if self.model is not None:
+            files[model_attachment_name(self.robot.name, self.model.version)] = self.model.encode()
+            run |= {"certificate": what.model_config.certificate, "mode": what.model_config.mode}
+        metadata = {"run": run | {"robots": self.robot.name}, "conditions": what.conditions.describe()}
+        metadata["robots"] = {self.robot.kind: json.dumps(self.robot.description)}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return TrialLog(path, metadata, files)
+
+    def record(self, number: int, path: Path) -> Row:
+        """Drive an episode again, write its log, and return its row."""
+        table = EpisodeTable(ROWS)
+        with self.log(path, episode=str(number)) as log:
+            for step in self.steps(number, log):
+                table.step(step)
+        return table.rows[0]
+
+    def _in_a_batch(self) -> bool:
+        try:
+            check_batch(self.robot, self.what.arena, self.what.conditions)
+            batch_filter(self.robot, self.what)
+        except NoBatch:
+            return False
+        return True
+
+    def _drive_batch(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
+        tables: dict[str, EpisodeTable] = {}
+        rows: dict[int, Row] = {}
+
+        def take(step: pb.Step) -> None:
+            table = tables.setdefault(step.actor, EpisodeTable(ROWS))
+            table.step(step)
+            if step.terminated or step.truncated:
+                rows[step.episode] = table.rows.pop()
+                each()
+
+        drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take)
+        return [rows[number] for number in range(first, first + episodes)]
+
+
+def too_near(row: Row, near: float) -> bool:
+    """Return whether an episode touched something, or came nearer than `near` [m] to something."""
+    touched = row["collision"] or row["contact_moving"]
+    return bool(touched or not row["closest"] >= near)

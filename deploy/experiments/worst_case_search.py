@@ -1,0 +1,179 @@
+"""Search for the episodes in which the filter keeps the least distance: CMA-ES over obstacles and proposed inputs.
+
+A candidate moves the obstacles next to the start, and says which inputs the policy proposes, piece by piece. Its score
+is the least true distance between the robot and any obstacle. The search knows the simulator, which no policy does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.deploy.experiments.campaign_episodes import ROWS, CampaignDriver, Row
+from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
+from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog
+from brakeline.deploy.vehicle_factory import environment
+from brakeline.messaging.obstacle import WALL, Obstacle
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import RobotWithTask
+from brakeline.sim.arena import Arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.scripted_policies import Policy
+
+Array = NDArray[np.float64]
+
+MOVED = 6  # obstacles that a candidate moves
+PIECES = 10  # of the proposed inputs
+PERIODS = 60  # of an episode
+AN_ARENA = 300  # episodes that are spent on one drawn arena
+SPREAD = 0.5  # first standard deviation of a candidate's numbers, which are used within -1 and 1
+FAR = 4.0  # footprints, by which an obstacle is moved at most
+TOUCHED = 1.0  # m, by which a candidate with a contact is better than any without one
+
+
+@dataclass(frozen=True)
+class SearchedEpisode:
+    """An episode of the search: a drawn arena, changed by numbers within -1 and 1.
+
+    Attributes:
+        number: of the drawn arena.
+        values: shifts of the obstacles next to the start, then the pieces of the inputs.
+    """
+
+    number: int
+    values: Array
+
+    def arena(self, drawn: Arena, robot: Robot) -> Arena:
+        """Return the drawn arena with its moved obstacles and a shorter time limit."""
+        dim = drawn.dim
+        shifts = FAR * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
+        inside = [o for o in drawn.obstacles if o.kind != WALL and len(o.position) == dim and _movable(o, drawn)]
+        inside.sort(key=lambda o: float(np.linalg.norm(np.subtract(o.position, drawn.start[:dim]))))
+        moved = {id(o): _shifted(o, shift) for o, shift in zip(inside, shifts, strict=False)}
+        obstacles = tuple(moved.get(id(o), o) for o in drawn.obstacles)
+        return replace(drawn, obstacles=obstacles, step_limit=PERIODS)
+
+    def policy(self, robot: Robot) -> Policy:
+        """Return the policy that proposes the inputs, each for the same time."""
+        pieces = self.values[-PIECES * robot.action_dim :].reshape(PIECES, robot.action_dim)
+        low, high = robot.low(), robot.high()
+        inputs = low + 0.5 * (pieces + 1.0) * (high - low)
+
+        def propose(observation: Any, info: dict[str, Any]) -> Array:
+            period = round(info["time"] / robot.period)
+            return np.asarray(inputs[min(period * PIECES // PERIODS, PIECES - 1)])
+
+        return propose
+
+
+def search(
+    robot: RobotWithTask, what: Evaluation, episodes: int, path: Path, say: Callable[[str], object]
+) -> dict[str, Any]:
+    """Search for so many episodes, and write the log of the worst one.
+
+    Args:
+        what: arena, method, model set, conditions, seed.
+        path: of the log.
+
+    Returns:
+        `episodes`, `collisions`, `steps`, `closest` [m] (the least distance without the start's), `number` and `values`
+        of the worst candidate, `history` (the least distance after each episode), and the log's path.
+    """
+    import cma
+
+    drawn: list[Arena] = []
+
+    def draw(name: str, generator: np.random.Generator, robot: RobotWithTask) -> Arena:
+        return drawn[-1]
+
+    env = environment(robot, what.arena, FRESH + what.seed, what.conditions, draw=draw)
+    driver = replace(CampaignDriver.of(robot, what), env=env)
+
+    def drive(candidate: SearchedEpisode, log: TrialLog | None = None) -> Row:
+        base = draw_arena(what.arena, np.random.default_rng((what.seed, candidate.number)), robot)
+        drawn[:] = [candidate.arena(base, robot)]
+        table = EpisodeTable(ROWS)
+        for step in driver.steps(candidate.number, log, candidate.policy(robot)):
+            table.step(step)
+        return table.rows[0]
+
+    found = _Found()
+    size = MOVED * robot.position_dim + PIECES * robot.action_dim
+    number = 0
+    while found.episodes < episodes:
+        options = {"bounds": [-1.0, 1.0], "seed": what.seed + number + 1, "verbose": -9, "maxfevals": AN_ARENA}
+        strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
+        while not strategy.stop() and found.episodes < episodes:
+            candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
+            strategy.tell(
+                [one.values for one in candidates], [_score(one, drive, found, drawn, robot) for one in candidates]
+            )
+            say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
+        number += 1
+    worst = found.worst
+    if worst is not None:
+        with driver.log(path, episode=str(worst.number), policy="worst-case search") as log:
+            drive(worst, log)
+    return {
+        "episodes": found.episodes,
+        "collisions": found.collisions,
+        "steps": found.steps,
+        "closest": found.closest,
+        "number": None if worst is None else worst.number,
+        "values": [] if worst is None else worst.values.round(6).tolist(),
+        "history": found.history,
+        "log": str(path),
+    }
+
+
+@dataclass
+class _Found:
+    """What the search has seen so far."""
+
+    episodes: int = 0
+    collisions: int = 0
+    steps: int = 0
+    score: float = math.inf
+    closest: float = math.inf  # m, of the candidate with the least score
+    worst: SearchedEpisode | None = None
+    history: list[float] = field(default_factory=list)
+
+
+def _score(
+    candidate: SearchedEpisode,
+    drive: Callable[[SearchedEpisode], Row],
+    found: _Found,
+    drawn: list[Arena],
+    robot: RobotWithTask,
+) -> float:
+    """Drive a candidate and return what CMA-ES makes small."""
+    row = drive(candidate)
+    (arena,) = drawn
+    start = np.asarray(arena.start[: arena.dim])
+    free = float(arena.shapes.distance(start).min()) - robot.footprint
+    if free < robot.footprint:  # it began too near to something: no fault of the filter
+        return 10.0 - free
+    found.episodes, found.steps = found.episodes + 1, found.steps + int(row["steps"])
+    touched = bool(row["collision"] or row["contact_moving"])
+    found.collisions += touched
+    score = float(row["closest"]) - TOUCHED * touched
+    if score < found.score:
+        found.score, found.closest, found.worst = score, float(row["closest"]), candidate
+    found.history.append(round(found.closest, 5))
+    return score
+
+
+def _movable(obstacle: Obstacle, arena: Arena) -> bool:
+    """Return whether this is no floor or ceiling."""
+    (low, high) = arena.bounds[0]
+    return not obstacle.size or max(obstacle.size) < high - low
+
+
+def _shifted(obstacle: Obstacle, shift: Array) -> Obstacle:
+    return replace(obstacle, position=tuple((np.asarray(obstacle.position) + shift).tolist()))

@@ -1,0 +1,121 @@
+"""A campaign counts each episode once, goes on where it ended, keeps near misses that replay, and finds worst cases."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from scipy.stats import binomtest
+
+from brakeline.deploy.commands.campaign_command import COLLIDED, CampaignCommand
+from brakeline.deploy.experiments import campaign
+from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cells_of, parts_of_cell
+from brakeline.deploy.experiments.campaign_episodes import CampaignDriver
+from brakeline.deploy.experiments.experiment_jobs import complete
+from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS
+from brakeline.deploy.run.replay_run import replay
+from brakeline.errors import ResultError
+from brakeline.logs.figure_tables import analyse
+from brakeline.messaging.task import robot_with_task
+
+NEAR = 0.1  # m, so that a few of these episodes are near misses
+CELL = CampaignPart("ground", "dense", "trained", "residual", "as-recorded", NEAR, 0, 1)
+GROUND = robot_with_task("ground")
+
+
+@pytest.fixture(scope="module")
+def driven(data_folder, tmp_path_factory):
+    """A cell of six episodes, in parts of four, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("campaign")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(campaign, "PART", 4)
+        parts = parts_of_cell(CELL, 6)
+    return parts, complete(parts, folder, folder), folder
+
+
+def test_the_parts_of_a_cell_add_up(driven):
+    parts, results, _ = driven
+    assert [(part.first, part.episodes) for part in parts] == [(0, 4), (4, 2)]
+    (cell,) = cells_of(parts, results)
+    rows = [result["episodes"] for result in results]
+    assert cell["episodes"] == 6 and cell["steps"] == sum(sum(row["steps"]) for row in rows)
+    assert cell["goals"] + cell["collisions"] + cell["timeouts"] == 6 and cell["collisions"] == 0
+    exact = binomtest(cell["goals"], 6).proportion_ci()
+    assert cell["goals_interval"] == pytest.approx((exact.low, exact.high))
+    assert cell["closest"] == min(min(row["closest"]) for row in rows)
+    text = campaign.markdown("ground", [cell])
+    assert "| dense | trained | residual | as-recorded | 6 |" in text and "0: 0.00 % [0.00, 45.93]" in text
+
+
+def test_a_campaign_goes_on_after_the_episodes_that_it_has(driven, monkeypatch):
+    parts, results, folder = driven
+    monkeypatch.setattr(CampaignPart, "run", lambda *_: pytest.fail("driven again"))
+    assert complete(parts, folder, folder) == results
+
+
+def test_near_misses_are_kept_and_replay_bit_by_bit(driven):
+    _, results, _ = driven
+    near = [row for result in results for row in result["near"]]
+    closest = [value for result in results for value in result["episodes"]["closest"]]
+    assert {row["episode"] for row in near} == {i for i, value in enumerate(closest) if value < NEAR} != set()
+    worst = min(near, key=lambda row: row["closest"])
+    assert worst["again"] == pytest.approx(worst["closest"], abs=1e-3), "a batch differs in the last digits"
+    figures = analyse([worst["log"]])
+    assert (figures["episodes"], figures["policy"]) == (1, "trained")
+    compared = replay([worst["log"]]).figures()
+    assert compared["requests"] == figures["steps"] and compared["different"] == 0
+
+
+def test_episodes_in_a_batch_are_those_one_after_the_other(driven, monkeypatch):
+    _, results, _ = driven
+    monkeypatch.setattr(CampaignDriver, "_in_a_batch", lambda self: False)
+    rows = CampaignDriver.of(GROUND, CELL.evaluation()).drive(1, 2, lambda: None)
+    for name, values in results[0]["episodes"].items():
+        assert [row[name] for row in rows] == pytest.approx(values[1:3], rel=0.05, abs=2e-3), name
+
+
+def test_parts_with_other_model_sets_are_not_added_up(driven):
+    parts, results, _ = driven
+    with pytest.raises(ResultError, match="other model sets"):
+        cells_of(parts, [results[0], results[1] | {"model": "another"}])
+
+
+def test_a_search_hits_something_without_the_filter_and_nothing_with_it(data_folder, tmp_path):
+    found = {}
+    for model_set in ("none", "residual"):
+        job = CampaignSearch(replace(CELL, model_set=model_set), 30)
+        found[model_set] = job.run(tmp_path / "ground" / model_set, lambda text: None)
+    bare, filtered = found["none"], found["residual"]
+    assert bare["collisions"] > 0 and bare["closest"] <= 0.0
+    assert filtered["collisions"] == 0 and filtered["closest"] > 0.0
+    for search in found.values():
+        assert search["episodes"] >= 30 and search["history"] == sorted(search["history"], reverse=True)
+        assert search["history"][-1] == pytest.approx(search["closest"], abs=1e-5)
+        assert analyse([search["log"]])["closest_approach"] == pytest.approx(search["closest"])
+    assert replay([filtered["log"]]).figures()["different"] == 0
+
+
+def test_a_collision_behind_the_filter_is_an_exit_status(driven, monkeypatch, tmp_path, capsys):
+    _, (first, _), _ = driven
+    touched = json.loads(json.dumps(first))
+    touched["episodes"]["collision"][0] = 1
+    monkeypatch.setattr(CampaignPart, "run", lambda self, folder, say: touched | {"study": {}})
+    command = CampaignCommand(
+        arenas=("dense",), policies=("trained",), model_sets=("residual",), episodes=4, engine=IN_THIS_PROCESS,
+        results=tmp_path / "results", runs=tmp_path / "runs", json=True,
+    )  # fmt: skip
+    monkeypatch.setattr("brakeline.deploy.experiments.experiment_jobs.read", lambda *_: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("brakeline.deploy.experiments.experiment_jobs.complete", lambda *_: [touched] if _[0] else [])
+        assert command.run() == COLLIDED
+    (cell,) = json.loads(capsys.readouterr().out)["ground"]["cells"]
+    assert cell["collisions"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [({"perturbations": ("earthquake",)}, "no perturbation"), ({"model_sets": ("hope",)}, "no model set"),
+     ({"arenas": ("moon",)}, "moon"), ({"policies": ("nobody",)}, "nobody")],
+)  # fmt: skip
+def test_a_mistyped_name_ends_it_before_it_begins(data_folder, tmp_path, change, said):
+    with pytest.raises(ValueError, match=said):
+        CampaignCommand(runs=tmp_path, results=tmp_path, **change).run()
