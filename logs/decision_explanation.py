@@ -14,6 +14,7 @@ from brakeline.messaging.stated_share import UNSTATED, describe_verification, pe
 
 Array = NDArray[np.float64]
 
+EXACT = 1e-4  # of an input's range: two inputs that differ by less are the same
 LEAST = 0.02  # of an input's range: smaller changes are not described
 AHEAD = math.radians(40.0)
 BEHIND = math.radians(140.0)
@@ -34,6 +35,7 @@ class Explanation:
         at, normal: (d,), a point on the edge of the half-space that blocks the proposal, and the normal from the free
             side to the blocked side; empty without such a half-space.
         trust: what the verification is worth, if the sentence does not contain it.
+        limited: which of the robot's own limits changed an allowed proposal; empty: none.
     """
 
     said: str
@@ -43,6 +45,7 @@ class Explanation:
     at: Array
     normal: Array
     trust: str = ""
+    limited: str = ""
 
 
 def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explanation | None:
@@ -58,6 +61,9 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
     proposed, executed = np.array(request.action), np.array(decision.plan[: robot.action_dim])
     heading = 0.0 if robot.heading is None else request.state[robot.heading]
     names = [split(label) for label in robot.action]
+    limited = ""
+    if decision.kind == pb.ALLOWED:
+        limited = limits_applied(robot, proposed, np.array(request.input_in_force), executed)
     said_already = decision.kind in (pb.FAILSAFE, pb.RECOVERING)
     return Explanation(
         sentence(robot, request, decision),
@@ -67,7 +73,34 @@ def explain(robot: Robot, request: pb.Request, decision: pb.Decision) -> Explana
         np.array(decision.stopped.at),
         np.array(decision.stopped.normal),
         "" if said_already else describe_verification(decision.verified, bound_in(decision)),
+        limited,
     )
+
+
+def limits_applied(robot: Robot, proposed: Array, before: Array, executed: Array) -> str:
+    """Say which of the robot's limits changed a proposal that was allowed; empty if it was executed as it is.
+
+    Args:
+        robot: has the limits.
+        proposed: (m,), by the policy.
+        before: (m,), executed in the period before; empty if it is unknown.
+        executed: (m,).
+
+    Returns:
+        e.g. "slew-limited", "clipped to its bounds", or both.
+    """
+    if len(proposed) != len(executed) or not np.isfinite(proposed).all():
+        return ""
+    tolerance = EXACT * (robot.high() - robot.low())
+    if (np.abs(executed - proposed) <= tolerance).all():
+        return ""
+    clipped = np.clip(proposed, robot.low(), robot.high())
+    outside = (np.abs(clipped - proposed) > tolerance).any()
+    slewed = (np.abs(clipped - executed) > tolerance) & np.isfinite(robot.slew)
+    if len(before) == len(executed):
+        slewed &= np.abs(executed - before) >= robot.slew - tolerance
+    words = ["clipped to its bounds"] * bool(outside) + ["slew-limited"] * bool(slewed.any())
+    return ", ".join(words) or "limited by the robot"
 
 
 def bound_in(decision: pb.Decision) -> float | None:

@@ -40,11 +40,11 @@ class DecisionView:
         return {} if self.perceived is None else self.perceived.flat(hits)
 
     def boxes_json(self) -> list[list[float]]:
-        """Return the tube from above: center x, y and half-width x, y of each box."""
-        return [rounded(row) for row in np.column_stack([self.centers[:, :2], self.half_widths[:, :2]])]
+        """Return the tube for JSON: center (d) and half-width (d) of each box."""
+        return [rounded(row) for row in np.column_stack([self.centers, self.half_widths])]
 
     def explanation_json(self) -> Figures:
-        """Return the explanation, the inputs, their arrows and the edge of the blocking half-space, from above.
+        """Return the explanation, the inputs, their arrows and the edge of the blocking half-space.
 
         Empty without an explanation.
         """
@@ -53,9 +53,10 @@ class DecisionView:
         return {
             "said": about.said,
             "trust": about.trust,
+            "limited": about.limited,
             "inputs": [[name, unit, *rounded((proposed, done))] for name, unit, proposed, done in about.inputs],
-            "arrows": [rounded(about.proposed[:2]), rounded(about.executed[:2])],
-            "edge": [*rounded(about.at[:2]), *rounded(about.normal[:2])] if len(about.at) else None,
+            "arrows": [rounded(about.proposed), rounded(about.executed)],
+            "edge": [*rounded(about.at), *rounded(about.normal)] if len(about.at) else None,
         }
 
 
@@ -107,12 +108,12 @@ def tube_boxes(exchange: pb.Exchange, dim: int | None = None) -> tuple[Array, Ar
     return centers.reshape(-1, max(dim, 1)), half_widths.reshape(-1, max(dim, 1))
 
 
-def boxes_from_above(reservations: Array) -> list[list[float]]:
-    """Return reservations (k, 2d + 1) from above: center x, y and half-width x, y with the body radius added."""
+def reservations_json(reservations: Array) -> list[list[float]]:
+    """Return reservations (k, 2d + 1) for JSON: center (d) and half-width (d) with the body radius added."""
     d = reservations.shape[1] // 2
-    return [rounded((*box[:2], *(box[d : d + 2] + box[-1]))) for box in reservations]
+    return [rounded((*box[:d], *(box[d:-1] + box[-1]))) for box in reservations]
 
 
 def body_discs(robot: Robot) -> list[list[float]]:
-    """Return x, y in the body frame and the radius of each disc of the robot's body, m."""
-    return [[*disc.at[:2], disc.radius] for disc in robot.body]
+    """Return the position (d) in the body frame and the radius of each disc or ball of the robot's body, m."""
+    return [[*disc.at, disc.radius] for disc in robot.body]

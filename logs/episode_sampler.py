@@ -1,19 +1,21 @@
 """Select a bounded number of episodes for the report while a log is read.
 
 For each robot kind: the nearest misses, collisions, the episodes with the most failsafes, a sample spread evenly over
-the log, and the last episode.
+the log, and the last episode. Of the others, the report has sketches.
 """
 
 from __future__ import annotations
 
 import heapq
+import json
 import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 from brakeline.logs.episode_stats import Figures, kind_of
-from brakeline.logs.episode_view import picture, rows
+from brakeline.logs.episode_view import FEW_TUBES, MOST_TUBES, picture, rows, sketch
+from brakeline.logs.json_values import finite
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 
@@ -21,6 +23,9 @@ NEAREST = 8
 COLLISIONS = 8
 MOST_FAILSAFES = 4  # episodes with the most failsafes
 SPREAD = 24
+SKETCHES = 2000  # episodes in short; of a longer log, evenly spread ones
+MOST_POINTS, FEWEST_POINTS = 40, 6  # steps in a sketch
+POINTS = 8000  # a new sketch has about this many steps, divided by the number of episodes so far
 MOST_STEPS = 3000  # steps of one episode in memory
 MOST_EXCHANGES = 600  # latest exchanges of one actor in memory
 
@@ -35,6 +40,7 @@ class EpisodeRecord:
     steps: list[pb.Step] = field(default_factory=list)
     closest: float = math.inf  # m
     failsafes: int = 0
+    until: int = 0  # steps of all actors of the robot kind up to the episode's latest step
     actor_exchanges: Iterable[pb.Exchange] = ()  # of this actor, also of other episodes
     other_exchanges: Iterable[pb.Exchange] = ()  # of the other robots of the world, also of other episodes
 
@@ -109,7 +115,10 @@ class EpisodeSampler:
         self._collisions: list[Figures] = []
         self._spread: dict[int, Figures] = {}
         self._stride = 1
+        self._sketches: dict[int, bytes] = {}  # JSON, which takes a sixth of the memory
+        self._sketch_stride = 1
         self._count = 0
+        self._steps = 0
 
     def source(self, name: str) -> ActorBuffer:
         """Return the buffer of an actor; create it for a new actor."""
@@ -125,6 +134,8 @@ class EpisodeSampler:
                 self._ended(source, episode)
             episode = source.running = EpisodeRecord(self.label, number, source.episode(number))
         episode.add(step)
+        self._steps += 1
+        episode.until = self._steps
 
     def close(self) -> None:
         """Evaluate the running episodes: the run has ended."""
@@ -135,13 +146,22 @@ class EpisodeSampler:
         self._sources.clear()
 
     def figures(self) -> Figures:
-        """Return `near`, the order of the nearest misses, smallest clearance first; and all selected `episodes`."""
+        """Return the selected `episodes`, and sketches of the `rest`, by their order in the log.
+
+        `near` has the orders of the nearest misses, smallest clearance first. `total` counts all episodes of the log.
+        """
         near = [item for *_, item in sorted(self._nearest, key=lambda entry: -entry[0])]
         failsafes = [item for *_, item in self._most_failsafes]
         last = [self._picture(self.last, self._count - 1)] if self.last is not None else []
         every = (*self._spread.values(), *last, *failsafes, *self._collisions, *near, *self.requested_episodes)
         selected = {item["order"]: item for item in every}
-        return {"near": [item["order"] for item in near], "episodes": [selected[order] for order in sorted(selected)]}
+        rest = [json.loads(item) for order, item in sorted(self._sketches.items()) if order not in selected]
+        return {
+            "near": [item["order"] for item in near],
+            "episodes": [selected[order] for order in sorted(selected)],
+            "rest": rest,
+            "total": self._count,
+        }
 
     def _ended(self, source: ActorBuffer, episode: EpisodeRecord) -> None:
         """Select the episode if it belongs to one of the groups. Only then is its picture computed."""
@@ -156,12 +176,23 @@ class EpisodeSampler:
         if len(self._collisions) < COLLISIONS and episode.outcome() == "collision":
             self._collisions.append(self._picture(episode, order))
         if order % self._stride == 0:
-            self._spread[order] = self._picture(episode, order)
+            self._spread[order] = self._picture(episode, order, FEW_TUBES)
             if len(self._spread) > SPREAD:
                 self._stride *= 2
                 self._spread = {k: item for k, item in self._spread.items() if k % self._stride == 0}
+        if order % self._sketch_stride == 0:
+            self._sketch(episode, order)
         if episode.number == self.wanted and self.actor in (None, episode.actor):
             self.requested_episodes.append(self._picture(episode, order) | {"rows": list(rows(episode, self.robot))})
+
+    def _sketch(self, episode: EpisodeRecord, order: int) -> None:
+        """Keep the episode in short. Of too many, keep every second one."""
+        points = min(MOST_POINTS, max(FEWEST_POINTS, POINTS // (order + 1)))
+        about = {"order": order, "until": episode.until, **sketch(episode, self.robot, points)}
+        self._sketches[order] = json.dumps(finite(about)).encode()
+        if len(self._sketches) > SKETCHES:
+            self._sketch_stride *= 2
+            self._sketches = {k: item for k, item in self._sketches.items() if k % self._sketch_stride == 0}
 
     def _others(self, source: ActorBuffer, episode: EpisodeRecord) -> list[pb.Exchange]:
         """Return the exchanges of the other robots of the episode's world; empty for a single robot."""
@@ -177,5 +208,5 @@ class EpisodeSampler:
         elif worth > heap[0][0]:
             heapq.heapreplace(heap, (worth, -order, self._picture(episode, order)))
 
-    def _picture(self, episode: EpisodeRecord, order: int) -> Figures:
-        return {"order": order, **picture(episode, self.robot)}
+    def _picture(self, episode: EpisodeRecord, order: int, tubes: int = MOST_TUBES) -> Figures:
+        return {"order": order, "until": episode.until, **picture(episode, self.robot, tubes)}

@@ -6,51 +6,73 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from brakeline.logs.decision_explanation import NO_ANSWER, bound_in, explain
-from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
+import numpy as np
+
+from brakeline.logs.arena_view import arena_view, obstacles_view
+from brakeline.logs.decision_explanation import NO_ANSWER, bound_in, explain, limits_applied
+from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures, kind_of
 from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.obstacle import BOX, WALL
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import reserved_boxes
 
 if TYPE_CHECKING:
     from brakeline.logs.episode_sampler import EpisodeRecord
 
-MOST_TUBES = 40  # tubes in one picture
+MOST_TUBES, FEW_TUBES = 40, 12  # tubes in one picture; in one of an ordinary episode
 CORNERS, HITS = 48, 90  # corners of the free space's outline and scan hits in the picture of one step
 NEAR = 8  # steps before and after the closest approach for which the picture has tubes
+SKETCHED = 2  # digits after the decimal point in a sketch: cm
 
 # One letter for each step's decision: n (none), a(l)lowed, a(d)justed, f(a)ilsafe, r(e)covering.
 LETTERS: dict[int, str] = {int(pb.UNKNOWN): "n", **{kind: name[1] for kind, name in KINDS.items()}}
+ALARMING = "nlead"  # letters; of several steps, a sketch shows the last one in this order
 
 
-def picture(episode: EpisodeRecord, robot: Robot | None) -> Figures:
-    """Return what a drawing from above needs, for JSON: arena, path [m], decisions by letter, some tubes."""
-    first, steps, exchanges = episode.steps[0], episode.steps, episode.exchanges()
-    closest = min(range(len(steps)), key=lambda k: steps[k].clearance)
+def picture(episode: EpisodeRecord, robot: Robot | None, tubes: int = MOST_TUBES) -> Figures:
+    """Return what a drawing of each step needs, for JSON: arena, path [m], decisions by letter, at most `tubes`."""
+    steps, exchanges = episode.steps, episode.exchanges()
+    closest = _closest(steps)
     return {
-        "actor": episode.actor,
-        "robot": first.robot,
-        "episode": episode.number,
-        **_arena(episode.about, exchanges),
+        **_summary(episode, closest),
+        **_arena(episode.about, exchanges, robot),
         "footprint": robot.footprint if robot is not None else 0.0,
         "discs": body_discs(robot) if robot is not None else [],
-        "outcome": episode.outcome(),
-        "steps": len(steps),
-        "first": first.step,
-        "reward": math.fsum(step.reward for step in steps),
-        "interventions": sum(kind_of(step) in INTERVENTIONS for step in steps),
-        "failsafes": episode.failsafes,
-        "closest": episode.closest if math.isfinite(episode.closest) else None,
-        "closest_at": closest,
-        "kinds": "".join(LETTERS.get(kind_of(step), "n") for step in steps),
-        "x": rounded(step.state[0] if step.state else 0.0 for step in steps),
-        "y": rounded(step.state[1] if len(step.state) > 1 else 0.0 for step in steps),
+        "period": robot.period if robot is not None else None,
+        "kinds": "".join(map(_letter, steps)),
+        **_path(steps, robot),
         "heading": _headings(steps, robot),
         "clearance": rounded(step.clearance for step in steps),
         "speed": rounded(step.speed for step in steps),
-        "tubes": _tubes(episode, exchanges, closest, robot),
+        "tubes": _tubes(episode, exchanges, closest, robot, tubes),
+        "movers": _movers(steps, exchanges),
+    }
+
+
+def sketch(episode: EpisodeRecord, robot: Robot | None, points: int) -> Figures:
+    """Return an episode in short, for JSON: as `picture`, without tubes, at `points` of its steps.
+
+    The steps are `at` evenly spaced indices, and the index of the closest approach. The walls are left out: they are
+    the edges of the arena's square.
+    """
+    steps, last = episode.steps, len(episode.steps) - 1
+    closest = _closest(steps)
+    at = sorted({round(k * last / max(1, points - 1)) for k in range(points)} | {closest})
+    some = [steps[k] for k in at]
+    parts = [steps[before + 1 : k + 1] for before, k in zip((-1, *at), at, strict=False)]
+    arena = _arena(episode.about, {}, robot, SKETCHED)
+    inside = [o for o in arena["obstacles"] if o["kind"] != WALL]
+    summary = _summary(episode, closest)
+    return {
+        **{name: round(value, 3) if isinstance(value, float) else value for name, value in summary.items()},
+        **{name: value for name, value in arena.items() if value is not None},
+        "obstacles": [{name: value for name, value in o.items() if value} for o in inside],
+        "at": at,
+        "kinds": "".join(max(map(_letter, part), key=ALARMING.index) for part in parts),
+        **_path(some, robot, SKETCHED),
+        "clearance": rounded((step.clearance for step in some), SKETCHED),
     }
 
 
@@ -67,6 +89,7 @@ def rows(episode: EpisodeRecord, robot: Robot | None) -> Iterable[Figures]:
             "time": step.header.time,
             **{name: list(getattr(step, name)) for name in ("state", "proposed", "action")},
             "decision": "no decision" if step.fallback else KINDS.get(step.decision),
+            "limited": _limited(step, exchange, robot),
             "reason": getattr(decision, "reason", None),
             "said": NO_ANSWER if step.fallback else _explanation(exchange, robot),
             "margin": decision.margin if decision is not None and decision.tube_center else None,
@@ -81,20 +104,63 @@ def rows(episode: EpisodeRecord, robot: Robot | None) -> Iterable[Figures]:
         }
 
 
-def _arena(about: pb.Episode | None, exchanges: Mapping[int, pb.Exchange]) -> Figures:
-    """Return arena, goal and obstacles. Without the Episode message, the obstacles come from the requests."""
-    if about is None:
-        requested = (item for exchange in exchanges.values() for item in exchange.request.obstacles)
-        distinct = {item.SerializeToString(deterministic=True): item for item in requested}
-        obstacles = [_obstacle(item) for item in distinct.values()]
-        return {"arena": None, "goal": None, "goal_radius": None, "start": None, "obstacles": obstacles}
+def _summary(episode: EpisodeRecord, closest: int) -> Figures:
+    """Return who drove, how it ended, and its counts."""
+    first, steps = episode.steps[0], episode.steps
     return {
-        "arena": about.arena,
-        "goal": rounded(about.goal[:2]) if len(about.goal) > 1 else None,
-        "goal_radius": about.goal_radius,
-        "start": rounded(about.start[:2]) if len(about.start) > 1 else None,
-        "obstacles": [_obstacle(item) for item in about.obstacles],
+        "actor": episode.actor,
+        "robot": first.robot,
+        "episode": episode.number,
+        "outcome": episode.outcome(),
+        "steps": len(steps),
+        "first": first.step,
+        "reward": math.fsum(step.reward for step in steps),
+        "interventions": sum(kind_of(step) in INTERVENTIONS for step in steps),
+        "failsafes": episode.failsafes,
+        "closest": episode.closest if math.isfinite(episode.closest) else None,
+        "closest_at": closest,
     }
+
+
+def _closest(steps: Sequence[pb.Step]) -> int:
+    return min(range(len(steps)), key=lambda k: steps[k].clearance)
+
+
+def _letter(step: pb.Step) -> str:
+    return LETTERS.get(kind_of(step), "n")
+
+
+def _dim(robot: Robot | None) -> int:
+    return 2 if robot is None else robot.position_dim
+
+
+def _path(steps: Sequence[pb.Step], robot: Robot | None, digits: int = 4) -> Figures:
+    """Return the coordinates of the measured positions by axis; z is None in the plane."""
+
+    def axis(k: int) -> list[float]:
+        return rounded((step.state[k] if len(step.state) > k else 0.0 for step in steps), digits)
+
+    return {"x": axis(0), "y": axis(1), "z": axis(2) if _dim(robot) == 3 else None}
+
+
+def _arena(
+    about: pb.Episode | None, exchanges: Mapping[int, pb.Exchange], robot: Robot | None, digits: int = 4
+) -> Figures:
+    """Return arena, goal and obstacles. Without the Episode message, the obstacles come from the requests."""
+    if about is not None:
+        return {"arena": about.arena, **arena_view(about, _dim(robot), digits)}
+    requested = (item for exchange in exchanges.values() for item in exchange.request.obstacles)
+    distinct = {item.SerializeToString(deterministic=True): item for item in requested if not item.HasField("motion")}
+    unknown = dict.fromkeys(("arena", "half", "floor", "ceiling", "goal", "goal_radius", "start"))
+    return {**unknown, "obstacles": obstacles_view(distinct.values())}
+
+
+def _limited(step: pb.Step, exchange: pb.Exchange | None, robot: Robot | None) -> str:
+    """Return which of the robot's limits changed an allowed proposal; empty if none did, or if that is unknown."""
+    if robot is None or step.fallback or step.decision != pb.ALLOWED or len(step.proposed) != robot.action_dim:
+        return ""
+    before = () if exchange is None else exchange.request.input_in_force
+    return limits_applied(robot, np.array(step.proposed), np.array(before), np.array(step.action))
 
 
 def _explanation(exchange: pb.Exchange | None, robot: Robot | None) -> str:
@@ -106,15 +172,15 @@ def _explanation(exchange: pb.Exchange | None, robot: Robot | None) -> str:
 
 
 def _tubes(
-    episode: EpisodeRecord, exchanges: Mapping[int, pb.Exchange], closest: int, robot: Robot | None
+    episode: EpisodeRecord, exchanges: Mapping[int, pb.Exchange], closest: int, robot: Robot | None, most: int
 ) -> dict[int, Figures]:
     """Return decisions by index of the step: around the closest approach, then interventions by their clearance."""
     steps, others = episode.steps, episode.exchanges_of_others()
-    near = [k for k in range(len(steps)) if abs(k - closest) <= NEAR]
+    near = [k for k in range(len(steps)) if abs(k - closest) <= min(NEAR, most // 4)]
     interventions = [k for k, step in enumerate(steps) if step.decision in INTERVENTIONS and k not in near]
     interventions.sort(key=lambda k: steps[k].clearance)
     tubes: dict[int, Figures] = {}
-    for k in sorted(near + interventions[: MOST_TUBES - len(near)]):
+    for k in sorted(near + interventions[: most - len(near)]):
         number = steps[k].step
         if number in exchanges and (tube := _tube(exchanges[number], others.get(number, ()), robot)) is not None:
             tubes[k] = tube
@@ -131,9 +197,9 @@ def _tube(exchange: pb.Exchange, others: Iterable[pb.Exchange], robot: Robot | N
         return None
     if not len(view.centers) or view.centers.shape[1] < 2:
         return None
-    perceived = view.perceived_json(HITS) | {"promises": boxes_from_above(view.reservations)}
+    perceived = view.perceived_json(HITS) | {"promises": reservations_json(view.reservations)}
     return {
-        "from": rounded(request.state[:2]),
+        "from": rounded(request.state[: view.centers.shape[1]]),
         "boxes": view.boxes_json(),
         "proposed": rounded(request.action),
         "plan": rounded(decision.plan[: len(request.action)]),
@@ -145,8 +211,21 @@ def _tube(exchange: pb.Exchange, others: Iterable[pb.Exchange], robot: Robot | N
     }
 
 
-def _obstacle(item: pb.Obstacle) -> Figures:
-    return {"kind": item.kind, "at": rounded(item.position), "size": rounded(item.size), "yaw": round(item.yaw, 4)}
+def _movers(steps: Sequence[pb.Step], exchanges: Mapping[int, pb.Exchange]) -> dict[int, list[list[float]]]:
+    """Return by index of each second step where the request's moving obstacles were: center and largest radius."""
+    movers: dict[int, list[list[float]]] = {}
+    for k, step in enumerate(steps[::2]):
+        exchange = exchanges.get(step.step)
+        moving = [] if exchange is None else [o for o in exchange.request.obstacles if o.HasField("motion")]
+        if moving:
+            movers[2 * k] = [rounded((*o.position, _reach(o)), SKETCHED) for o in moving]
+    return movers
+
+
+def _reach(obstacle: pb.Obstacle) -> float:
+    """Return the radius of an obstacle from above; of a box, that of the circle around it."""
+    sizes = obstacle.size[:2]
+    return 0.5 * math.hypot(*sizes) if obstacle.kind == BOX else max(sizes[:1], default=0.0)
 
 
 def _headings(steps: Sequence[pb.Step], robot: Robot | None) -> list[float] | None:

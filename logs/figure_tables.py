@@ -113,7 +113,7 @@ def show_episode(episode: Figures) -> RenderableType:
         (
             str(row["step"]),
             *(" ".join(f"{value:.2f}" for value in row[name]) for name in ("state", "proposed", "action")),
-            row["decision"] or "-",
+            ", ".join(filter(None, (row["decision"] or "-", row["limited"]))),
             _optional("{:.2f}", row["decide_ms"]),
             _optional("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
             f"{row['clearance']:.3f}",

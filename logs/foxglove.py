@@ -20,6 +20,7 @@ from google.protobuf.message import Message
 
 from brakeline.errors import Implausible, UnknownRobot
 from brakeline.logs import foxglove_scene
+from brakeline.logs.arena_view import half_width
 from brakeline.logs.reader import Record
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import Entry
@@ -120,7 +121,7 @@ class FoxgloveConverter:
             raise UnknownRobot(f"no robot is called {episode.robot!r}")
         if _source(key) not in self._actors and len(self._actors) >= MOST_ACTORS:
             raise Implausible(f"{name} is not drawn: there are already {MOST_ACTORS} actors")
-        site = self._layout.position(robot.name, name, 2.0 * foxglove_scene.half_width(episode))
+        site = self._layout.position(robot.name, name, 2.0 * half_width(episode))
         actor = self._actors.setdefault(_source(key), _Actor(robot, name, site))
         actor.waiting = None
         arena = foxglove_scene.arena(robot, episode, time)

@@ -31,9 +31,11 @@ from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from brakeline.logs.arena_view import closes, half_width
 from brakeline.logs.decision_explanation import NO_ANSWER, Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
+from brakeline.logs.viewer.palette import rgb_color
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import LidarRays
@@ -47,21 +49,16 @@ FLAT = 0.02  # m, height of marks on the floor; walls are twice as thick
 LEVELS = {"DEBUG": Log.DEBUG, "INFO": Log.INFO, "WARNING": Log.WARNING, "ERROR": Log.ERROR}
 
 
-def _color(red: int, green: int, blue: int, alpha: float = 1.0) -> Color:
+def _color(name: str, alpha: float = 1.0) -> Color:
+    red, green, blue = rgb_color(name)
     return Color(r=red / 255, g=green / 255, b=blue / 255, a=alpha)
 
 
-SOLID, WALLS, GOAL = _color(120, 128, 140), _color(120, 128, 140, 0.25), _color(52, 168, 100, 0.35)
-PROPOSED, EXECUTED, EDGE = _color(199, 125, 0), _color(31, 95, 191), _color(192, 32, 48, 0.5)
-FREE, HIT, RESERVED = _color(20, 140, 120), _color(90, 40, 140), _color(40, 96, 190, 0.18)
-MOVER, SWEPT = _color(170, 90, 40), _color(170, 90, 40, 0.15)
-BODY, NOSE = _color(40, 96, 190), _color(250, 250, 250)
-COLORS: dict[int, tuple[int, int, int]] = {
-    pb.ALLOWED: (52, 168, 100),
-    pb.ADJUSTED: (240, 150, 30),
-    pb.FAILSAFE: (214, 48, 60),
-    pb.RECOVERING: (142, 68, 173),
-}
+SOLID, WALLS, GOAL = _color("obstacle-edge"), _color("obstacle-edge", 0.25), _color("goal", 0.35)
+PROPOSED, EXECUTED, EDGE = _color("proposed"), _color("executed"), _color("halfspace", 0.5)
+FREE, HIT, RESERVED = _color("free"), _color("hit"), _color("reserved", 0.18)
+MOVER, SWEPT = _color("mover"), _color("mover", 0.15)
+BODY, NOSE, NAME = _color("body"), _color("field"), _color("soft")
 
 
 def body_frame(actor: str) -> str:
@@ -74,29 +71,17 @@ def stamp(time: int) -> Timestamp:
     return Timestamp(seconds=time // 10**9, nanos=time % 10**9)
 
 
-def half_width(episode: pb.Episode) -> float:
-    """Return half the edge of the smallest square around the origin that holds the episode's arena, m."""
-    walls = [o.position[:2] for o in episode.obstacles if o.kind == WALL]
-    points = walls or [o.position[:2] for o in episode.obstacles] + [episode.goal[:2], episode.start[:2]]
-    return max((abs(value) for point in points for value in point), default=1.0) or 1.0
-
-
 def arena(robot: Robot, episode: pb.Episode, time: int) -> SceneUpdate:
     """Draw obstacles, walls, goal and the robot's body. Sent once, at the start of an episode."""
     half = half_width(episode)
     room = SceneEntity(timestamp=stamp(time), frame_id=episode.actor, id="arena")
-    ceilings = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if _closes(o, half)]
+    ceilings = [o.position[2] - 0.5 * o.size[2] for o in episode.obstacles if closes(o, half)]
     height = max(ceilings, default=0.0) or HEIGHT
     for obstacle in episode.obstacles:
-        if not _closes(obstacle, half):  # a floor or a ceiling would hide the room
+        if not closes(obstacle, half):  # a floor or a ceiling would hide the room
             _draw_obstacle(room, obstacle, half, height)
     _round(room, episode.goal[: robot.position_dim], episode.goal_radius, FLAT, GOAL)
     return SceneUpdate(entities=[room, _body(robot, episode.actor, time)])
-
-
-def _closes(obstacle: pb.Obstacle, half: float) -> bool:
-    """Return whether the obstacle is a floor or a ceiling."""
-    return obstacle.kind == BOX and len(obstacle.size) == 3 and min(obstacle.size[:2]) >= 2.0 * half
 
 
 def _draw_obstacle(room: SceneEntity, obstacle: pb.Obstacle, half: float, height: float) -> None:
@@ -122,7 +107,7 @@ def _body(robot: Robot, actor: str, time: int) -> SceneEntity:
         _round(body, disc.at, disc.radius, tall, BODY, lift=0.5 * tall)
     if robot.position_dim == 2:
         _cube(body, _pose((0.5 * robot.front_extent, 0.0, tall)), (robot.front_extent, 2.0 * FLAT, FLAT), NOSE)
-    body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), _color(60, 60, 60)))
+    body.texts.append(_text(actor, (0.0, 0.0, HEIGHT + robot.footprint), NAME))
     return body
 
 
@@ -144,7 +129,7 @@ def decision(
     """
     kind = kind_of(step)
     entity = SceneEntity(timestamp=stamp(time), frame_id=step.actor, id="decision")
-    color, words = COLORS.get(kind, (120, 120, 120)), KINDS.get(kind, "")
+    color, words = KINDS.get(kind, "unfiltered"), KINDS.get(kind, "")
     if exchange is not None:
         view = decision_view(robot, exchange, reservations)
         start = exchange.request.state[: robot.position_dim]
@@ -158,20 +143,18 @@ def decision(
     if kind in INTERVENTIONS:
         above = HEIGHT + 3.0 * robot.footprint
         text = NO_ANSWER if step.fallback else words
-        entity.texts.append(_text(text, step.state[: robot.position_dim], _color(*color), above))
+        entity.texts.append(_text(text, step.state[: robot.position_dim], _color(color), above))
     return SceneUpdate(entities=[entity])
 
 
-def _draw_tube(
-    entity: SceneEntity, view: DecisionView, start: Sequence[float], footprint: float, color: tuple[int, int, int]
-) -> None:
+def _draw_tube(entity: SceneEntity, view: DecisionView, start: Sequence[float], footprint: float, color: str) -> None:
     """Add the boxes of the tube, the area where the robot stops, and the plan from the robot through the centers."""
     for center, half in zip(view.centers, view.half_widths, strict=True):
-        _cube(entity, _pose(center), _edges(half), _color(*color, 0.6))
+        _cube(entity, _pose(center), _edges(half), _color(color, 0.6))
     if len(view.centers):  # the body is in this disc or sphere, wherever in the last box the robot stops
         stop = math.hypot(*view.half_widths[-1]) + footprint
-        _round(entity, view.centers[-1], stop, FLAT, _color(*color, 0.2))
-    _line(entity, LinePrimitive.LINE_STRIP, (start, *view.centers), 3.0, _color(*color))
+        _round(entity, view.centers[-1], stop, FLAT, _color(color, 0.2))
+    _line(entity, LinePrimitive.LINE_STRIP, (start, *view.centers), 3.0, _color(color))
 
 
 def _draw_explanation(entity: SceneEntity, start: Sequence[float], about: Explanation, size: float) -> None:

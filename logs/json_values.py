@@ -20,6 +20,6 @@ def finite(value: Any, digits: int | None = None) -> Any:
     return value if digits is None else round(value, digits)
 
 
-def rounded(values: Iterable[float]) -> list[float]:
-    """Round to 4 digits; a value that is not finite becomes 0."""
-    return [round(float(value), 4) if math.isfinite(value) else 0.0 for value in values]
+def rounded(values: Iterable[float], digits: int = 4) -> list[float]:
+    """Round to so many digits after the decimal point; a value that is not finite becomes 0."""
+    return [round(float(value), digits) if math.isfinite(value) else 0.0 for value in values]

@@ -54,7 +54,7 @@ class RunAnalysis:
         self.options = options or AnalysisOptions()
         self.metrics = Metrics(robots=log.robots)
         self.training: defaultdict[str, LearningCurve] = defaultdict(LearningCurve)  # by robot kind
-        self.intervention_maps: defaultdict[str, InterventionMap] = defaultdict(InterventionMap)
+        self.intervention_maps: dict[str, InterventionMap] = {}
         self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
         self._received = 0  # when the recorder received the message in hand, without jumps of its clock [ns]
@@ -109,22 +109,20 @@ class RunAnalysis:
         """Add a learner's message, and the steps after a gap of the log that it permits. Episodes drawn lack these."""
         self.training[metrics.robot].learner(metrics)
         for step in self.metrics.late:
-            self._count(metrics.robot, step)
-
-    def _count(self, robot: str, step: Any) -> None:
-        """Add a step to the curves and the map of a robot kind."""
-        self.training[robot].step(step)
-        if len(state := step.state[:2]) == 2:
-            self.intervention_maps[robot].step(state, step)
+            self.training[metrics.robot].step(step)
 
     def _step(self, series: LogChannel, step: Any) -> None:
-        self._count(series.robot, step)
+        self.training[series.robot].step(step)
         sampler, buffer = self._buffer(series)
         sampler.step(buffer, step)
         self.timeline.step(self._received)
 
     def _exchange(self, series: LogChannel, exchange: Any) -> None:
-        self.training[series.robot].exchange(exchange)
+        robot = series.robot
+        self.training[robot].exchange(exchange)
+        if robot not in self.intervention_maps:
+            self.intervention_maps[robot] = InterventionMap(self.log.robots.named(robot))
+        self.intervention_maps[robot].exchange(exchange)
         self._buffer(series)[1].exchanges.append(exchange)
 
     def _buffer(self, series: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:

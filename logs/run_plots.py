@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.run_groups import METHOD_COLORS
+from brakeline.logs.viewer.palette import hex_color
 
 OTHER_COLORS = ("#56b4e9", "#cc79a7", "#5d6b7c", "#b39800")  # of groups that share their method with another
 
@@ -25,6 +26,7 @@ ROWS: tuple[tuple[str, Callable[[Figures], float]], ...] = (
     ("reward of an episode", _value_or_nan("reward")),
     ("interventions", lambda row: row["adjusted"] + row["failsafes"]),
 )
+KINDS = (("adjusted", "adjusted"), ("failsafe", "failsafes"))  # of interventions, and their names in a row
 # Of a model set that can be adapted: what a change of the robot does to its sets.
 SETS: tuple[tuple[str, Callable[[Figures], float]], ...] = (
     ("windows outside the sets", _value_or_nan("beyond")),
@@ -71,8 +73,12 @@ def _run(training: Figures) -> Figure:
     picture, grid = _panels(list(training) or [""], [label for label, _ in shown])
     for column, robot in zip(grid, training, strict=False):
         bins = training[robot]["bins"]
-        for axes, (_, value) in zip(column, shown, strict=True):
-            axes.plot([row["until"] for row in bins], [value(row) for row in bins])
+        until = [row["until"] for row in bins]
+        for axes, (label, value) in zip(column, shown, strict=True):
+            axes.plot(until, [value(row) for row in bins], color=hex_color("ink"))
+            for kind, name in KINDS if label == "interventions" else ():
+                axes.plot(until, [row[name] for row in bins], color=hex_color(kind), label=kind, linewidth=0.9)
+                axes.legend(frameon=False, fontsize=8)
             for model in training[robot]["models"][1:]:
                 axes.axvline(model["from"], color="black", linestyle=":")
     return picture

@@ -22,6 +22,7 @@ FLAGS = (
     "--headless=new",
     "--no-sandbox",
     "--disable-gpu",
+    "--enable-unsafe-swiftshader",  # WebGL without a graphics card
     "--disable-dev-shm-usage",
     "--disable-background-networking",
     "--no-first-run",
@@ -99,6 +100,17 @@ class Page:
         """The page as it is printed, on A4."""
         self.call("Emulation.setEmulatedMedia", media="", features=[])
         return base64.b64decode(self.call("Page.printToPDF", paperWidth=8.27, paperHeight=11.69)["data"])
+
+    def press(self, key: str) -> None:
+        """A key goes down and up again, wherever the focus is."""
+        text = {"text": key} if len(key) == 1 else {}
+        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, code=key)
+
+    def mouse(self, kind: str, x: float, y: float) -> None:
+        """The left button of the mouse is pressed, released, or the mouse moves (`kind`: Pressed, Released, Moved)."""
+        pressed = {"button": "left", "clickCount": 1} if kind != "Moved" else {}
+        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **pressed)
 
     def open(self, url: str) -> None:
         self.call("Page.navigate", url=url)

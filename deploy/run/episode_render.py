@@ -25,6 +25,7 @@ from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.logs.decision_explanation import Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import KINDS as DECISIONS
+from brakeline.logs.viewer.palette import hex_color
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
 from brakeline.messaging.robot import Robot
@@ -34,12 +35,16 @@ from brakeline.sim.scripted_policies import Policy
 Array = NDArray[np.float64]
 
 KINDS = {pb.UNKNOWN: "no filter", **DECISIONS}
-COLOURS = {"no filter": "#444444", "allowed": "#0072b2", "adjusted": "#e69f00", "failsafe": "#d55e00"}
-COLOURS["recovering"] = "#8e44ad"
-ARROWS = {"proposed": "#c77d00", "executed": "#1f5fbf"}
-EDGE = "#c02030"  # of the half-space that blocks the proposal
+COLOURS = {kind: hex_color(kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}
+COLOURS["no filter"] = hex_color("unfiltered")
+ARROWS = {"proposed": hex_color("proposed"), "executed": hex_color("executed")}
+EDGE = hex_color("halfspace")  # of the half-space that blocks the proposal
 HITS = 400  # scan hits in one frame
-FREE, HIT, MOVER = "#148c78", "#5a288c", "#aa5a28"  # perceived surroundings: scan and moving obstacles
+FREE, HIT, MOVER = (
+    hex_color("free"),
+    hex_color("hit"),
+    hex_color("mover"),
+)  # perceived surroundings: scan and moving obstacles
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # of the film relative to real time
 LAST_FRAMES = 8  # repetitions of the last frame
@@ -187,8 +192,8 @@ class _FilmAxes:
             drawn.set_facecolor("#9a9a9a")
         axes.add_collection(drawn)
         goal = arena.goal
-        axes.add_patch(Circle(goal[:2], arena.goal_radius, color="#009e73", alpha=0.35, zorder=1))
-        axes.plot(*goal[:2], marker="*", color="#009e73", markersize=12, zorder=3)
+        axes.add_patch(Circle(goal[:2], arena.goal_radius, color=hex_color("goal"), alpha=0.35, zorder=1))
+        axes.plot(*goal[:2], marker="*", color=hex_color("goal"), markersize=12, zorder=3)
         axes.plot(*self.path[0, :2], marker="o", color="white", markeredgecolor="black", markersize=6, zorder=6)
 
     def zoom(self, paths: Array) -> None:
@@ -259,7 +264,7 @@ class _FilmAxes:
         if len(about.free):
             outline = Polygon(about.free[:, :2], facecolor=FREE, edgecolor=FREE, alpha=0.12 * alpha, zorder=1)
             drawn.append(self.axes.add_patch(outline))
-            hits = np.reshape(about.flat(HITS)["hits"], (-1, 2))
+            hits = np.array([hit[:2] for hit in about.flat(HITS)["hits"]]).reshape(-1, 2)
             drawn += self.axes.plot(*hits.T, ".", color=HIT, markersize=2, alpha=alpha, zorder=5)
         for discs, faint in ((about.swept.reshape(-1, about.swept.shape[-1]), 0.12), (about.movers, 0.8)):
             for disc in discs:

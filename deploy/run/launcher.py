@@ -23,6 +23,7 @@ from brakeline.learner.checkpoint import latest as latest_checkpoint
 from brakeline.logs.log_length import count_by_key
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.watch.run_history import NOTE, RunHistory, history_to_note
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
@@ -113,6 +114,7 @@ class Launcher:
         self.metrics = Metrics(robots=RecordedRobots(robot_named(name) for name in config.robots))
         self.lines: deque[str] = deque(maxlen=200)
         self.ending = False
+        self._history = RunHistory()
         self._earlier: set[Path] = set()  # files of the log from before a resumption
         self._inbox = Inbox()
         self._lacks_messages = False  # because the inbox was full
@@ -170,7 +172,10 @@ class Launcher:
         """Put the totals of the run into each health message, for viewers that connect in its middle."""
         config, steps = self.config, self.config.steps * len(self.config.robots)
         process.figures.update({f"restarts {child.spec.name}": child.restarts for child in self.processes})
-        process.figures.update(totals_to_health(run_totals(self.metrics)))
+        totals = run_totals(self.metrics)
+        self._history.add(totals)
+        process.figures.update(totals_to_health(totals))
+        process.notes[NOTE] = history_to_note(self._history.rows)
         process.notes.update(run=self.folder.name, method=config.method, arena=config.arena)
         process.notes.update(seed=str(config.seed), steps=str(steps))
 

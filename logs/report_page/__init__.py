@@ -24,11 +24,12 @@ from brakeline.logs.episode_stats import Figures
 from brakeline.logs.json_values import finite
 from brakeline.logs.log_analysis import SETUP
 from brakeline.logs.tube_stats import stated
+from brakeline.logs.viewer import SCRIPTS, STYLES, viewer_file
 
-STYLES = ("report.css",)
+OWN_STYLES = ("report.css",)
 PAGE = "report.html.j2"
 PIECES = ("headline.html.j2", "details.html.j2")
-SCRIPTS = ("svg.js", "save.js", "learning.js", "charts.js", "scene.js", "episodes.js", "main.js")
+OWN_SCRIPTS = ("save.js", "learning.js", "charts.js", "episodes.js", "main.js")
 
 RATES = (  # name, unit, description
     ("goals", "episodes", "goals reached"),
@@ -60,12 +61,12 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
                 "label": label,
                 "mark": f"run{place}-" if place else "",  # prefix of the element ids of this run
                 "f": own | {"rates": rates(own)},
-                "kept": sum(len(gallery["episodes"]) for gallery in pictures["galleries"].values()),
+                "kept": kept(pictures["galleries"].values()),
             }
             for place, (label, (own, pictures)) in enumerate(runs.items())
         ],
-        style="\n".join(map(_text, STYLES)),
-        script="\n".join(['"use strict";', *map(_text, SCRIPTS)]),
+        style="\n".join([*map(viewer_file, STYLES), *map(_text, OWN_STYLES)]),
+        script="\n".join(['"use strict";', *map(viewer_file, SCRIPTS), *map(_text, OWN_SCRIPTS)]),
         data=embedded([_drawing_data(label, own, pictures) for label, (own, pictures) in runs.items()]),
     )
 
@@ -92,6 +93,13 @@ def rates(figures: Figures) -> list[Figures]:
         | {"name": name, "what": what, "interval": figures["intervals"][name]}
         for name, _, what in RATES
     ]
+
+
+def kept(galleries: Iterable[Figures]) -> dict[str, int]:
+    """Return how many episodes the page has with every step (`whole`), how many at all, and how many the log has."""
+    counts = [(len(gallery["episodes"]), len(gallery["rest"]), gallery["total"]) for gallery in galleries]
+    whole, rest, total = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0, 0)
+    return {"whole": whole, "all": whole + rest, "total": total}
 
 
 def missing(figures: Figures) -> list[str]:
@@ -158,4 +166,4 @@ def _text(name: str) -> str:
 
 def names() -> Iterable[str]:
     """Return the names of all files of the page."""
-    return (PAGE, *PIECES, *STYLES, *SCRIPTS)
+    return (PAGE, *PIECES, *OWN_STYLES, *OWN_SCRIPTS)

@@ -6,9 +6,9 @@ function whiskers(root) {
     if (rate === "") continue;
     const most = Math.max(+high || 0, +rate) > 0.2 ? 1 : Math.max(+high || 0, +rate, 1e-9) * 1.15;
     const x = scale(0, most, 4, 256);
-    const parts = [tag("line", { x1: 4, x2: 256, y1: 10, y2: 10, stroke: "#dfe4ea", "stroke-width": 2 })];
-    if (low !== "") parts.push(tag("line", { x1: x(+low), x2: x(+high), y1: 10, y2: 10, stroke: "#2b6cb8", "stroke-width": 5, "stroke-linecap": "round", opacity: 0.35 }));
-    parts.push(tag("circle", { cx: x(+rate), cy: 10, r: 4, fill: "#2b6cb8" }));
+    const parts = [tag("line", { x1: 4, x2: 256, y1: 10, y2: 10, stroke: color("line"), "stroke-width": 2 })];
+    if (low !== "") parts.push(tag("line", { x1: x(+low), x2: x(+high), y1: 10, y2: 10, stroke: color("allowed"), "stroke-width": 5, "stroke-linecap": "round", opacity: 0.35 }));
+    parts.push(tag("circle", { cx: x(+rate), cy: 10, r: 4, fill: color("allowed") }));
     parts.push(label(310, 14, `of ${percent(most)}`, { "text-anchor": "end" }));
     cell.innerHTML = drawing(312, 20, `${percent(+rate)}, interval ${percent(+low)} to ${percent(+high)}`, parts);
   }
@@ -62,44 +62,38 @@ function heat(share) {
   return `rgb(${stops[k].map((v, i) => Math.round(v + f * (stops[k + 1][i] - v))).join(",")})`;
 }
 
-/** One map: the color shows `value(cell)` between 0 and `most`; `form` formats a value. */
-function map(cells, cell, what, value, most, form) {
-  const xs = cells.map((c) => c[0]), ys = cells.map((c) => c[1]);
-  const box = { x0: Math.min(...xs) * cell, x1: (Math.max(...xs) + 1) * cell, y0: Math.min(...ys) * cell, y1: (Math.max(...ys) + 1) * cell };
-  const per = 400 / Math.max(box.x1 - box.x0, box.y1 - box.y0);
-  const frame = { left: 36, top: 26, right: 36 + per * (box.x1 - box.x0), bottom: 26 + per * (box.y1 - box.y0) };
-  const x = (v) => frame.left + per * (v - box.x0), y = (v) => frame.bottom - per * (v - box.y0);
-  const out = [label(4, 14, what, { class: "title" })];
+/** A map of interventions in the robot's frame, which looks to the right. */
+function interventionMap({ cell, cells, heading, footprint }) {
+  const count = (c) => c[2] + c[3] + c[4], counts = cells.map(count).sort((a, b) => a - b), most = Math.max(2, counts[Math.floor(0.98 * (counts.length - 1))]);
+  const reach = cell * (1 + Math.max(3, ...cells.flatMap(([x, y]) => [Math.abs(x), Math.abs(x + 1), Math.abs(y), Math.abs(y + 1)])));
+  const frame = { left: 44, top: 26, right: 444, bottom: 426 }, x = scale(-reach, reach, frame.left, frame.right), y = scale(-reach, reach, frame.bottom, frame.top), per = x(1) - x(0);
+  const out = [label(4, 14, `interventions in a cell of ${figure(cell)} m`, { class: "title" }), tag("rect", { x: frame.left, y: frame.top, width: 400, height: 400, class: "paper" })];
   for (const c of cells) {
-    const [cx, cy, steps, adjusted, failsafe, hit] = c;
-    const said = `${steps} steps, ${adjusted} adjusted, ${failsafe} failsafe${hit ? `, ${hit} in collision` : ""}`;
-    out.push(tag("rect", { x: x(cx * cell), y: y((cy + 1) * cell), width: per * cell, height: per * cell, fill: heat(value(c) / most) }, tag("title", {}, said)));
-    if (hit) out.push(tag("circle", { cx: x((cx + 0.5) * cell), cy: y((cy + 0.5) * cell), r: 4, fill: "none", stroke: "#000", "stroke-width": 1.5 }));
+    const said = `${c[2]} adjusted, ${c[3]} failsafe, ${c[4]} recovering: ${figure((c[0] + 0.5) * cell)} m ahead, ${figure((c[1] + 0.5) * cell)} m to the left`;
+    out.push(tag("rect", { x: x(c[0] * cell), y: y((c[1] + 1) * cell), width: per * cell, height: per * cell, fill: heat(count(c) / most) }, tag("title", {}, said)));
   }
-  for (const v of ticks(box.x0, box.x1, 5)) out.push(label(x(v), frame.bottom + 15, figure(v), { "text-anchor": "middle" }));
-  for (const v of ticks(box.y0, box.y1, 5)) out.push(label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
+  out.push(tag("circle", { cx: x(0), cy: y(0), r: Math.max(4, per * footprint), fill: "none", class: "ink", "stroke-width": 1.5 }), tag("line", { x1: x(0), y1: y(0), x2: x(0) + Math.max(10, 1.8 * per * footprint), y2: y(0), class: "ink", "stroke-width": 2 }));
+  for (const v of ticks(-reach, reach, 6)) out.push(label(x(v), frame.bottom + 15, figure(v), { "text-anchor": "middle" }), label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
   for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 12, y: frame.bottom - 8 - k * 8, width: 12, height: 8.3, fill: heat(k / 20) }));
-  out.push(label(frame.right, frame.bottom + 30, "x [m]", { "text-anchor": "end" }), label(frame.left - 6, frame.top - 2, "y [m]", { "text-anchor": "end" }));
-  for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, form(most * k / 20)));
-  return drawing(frame.right + 76, frame.bottom + 34, `${what}, from above`, out);
+  for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, figure(Math.round((most * k) / 20))));
+  out.push(label(frame.right, frame.bottom + 30, `ahead [m], ${heading ? "as the robot looks" : "in the direction of the proposed motion"}`, { "text-anchor": "end" }), label(frame.left, frame.top - 4, "left [m]", { "text-anchor": "end" }));
+  return drawing(frame.right + 76, frame.bottom + 34, "interventions around the robot, from above", out);
 }
 
 function places(target, robots) {
-  for (const [robot, { cell, cells }] of Object.entries(robots)) {
-    if (!cells.length) continue;
-    const share = (c) => (c[3] + c[4]) / c[2], steps = (c) => c[2];
-    const high = (value, some) => { const found = some.map(value).sort((a, b) => a - b); return found[Math.floor(0.98 * (found.length - 1))] ?? 0; };
-    const often = cells.filter((c) => c[2] >= 5);
-    const made = element("div", { class: "charts", "data-robot": robot }, element("div"), element("div"));
-    made.children[0].innerHTML = map(cells, cell, `interventions: share of the steps in a cell of ${figure(cell)} m`, share, Math.max(0.02, high(share, often)), percents);
-    made.children[1].innerHTML = map(cells, cell, "steps in a cell", steps, Math.max(2, high(steps, cells)), (v) => figure(Math.round(v)));
-    const rows = () => cells.map(([cx, cy, steps, adjusted, failsafe, collisions]) => ({ x_m: cx * cell, y_m: cy * cell, steps, adjusted, failsafe, collisions }));
-    saves(made.children[0], `interventions of ${robot} by place`, rows);
-    saves(made.children[1], `steps of ${robot} by place`, rows);
+  for (const [robot, about] of Object.entries(robots)) {
+    if (!about.cells.length && !about.elsewhere) continue;
+    const drawn = element("div", { class: "charts", "data-robot": robot }), map = element("div");
+    if (about.cells.length) {
+      map.innerHTML = interventionMap(about);
+      saves(map, `interventions around ${robot}`, () => about.cells.map(([cx, cy, adjusted, failsafe, recovering]) => ({ ahead_m: cx * about.cell, left_m: cy * about.cell, adjusted, failsafe, recovering })));
+      drawn.append(map);
+    }
     if (Object.keys(robots).length > 1) target.append(element("h3", {}, robot));
-    target.append(made);
+    target.append(drawn);
+    if (about.elsewhere) target.append(element("p", { class: "small" }, `${about.elsewhere} interventions have no place, for instance because a limit of the speed was the reason.`));
   }
-  if (!target.children.length) target.append(nothing("The log has no positions."));
+  if (!target.children.length) target.append(nothing("The log has no intervention."));
 }
 
 function timeline(target, { lives, lines, bin_s, steps }) {
@@ -111,7 +105,7 @@ function timeline(target, { lives, lines, bin_s, steps }) {
   const out = [label(4, 16, "steps/s", { class: "title" })];
   if (steps.length) {
     const most = Math.max(...steps.map((s) => s[1])), y = scale(0, most, 70, 8);
-    for (const [from, rate] of steps) out.push(tag("rect", { x: at(from), width: Math.max(0.5, at(from + bin_s) - at(from)), y: y(rate), height: 70 - y(rate), fill: "#9db8d8" }, tag("title", {}, `${figure(rate)} steps/s after ${figure(from - begin)} s`)));
+    for (const [from, rate] of steps) out.push(tag("rect", { x: at(from), width: Math.max(0.5, at(from + bin_s) - at(from)), y: y(rate), height: 70 - y(rate), fill: color("bar") }, tag("title", {}, `${figure(rate)} steps/s after ${figure(from - begin)} s`)));
     out.push(label(frame.left - 6, 18, figure(most), { "text-anchor": "end" }), tag("line", { x1: frame.left, x2: frame.right, y1: 70, y2: 70, class: "axis" }));
   }
   names.forEach((name, k) => {
@@ -119,15 +113,15 @@ function timeline(target, { lives, lines, bin_s, steps }) {
     out.push(label(4, y + 12, name.length > 20 ? `…${name.slice(-19)}` : name), tag("rect", { x: frame.left, y, width: frame.right - frame.left, height: 16, class: "paper" }));
     for (const life of lives.filter((l) => l.process === name)) {
       const said = `${name}: ${figure(life.start - begin)} to ${figure(life.end - begin)} s, ${life.goodbye ? "ended in order" : end - life.end > 3 ? "then silent" : "alive at the end of the log"}`;
-      out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: "#4f9d78", rx: 2 }, tag("title", {}, said)));
+      out.push(tag("rect", { x: at(life.start), y, width: Math.max(2, at(life.end) - at(life.start)), height: 16, fill: color("alive"), rx: 2 }, tag("title", {}, said)));
       if (!life.goodbye && end - life.end > 3) out.push(tag("rect", { x: at(life.end) - 1.5, y: y - 2, width: 3, height: 20, fill: KINDS.a.color }, tag("title", {}, said)));
       if (life.restart) out.push(tag("path", { d: `M${at(life.start)} ${y - 2} l6 10 l-6 10 z`, class: "solid" }, tag("title", {}, `${name} was restarted`)));
     }
-    for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : "#f2c14e", stroke: "#fff" }, tag("title", {}, `${line.level}: ${line.text}`)));
+    for (const line of lines.filter((l) => l.process === name)) out.push(tag("circle", { cx: at(line.t), cy: y + 8, r: 3.2, fill: line.level === "ERROR" ? KINDS.a.color : color("warning"), stroke: color("paper") }, tag("title", {}, `${line.level}: ${line.text}`)));
   });
   for (const t of ticks(0, end - begin, 8)) out.push(label(x(t), frame.bottom + 14, `${figure(t, 6)} s`, { "text-anchor": "middle" }));
   const box = element("div");
   box.innerHTML = drawing(1040, frame.bottom + 22, "health of the processes", out);
   saves(box, "health of the processes", () => lives.map((life) => ({ process: life.process, from_s: life.start - begin, to_s: life.end - begin, goodbye: life.goodbye, restart: life.restart })));
-  target.append(box, legend([["#4f9d78", "alive"], [KINDS.a.color, "silent from here on; an error"], ["#f2c14e", "a warning"], ["#1b2430", "restarted"]]));
+  target.append(box, legend([[color("alive"), "alive"], [KINDS.a.color, "silent from here on; an error"], [color("warning"), "a warning"], [color("ink"), "restarted"]]));
 }

@@ -1,29 +1,15 @@
-// The nearest misses, and the picker of episodes.
+// The nearest misses, and the picker of episodes with their viewer.
 
-/** The smallest rectangle that holds an episode: its path, start, goal and obstacles. */
-function episodeBounds(episode) {
-  const xs = [...episode.x], ys = [...episode.y];
-  const add = (x, y, reach = 0) => { xs.push(x - reach, x + reach); ys.push(y - reach, y + reach); };
-  if (episode.goal) add(...episode.goal, episode.goal_radius);
-  if (episode.start) add(...episode.start);
-  for (const o of episode.obstacles) add(o.at[0], o.at[1], o.kind === "wall" ? 0 : 0.5 * Math.hypot(...o.size.slice(0, 2)));
-  const pad = 0.04 * Math.max(Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys), 0.5);
-  return [Math.min(...xs) - pad, Math.min(...ys) - pad, Math.max(...xs) + pad, Math.max(...ys) + pad];
-}
+const PERCEIVED = [["free", "free", "free space by the scan"], ["hits", "hit", "hits of the scan"], ["movers", "mover", "moving obstacle and its reachable set"], ["promises", "reserved", "reserved by other robots"]];
 
-/** The episode at step `k` as an SVG, within `bounds` or all of it. */
-function drawEpisode(episode, k, size, bounds = episodeBounds(episode)) {
-  const { x, y, heading, tubes } = episode;
-  const scene = { ...episode, points: x.map((value, i) => [value, y[i]]), pose: [x[k], y[k], heading?.[k] ?? null], decision: tubes[k] };
-  return drawScene(scene, bounds, size, `${episode.actor}, episode ${episode.episode}, step ${episode.first + k}`, k);
-}
-
+/** Say what was decided at the point `k`, and why. */
 function why(episode, k) {
-  const t = episode.tubes[k];
-  if (!t) return KINDS[episode.kinds[k]].name;
+  const t = episode.tubes?.[k], kind = KINDS[episode.kinds[k]].name;
+  if (!t) return kind;
+  const decision = [kind, t.limited].filter(Boolean).join(", ");
   const inputs = t.inputs?.map(([name, unit, proposed, executed]) => `${name} ${figure(proposed)} → ${figure(executed)} ${unit}`) ?? [`${t.proposed.join(", ")} → ${t.plan.join(", ")}`];
   const reason = (episode.kinds[k] !== "l" && t.said) || t.reason;
-  return `${KINDS[episode.kinds[k]].name}${reason ? `: ${reason}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.trust ? `; ${t.trust}` : ""}`;
+  return `${decision}${reason ? `: ${reason}` : ""}; proposed → executed: ${inputs.join(", ")}; margin ${t.at_least ? "> " : ""}${figure(100 * t.margin)} cm${t.trust ? `; ${t.trust}` : ""}`;
 }
 
 /** Draw the nearest misses of all robot kinds, the smallest clearance first. */
@@ -34,136 +20,120 @@ function near(target, galleries, choose) {
     const reach = Math.max(0.1, 3.4 * episode.footprint, 1.3 * Math.max(0, ...(episode.tubes[k]?.boxes ?? []).map(([x, y]) => Math.hypot(x - episode.x[k], y - episode.y[k]))));
     const bounds = [episode.x[k] - reach, episode.y[k] - reach, episode.x[k] + reach, episode.y[k] + reach];
     const picture = element("div");
-    picture.innerHTML = drawEpisode(episode, k, 260, bounds);
+    picture.innerHTML = drawScene(sceneAt(episode, k), bounds, 260, `${episode.actor}, episode ${episode.episode}, step ${stepOf(episode, k)}`, k);
     picture.querySelector("svg").setAttribute("width", "100%");
-    const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${episode.first + k} (${episode.outcome}) `);
+    const facts = element("p", {}, element("b", {}, `${figure(100 * episode.closest)} cm`), ` ${episode.actor}, episode ${episode.episode}, step ${stepOf(episode, k)} (${episode.outcome}) `);
     facts.append(element("button", { onclick: () => choose(robot, order, k) }, "show"));
     target.append(element("div", { class: "card", "data-closest": episode.closest }, picture, facts, element("p", { class: "why" }, why(episode, k))));
   }
   if (!target.children.length) target.append(nothing("The log has no episode with a clearance."));
 }
 
-/** Plot the clearance over the steps of an episode, coloured by decision. */
-function strip(episode, k) {
-  const frame = { left: 40, right: 390, top: 22, bottom: 112 };
-  const most = Math.max(0.05, ...episode.clearance);
-  const x = scale(0, Math.max(1, episode.steps - 1), frame.left, frame.right), y = scale(0, most, frame.bottom, frame.top);
-  const parts = [label(4, 12, "clearance [m] over steps", { class: "title" }), axes(frame, x, y, ticks(0, episode.steps - 1, 5).filter(Number.isInteger), ticks(0, most, 3))];
-  parts.push(tag("polyline", { points: episode.clearance.map((c, i) => `${x(i).toFixed(1)},${y(c).toFixed(1)}`).join(" "), fill: "none", stroke: "#5d6b7c", "stroke-width": 1.3 }));
-  episode.clearance.forEach((c, i) => { if ("dae".includes(episode.kinds[i])) parts.push(tag("circle", { cx: x(i), cy: y(c), r: 2.3, fill: KINDS[episode.kinds[i]].color })); });
-  parts.push(tag("line", { x1: x(k), x2: x(k), y1: frame.top, y2: frame.bottom, class: "ink", "stroke-dasharray": "3 3" }));
-  return drawing(400, 132, "clearance over the episode", parts);
+/** All episodes of a run in the order of the log, with each sketch completed by what all episodes of its robot share. */
+function episodesOf(galleries) {
+  return Object.entries(galleries).flatMap(([robot, { near: nearest, episodes, rest }]) => {
+    const { footprint = 0, discs = [], period = null } = episodes[0] ?? {};
+    const unknown = { footprint, discs, period, heading: null, tubes: {}, arena: null, half: null, floor: null, ceiling: null, goal: null, start: null, z: null };
+    const all = [...episodes, ...rest.map((item) => ({ ...unknown, ...item, closest_at: item.at.indexOf(item.closest_at) }))];
+    return all.sort((a, b) => a.order - b.order).map((episode) => ({ robot, episode, near: nearest.indexOf(episode.order) }));
+  });
 }
 
 class Picker {
-  /** `mark` is a prefix for element ids of this run; `onshow(order, step)` is called for each step that is shown. */
+  /** `mark` is a prefix for element ids of this run; `onshow(episode, step)` is called for each step that is shown. */
   constructor(target, galleries, mark, onshow) {
     this.target = target;
     this.onshow = onshow;
-    this.all = Object.entries(galleries).flatMap(([robot, { near: nearest, episodes }]) => episodes.map((episode) => ({ robot, episode, near: nearest.indexOf(episode.order) })));
+    this.all = episodesOf(galleries);
     if (!this.all.length) return void target.append(nothing("The log has no episode."));
     this.select = element("select", { "aria-label": "episode", onchange: () => this.show(+this.select.value) });
     this.all.forEach(({ episode: e, near: rank }, i) => {
-      const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : ""].filter(Boolean);
+      const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : "", e.at ? "in short" : ""].filter(Boolean);
       this.select.append(element("option", { value: i }, `${e.actor}, episode ${e.episode}: ${marks.join(", ")}`));
     });
-    const move = (by) => this.show((this.at + by + this.all.length) % this.all.length);
-    this.slider = element("input", { type: "range", min: 0, "aria-label": "step", oninput: () => this.step(+this.slider.value) });
-    this.play = element("button", { onclick: () => this.toggle() }, "play");
-    target.append(element("div", { class: "bar" }, element("button", { onclick: () => move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => move(1), "aria-label": "next episode" }, "›"), this.play, this.slider));
-    this.map = element("div", { id: `${mark}episode-map`, class: "episode-map", tabindex: 0, "aria-label": "Episode from above. Left and right arrow: step. Up and down arrow: episode. Space: play.", onkeydown: (event) => this.key(event) });
+    target.append(element("div", { class: "bar" }, element("button", { onclick: () => this.move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => this.move(1), "aria-label": "next episode" }, "›")));
+    const stage = element("div"), course = element("div", { class: "course" });
+    this.viewer = new Viewer(stage, { id: `${mark}episode-map`, onshow: (k) => this.tell(k) });
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });
-    this.strip = element("div");
-    const map = element("div", {}, this.map), course = element("div", { class: "course" }, this.strip);
-    saves(map, "an episode from above");
-    saves(course, "clearance over the episode", () => this.rows());
-    target.append(element("div", { class: "split" }, map, element("div", {}, this.facts, course)));
-    target.append(legend([...["l", "d", "a", "e"].map((k) => [KINDS[k].color, KINDS[k].name]), [TUBE, "tube and plan"], [ARROWS[0], "→ proposed"], [ARROWS[1], "→ executed"], [EDGE, "edge of the half-space that blocks the proposal"], [GOAL, "goal"], [OBSTACLE, "obstacles"], ...this.perceivedLegend()]));
+    course.append(this.viewer.plots);
+    saves(stage, "an episode", null, () => this.viewer.drawing());
+    saves(course, "an episode over time", () => this.rows(), () => course.querySelector("svg"));
+    target.append(element("div", { class: "split" }, stage, element("div", {}, this.facts, course)));
+    target.append(legend([...viewerLegend(), ...this.perceivedLegend()]));
     const wanted = this.all.findIndex(({ episode }) => episode.rows);
     this.show(wanted >= 0 ? wanted : Math.max(0, this.all.findIndex(({ near: rank }) => rank === 0)));
   }
 
+  get episode() {
+    return this.all[this.at].episode;
+  }
+
   /** The steps of the episode that is shown, for a CSV. */
   rows() {
-    const { episode: e } = this.all[this.at];
-    return e.clearance.map((clearance, k) => ({ step: e.first + k, x_m: e.x[k], y_m: e.y[k], speed_m_s: e.speed[k], clearance_m: clearance, decision: KINDS[e.kinds[k]].name }));
+    const e = this.episode;
+    return e.clearance.map((clearance, k) => ({ step: stepOf(e, k), x_m: e.x[k], y_m: e.y[k], ...(e.z ? { z_m: e.z[k] } : {}), speed_m_s: e.speed?.[k], clearance_m: clearance, decision: KINDS[e.kinds[k]].name }));
   }
 
   /** Legend of the perceived surroundings that at least one picture of the page shows. */
   perceivedLegend() {
-    const parts = [["free", FREE, "free space by the scan"], ["hits", HIT, "hits of the scan"], ["movers", MOVER, "moving obstacle and its reachable set"], ["promises", PROMISE, "reserved by other robots"]];
-    return parts.filter(([name]) => this.all.some(({ episode }) => Object.values(episode.tubes).some((t) => t[name]))).map(([, color, words]) => [color, words]);
+    return PERCEIVED.filter(([name]) => this.all.some(({ episode }) => Object.values(episode.tubes).some((t) => t[name]))).map(([, name, words]) => [color(name), words]);
   }
 
-  choose(robot, order, k) {
+  choose(robot, order, k = null) {
     this.show(this.all.findIndex((item) => item.robot === robot && item.episode.order === order), k);
-    this.target.closest("section").scrollIntoView({ behavior: "smooth" });
+    this.arrive();
+  }
+
+  /** Bring the viewer into the window. */
+  arrive() {
+    this.target.closest("section").scrollIntoView();
+  }
+
+  move(by) {
+    this.show((this.at + by + this.all.length) % this.all.length);
   }
 
   show(index, k = null) {
-    this.stop();
     this.at = index;
     this.select.value = String(index);
-    const { episode } = this.all[index];
-    this.slider.max = episode.steps - 1;
-    this.step(k ?? episode.closest_at);
+    this.viewer.show(this.episode, k ?? this.episode.closest_at);
   }
 
-  step(k) {
-    const { episode: e } = this.all[this.at];
-    this.k = k;
-    this.slider.value = k;
-    this.map.innerHTML = drawEpisode(e, k, 600);
-    this.strip.innerHTML = strip(e, k);
+  /** Show the facts of the episode and of its point `k`. */
+  tell(k) {
+    const e = this.episode, step = stepOf(e, k);
     const facts = {
       actor: e.actor, episode: e.episode, arena: e.arena ?? "not in the log", outcome: e.outcome, steps: e.steps, reward: figure(e.reward, 4),
-      interventions: `${e.interventions}, ${e.failsafes} of them failsafe`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${e.first + e.closest_at}`,
-      step: e.first + k, position: `${figure(e.x[k])}, ${figure(e.y[k])} m`, speed: `${figure(e.speed[k])} m/s`, clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
+      interventions: `${e.interventions}, ${e.failsafes} of them failsafe`, "closest approach": e.closest === null ? "–" : `${figure(100 * e.closest)} cm at step ${stepOf(e, e.closest_at)}`,
+      step, position: `${[e.x[k], e.y[k], ...(e.z ? [e.z[k]] : [])].map((v) => figure(v)).join(", ")} m`, ...(e.speed ? { speed: `${figure(e.speed[k])} m/s` } : {}), clearance: `${figure(100 * e.clearance[k])} cm`, decision: why(e, k),
+      ...(e.at ? { "in short": `this page has ${e.at.length} of the steps; for all of them, run brakeline analyse with --html and --episode ${e.episode}` } : {}),
     };
-    this.onshow(e.order, e.first + k);
     this.facts.replaceChildren(...Object.entries(facts).flatMap(([name, value]) => [element("dt", {}, name), element("dd", { "data-fact": name }, String(value))]));
+    this.onshow(e, step);
   }
 
-  /** Left and right change the step, up and down the episode; space plays. */
+  /** Follow a key; return false if it means nothing here. */
   key(event) {
-    const steps = this.all[this.at].episode.steps;
-    const moves = {
-      ArrowRight: () => this.step(Math.min(steps - 1, this.k + 1)),
-      ArrowLeft: () => this.step(Math.max(0, this.k - 1)),
-      ArrowDown: () => this.show((this.at + 1) % this.all.length),
-      ArrowUp: () => this.show((this.at + this.all.length - 1) % this.all.length),
-      Home: () => this.step(0),
-      End: () => this.step(steps - 1),
-      " ": () => this.toggle(),
-    };
-    if (!moves[event.key]) return;
-    event.preventDefault();
-    if (event.key !== " ") this.stop();
-    moves[event.key]();
+    if (!this.viewer) return false;
+    const focused = this.viewer.stage.contains(document.activeElement);
+    const by = { n: 1, p: -1, ...(focused ? { ArrowDown: 1, ArrowUp: -1 } : {}) }[event.key];
+    if (by) this.move(by);
+    return Boolean(by) || this.viewer.key(event);
   }
 
-  /** Show the episode with this place in the log at this step; return false if the page does not have it. */
-  jump(order, step) {
-    const place = this.all?.findIndex(({ episode }) => episode.order === order) ?? -1;
+  /** Show the first episode that `is(episode)`, at a step; return false if the page does not have it. */
+  jump(is, step) {
+    const place = this.all.findIndex(({ episode }) => is(episode));
     if (place < 0) return false;
-    const { first, steps } = this.all[place].episode;
-    this.show(place, Math.min(steps - 1, Math.max(0, step - first)));
+    this.show(place, step === null ? null : pointOf(this.all[place].episode, step));
     return true;
   }
 
-  toggle() {
-    if (this.timer) return this.stop();
-    if (this.k >= this.all[this.at].episode.steps - 1) this.step(0);
-    this.play.textContent = "pause";
-    this.timer = setInterval(() => {
-      if (this.k >= this.all[this.at].episode.steps - 1) return this.stop();
-      this.step(this.k + 1);
-    }, 60);
-  }
-
-  stop() {
-    clearInterval(this.timer);
-    this.timer = null;
-    if (this.play) this.play.textContent = "play";
+  /** Show the episode that ended next to a step of all actors of a robot kind. */
+  openAt(robot, step) {
+    const own = this.all.filter((item) => item.robot === robot);
+    if (!own.length) return;
+    const after = own.filter(({ episode }) => episode.until >= step), { episode } = after.length ? after.reduce((a, b) => (b.episode.until < a.episode.until ? b : a)) : own.at(-1);
+    this.choose(robot, episode.order);
   }
 }

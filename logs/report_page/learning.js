@@ -64,7 +64,7 @@ function bandOf(curves) {
 
 /** Lines of a chart: one line per run, or one band per configuration with several seeds. */
 function linesOf(runs, robot, what, view) {
-  const single = (run, color) => ({ name: run.run, color, points: pointsOf(run, robot, what, view.share) });
+  const single = (run, color) => ({ run, name: run.run, color, points: pointsOf(run, robot, what, view.share) });
   if (!view.bands) return runs.map((run) => single(run, run.color)).filter((line) => line.points.length > 1);
   const groups = new Map();
   for (const run of runs) groups.set(run.group, [...(groups.get(run.group) ?? []), run]);
@@ -75,56 +75,104 @@ function linesOf(runs, robot, what, view) {
   }).filter(Boolean);
 }
 
-function chart(lines, what, view) {
+/** Draw one chart. `view`: also the steps that all charts show; `on.click(run, step)`, `on.zoom(from, to)`. */
+function chart(lines, what, view, on) {
   const frame = { left: 56, right: 486, top: 30, bottom: 178 };
-  const values = lines.flatMap((line) => line.band ? line.band.flatMap((p) => [p.low, p.high]) : line.points.flatMap((p) => view.raw && p.raw !== null ? [p.raw, p.smooth] : [p.smooth]));
+  const [from, to] = view.range ?? [0, Infinity], inside = (p) => p.step >= from && p.step <= to;
+  const end = view.range ? to : Math.max(...lines.flatMap((line) => (line.band ?? line.points).map((p) => p.step)));
+  const values = lines.flatMap((line) => line.band ? line.band.filter(inside).flatMap((p) => [p.low, p.high]) : line.points.filter(inside).flatMap((p) => view.raw && p.raw !== null ? [p.raw, p.smooth] : [p.smooth]));
   if (!values.length) return null;
-  const end = Math.max(...lines.flatMap((line) => (line.band ?? line.points).map((p) => p.step)));
   const low = what.low ?? Math.min(...values), high = what.high ?? (Math.max(...values) * (what.low === 0 ? 1.1 : 1) || 1);
-  const x = scale(0, end, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
+  const x = scale(from, end, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
   const spot = (px, py) => `${px.toFixed(1)},${Math.min(frame.bottom, Math.max(frame.top, py)).toFixed(1)}`;
   const parts = [label(4, 14, [what.title, ` [${what.unit}]`].join(""), { class: "title" })];
-  parts.push(axes(frame, x, y, ticks(0, end, 4), ticks(low, high, 4), { y: what.form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }));
+  parts.push(axes(frame, x, y, ticks(from, end, 4), ticks(low, high, 4), { y: what.form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }));
   for (const line of lines) {
-    const drawn = line.band ?? line.points;
+    const drawn = (line.band ?? line.points).filter(inside);
     if (line.band) {
-      const edge = [...line.band.map((p) => spot(x(p.step), y(p.high))), ...line.band.toReversed().map((p) => spot(x(p.step), y(p.low)))];
+      const edge = [...drawn.map((p) => spot(x(p.step), y(p.high))), ...drawn.toReversed().map((p) => spot(x(p.step), y(p.low)))];
       parts.push(tag("polygon", { points: edge.join(" "), fill: line.color, opacity: 0.2, class: "band" }));
     } else if (view.raw && (what.weight || what.of === "learner")) {
-      const raw = line.points.filter((p) => p.raw !== null).map((p) => tag("circle", { cx: x(p.step), cy: Math.min(frame.bottom, Math.max(frame.top, y(p.raw))), r: 1.5, fill: line.color }));
+      const raw = drawn.filter((p) => p.raw !== null).map((p) => tag("circle", { cx: x(p.step), cy: Math.min(frame.bottom, Math.max(frame.top, y(p.raw))), r: 1.5, fill: line.color }));
       parts.push(tag("g", { opacity: 0.35, class: "raw" }, raw));
     }
     const path = drawn.map((p) => spot(x(p.step), y(line.band ? p.mean : p.smooth))).join(" ");
     parts.push(tag("polyline", { points: path, fill: "none", stroke: line.color, "stroke-width": 1.8, "stroke-linejoin": "round", "data-run": line.name }));
   }
+  parts.push(tag("rect", { y: frame.top, height: frame.bottom - frame.top, width: 0, class: "zooming" }), tag("line", { y1: frame.top, y2: frame.bottom, class: "cross" }));
   parts.push(label(frame.right, 208, "steps of all actors of the run", { "text-anchor": "end" }));
   const box = element("figure", { class: "chart", "data-chart": what.title });
   box.innerHTML = drawing(496, 214, what.title, parts);
+  const stepAt = (px) => from + (Math.min(1, Math.max(0, (px - frame.left) / (frame.right - frame.left)))) * (end - from);
   hovers(box, (px) => {
     if (px < frame.left) return null;
-    const step = ((px - frame.left) / (frame.right - frame.left)) * end;
+    const step = stepAt(px);
     const said = lines.map((line) => {
       const drawn = line.band ?? line.points, p = drawn.find((p) => p.step >= step);
       return p && `${lines.length > 1 ? `${line.name}: ` : ""}${what.form(line.band ? p.mean : p.smooth)}${line.band ? ` (${what.form(p.low)} to ${what.form(p.high)})` : ""}`;
     }).filter(Boolean);
     return said.length ? `step ${figure(step, 6)}\n${said.join("\n")}` : null;
   });
+  box.cross = (step) => place(box.querySelector(".cross"), step, x, from, end);
+  followPointer(box, stepAt, x, { ...on, nearest: (step, py) => nearestLine(lines, step, (p) => Math.abs(y(p) - py)) });
   saves(box, what.title, () => lines.flatMap((line) => line.band ? line.band.map((p) => ({ run: line.name, step: p.step, mean: p.mean, low: p.low, high: p.high })) : line.points.map((p) => ({ run: line.name, ...p }))));
   return box;
 }
 
-/** Draw the curves with their controls; `runs` is the page's data. */
-function learning(target, controls, runs) {
+/** Show a chart's vertical line at a step; hide it if the chart does not show the step. */
+function place(line, step, x, from, end) {
+  const seen = step !== null && step >= from && step <= end;
+  line.style.display = seen ? "inline" : "none";
+  if (seen) for (const name of ["x1", "x2"]) line.setAttribute(name, x(step));
+}
+
+/** The run whose line is nearest at a step; `away(value)` is the distance of a value. A band is no single run. */
+function nearestLine(lines, step, away) {
+  const single = lines.filter((line) => line.run && line.points.length).map((line) => [line.run, between(line.points, step)]).filter(([, value]) => value !== null);
+  return single.length ? single.reduce((a, b) => (away(b[1]) < away(a[1]) ? b : a))[0] : null;
+}
+
+/** Follow the pointer on a chart: move the line on all charts; a drag zooms, a click opens an episode. */
+function followPointer(box, stepAt, x, on) {
+  const svg = box.querySelector("svg"), zooming = box.querySelector(".zooming");
+  const at = (event) => { const bounds = svg.getBoundingClientRect(), per = svg.viewBox.baseVal.width / bounds.width; return [(event.clientX - bounds.left) * per, (event.clientY - bounds.top) * per]; };
+  let pressed = null;
+  svg.addEventListener("pointerdown", (event) => { if (event.button === 0) [pressed] = at(event); });
+  svg.addEventListener("pointermove", (event) => {
+    const [px] = at(event), step = stepAt(px);
+    on.cross(step);
+    if (pressed === null) return;
+    zooming.setAttribute("x", Math.min(x(stepAt(pressed)), x(step)));
+    zooming.setAttribute("width", Math.abs(x(step) - x(stepAt(pressed))));
+  });
+  svg.addEventListener("pointerup", (event) => {
+    const [px, py] = at(event), begun = pressed;
+    pressed = null;
+    zooming.setAttribute("width", 0);
+    if (begun === null) return;
+    if (Math.abs(px - begun) > 8) return on.zoom(...[stepAt(begun), stepAt(px)].sort((a, b) => a - b));
+    const run = on.nearest(stepAt(px), py);
+    if (run) on.click(run, stepAt(px));
+  });
+  svg.addEventListener("pointerleave", () => { pressed = null; zooming.setAttribute("width", 0); on.cross(null); });
+}
+
+/** Draw the curves with their controls. `runs` is the page's data; a click on a curve calls `open(run, robot, step)`. */
+function learning(target, controls, runs, open) {
   const robots = [...new Set(runs.flatMap((run) => Object.keys(run.training)))].sort();
   const setups = runs.map((run) => Object.entries(run.setup).filter(([name]) => name !== "seed").map(([, value]) => value).filter(Boolean).join(", ") || "run");
   runs.forEach((run, k) => { run.group = setups[k]; run.color = COLORS[(setups.length === new Set(setups).size ? k : [...new Set(setups)].indexOf(setups[k])) % COLORS.length]; });
   if (runs.length > 1 && new Set(setups).size < runs.length) runs.forEach((run, k) => { run.color = COLORS[k % COLORS.length]; });
-  const view = { share: 0.02, raw: true, bands: false, shown: new Set(runs) };
+  const view = { share: 0.02, raw: true, bands: false, shown: new Set(runs), range: null };
+  const cross = (step) => target.querySelectorAll("figure.chart").forEach((box) => box.cross(step));
+  const zoom = (from, to) => { view.range = from === null ? null : [from, to]; draw(); };
+  const whole = element("button", { id: "whole", hidden: "", onclick: () => zoom(null) }, "show all steps");
   const draw = () => {
     target.replaceChildren();
+    whole.hidden = view.range === null;
     const shown = runs.filter((run) => view.shown.has(run));
     for (const robot of robots) {
-      const drawn = CURVES.map((what) => [what, linesOf(shown, robot, what, view)]).map(([what, lines]) => lines.length ? chart(lines, what, view) : null).filter(Boolean);
+      const drawn = CURVES.map((what) => [what, linesOf(shown, robot, what, view)]).map(([what, lines]) => lines.length ? chart(lines, what, view, { cross, zoom, click: (run, step) => open(run, robot, step) }) : null).filter(Boolean);
       if (!drawn.length) continue;
       if (robots.length > 1) target.append(element("h3", {}, robot));
       const grid = element("div", { class: "charts", "data-robot": robot });
@@ -137,7 +185,9 @@ function learning(target, controls, runs) {
   const smooth = element("select", { id: "smoothing", "aria-label": "smoothing", onchange: () => { view.share = +smooth.value; draw(); } });
   for (const [share, words] of [[0, "not smoothed"], [0.02, "smoothed over 4 % of the run"], [0.05, "smoothed over 10 % of the run"]]) smooth.append(element("option", { value: share, ...(share === view.share ? { selected: "" } : {}) }, words));
   const raw = element("input", { type: "checkbox", id: "raw", checked: "", onchange: () => { view.raw = raw.checked; draw(); } });
-  controls.append(smooth, element("label", {}, raw, " raw values as dots"));
+  controls.append(smooth, element("label", {}, raw, " raw values as dots"), whole);
+  target.before(element("p", { class: "small" }, "A click on a curve opens the episode of that step. Drag along the steps to zoom; a double click shows all steps again."));
+  target.addEventListener("dblclick", () => zoom(null));
   if (setups.length > new Set(setups).size) {
     const bands = element("input", { type: "checkbox", id: "bands", onchange: () => { view.bands = bands.checked; draw(); } });
     controls.append(element("label", {}, bands, " seeds as mean and 95 % interval"));

@@ -1,8 +1,8 @@
 // Save figures as SVG and their data as CSV.
 
-/** The styles of a saved figure, on white. */
-const LOOK = `svg{font:11px "DejaVu Sans",Helvetica,Arial,sans-serif;background:#fff}text{fill:#3c4856}.title{fill:#1b2430;font-weight:600;font-size:12.5px}
-.grid{stroke:#e6eaef}.axis{stroke:#aab4c0}.ink{stroke:#1b2430}.solid{fill:#1b2430;stroke:none}.paper{fill:#fcfdfe}`;
+/** The styles of a saved figure, on white: with the light colors, which are the first rule of the page. */
+const LOOK = `svg{${document.styleSheets[0]?.cssRules[0]?.style.cssText ?? ""}font:11px "DejaVu Sans",Helvetica,Arial,sans-serif;background:#fff}text{fill:var(--soft)}.title{fill:var(--ink);font-weight:600;font-size:12.5px}
+.grid{stroke:var(--grid)}.axis{stroke:var(--axis)}.ink{stroke:var(--ink)}.solid{fill:var(--ink);stroke:none}.paper{fill:var(--field)}`;
 
 function save(name, kind, text) {
   const link = element("a", { href: URL.createObjectURL(new Blob([text], { type: kind })), download: name });
@@ -10,9 +10,9 @@ function save(name, kind, text) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-/** Return the text of an SVG file. */
+/** Return the text of an SVG file. `svg`: an element or its markup. */
 function standalone(svg) {
-  const text = new XMLSerializer().serializeToString(svg);
+  const text = svg instanceof Element ? new XMLSerializer().serializeToString(svg) : String(svg);
   return `<?xml version="1.0" encoding="UTF-8"?>\n${text.replace(/>/, `><style>${LOOK}</style>`)}`;
 }
 
@@ -28,10 +28,10 @@ function csv(rows) {
 
 const fileName = (words) => words.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "");
 
-/** Add buttons that save the drawing in `box` and its data `rows()`. */
-function saves(box, name, rows) {
+/** Add buttons that save a drawing `svg()`, by default the one in `box`, and its data `rows()`. */
+function saves(box, name, rows, svg = () => box.querySelector("svg")) {
   const buttons = element("div", { class: "saves" });
-  buttons.append(element("button", { onclick: () => save(`${fileName(name)}.svg`, "image/svg+xml", standalone(box.querySelector("svg"))), "aria-label": `save “${name}” as SVG` }, "SVG"));
+  buttons.append(element("button", { onclick: () => save(`${fileName(name)}.svg`, "image/svg+xml", standalone(svg())), "aria-label": `save “${name}” as SVG` }, "SVG"));
   if (rows) buttons.append(element("button", { onclick: () => save(`${fileName(name)}.csv`, "text/csv", csv(rows())), "aria-label": `save the data of “${name}” as CSV` }, "CSV"));
   box.append(buttons);
 }

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
 from typing import Any
 
 from brakeline.errors import Implausible
-from brakeline.logs.decision_view import body_discs, boxes_from_above, decision_view
+from brakeline.logs.arena_view import arena_view
+from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
-from brakeline.logs.foxglove_scene import half_width
+from brakeline.logs.episode_view import LETTERS
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
+from brakeline.logs.watch.run_history import NOTE, RunHistory, history_from_note
 from brakeline.logs.watch.run_totals import run_totals, totals_from_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
-from brakeline.messaging.obstacle import WALL
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import reserved_boxes
 
 LINES = 8  # warnings
-EPISODES = 300  # episodes in the reward curve
-TRAIL = 600  # positions of the running episode
+TRAIL = 600  # latest steps of the running episode; with many robots, fewer of each
+MANY = 4  # robots that get their whole trail
+STUCK = 50  # steps within one footprint of the same place after which a robot counts as stuck
 FIGURES_EVERY = 1.0  # s
 MOST_PANELS = 200
 LAUNCHER = "launcher"  # the process that knows the run from its beginning
@@ -32,34 +35,36 @@ SETUP = ("run", "method", "arena", "seed", "steps")  # the launcher's notes abou
 
 
 NO_DECISION: dict[str, Any] = {
-    "tube": [], "margin": None, "at_least": False, "said": "", "trust": "", "inputs": [], "arrows": [], "edge": [],
-    "slow": 0.0,
+    "tube": [], "margin": None, "at_least": False, "said": "", "trust": "", "limited": "", "inputs": [], "arrows": [],
+    "edge": [], "slow": 0.0,
 }  # fmt: skip
 
 
 class RobotPanel:
-    """One robot in its running episode. Positions are x and y in m, in the arena's frame.
+    """One robot in its running episode. Positions are in m, in the arena's frame.
 
     Attributes:
         fleet: the actors of the robot's world.
-        reservation: the boxes that this robot reserves, from above.
+        reservation: the boxes that this robot reserves.
         reward: sum over the episode.
     """
 
     def __init__(self, robot: Robot, actor: str) -> None:
         self.robot, self.fleet, self.reward = robot, list[str](), 0.0
         self.reservation: list[list[float]] = []
-        self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)  # positions of the episode
-        self._marks: deque[tuple[float, float, str]] = deque(maxlen=TRAIL)  # its interventions: x, y, kind
+        self._trail: deque[pb.Step] = deque(maxlen=TRAIL)  # steps of the episode
+        self._steps = self._interventions = 0  # in the episode, as far as they were watched
+        self._anchor: list[float] = []  # where the robot was when it last moved by more than its footprint
+        self._still = 0  # steps since then
         self._shown: dict[str, Any] = NO_DECISION | {
             "actor": actor,
             "robot": robot.name,
             "footprint": robot.footprint,
             "discs": body_discs(robot),
+            "period": robot.period,
             "number": 0,  # of the episode
             "arena": {},
             "pose": [],
-            "height": None,
             "kind": "",
             "around": {},
             "ended": "",  # outcome of the previous episode
@@ -67,21 +72,10 @@ class RobotPanel:
 
     def begin(self, episode: pb.Episode) -> None:
         """Start an episode."""
-        self.reward = 0.0
+        self.reward, self._steps, self._interventions, self._still = 0.0, 0, 0, 0
         self._trail.clear()
-        self._marks.clear()
-        half = half_width(episode)
-        # A floor or a ceiling would cover the map; the walls are the edges of the square.
-        inside = [o for o in episode.obstacles if o.kind != WALL and max(o.size) < 2.0 * half]
-        arena = {
-            "half": half,
-            "obstacles": [
-                {"kind": o.kind, "at": list(o.position[:2]), "size": list(o.size), "yaw": o.yaw} for o in inside
-            ],
-            "goal": list(episode.goal[:2]),
-            "goal_radius": episode.goal_radius,
-        }
-        self._shown |= {"number": episode.episode, "arena": arena}
+        self._anchor = []
+        self._shown |= {"number": episode.episode, "arena": arena_view(episode, self.robot.position_dim)}
         self._move_to(list(episode.start))
 
     def decide(self, exchange: pb.Exchange) -> None:
@@ -101,32 +95,46 @@ class RobotPanel:
             "slow": exchange.request.slow,
         }
         self.fleet = list(exchange.request.fleet)
-        self.reservation = boxes_from_above(reserved_boxes(self.robot, exchange))
+        self.reservation = reservations_json(reserved_boxes(self.robot, exchange))
 
     def step(self, step: pb.Step) -> None:
         """Move the robot to its next state."""
-        x, y = self._move_to(list(step.state))
+        self._move_to(list(step.state))
         kind = kind_of(step)
         self._shown["kind"] = KINDS.get(kind, "")
         self.reward += step.reward
-        self._trail.append((x, y))
-        if kind in INTERVENTIONS:
-            self._marks.append((x, y, KINDS[kind]))
+        self._trail.append(step)
+        self._steps += 1
+        self._interventions += kind in INTERVENTIONS
         if step.terminated or step.truncated:
             self._shown["ended"] = "collision" if step.collision else "goal" if step.goal else "time limit"
 
-    def _move_to(self, state: list[float]) -> tuple[float, float]:
+    def _move_to(self, state: list[float]) -> None:
         robot = self.robot
         if len(state) != robot.state_dim:
             raise ValueError(f"a state has {len(state)} numbers, not the {robot.state_dim} of {robot.name}")
-        heading = 0.0 if robot.heading is None else state[robot.heading]
-        height = state[2] if robot.position_dim == 3 else None
-        self._shown |= {"pose": [state[0], state[1], heading], "height": height}
-        return state[0], state[1]
+        position = state[: robot.position_dim]
+        self._shown["pose"] = [*position, *([] if robot.heading is None else [state[robot.heading]])]
+        if self._anchor and math.dist(position, self._anchor) <= robot.footprint:
+            self._still += 1
+        else:
+            self._anchor, self._still = position, 0
 
-    def view(self) -> dict[str, Any]:
-        """Return the panel for JSON."""
-        return self._shown | {"reward": self.reward, "trail": list(self._trail), "marks": list(self._marks)}
+    def view(self, most: int = TRAIL) -> dict[str, Any]:
+        """Return the panel for JSON, with the latest `most` steps of the episode."""
+        steps, robot = list(self._trail)[-most:], self.robot
+        states = [step.state for step in steps]
+        path = {name: [state[k] for state in states] for k, name in enumerate("xyz"[: robot.position_dim])}
+        return self._shown | {
+            "reward": self.reward,
+            "interventions": self._interventions,
+            "stuck": self._still if self._still >= STUCK else 0,
+            "first": steps[0].step if steps else 0,
+            "path": path,
+            "heading": None if robot.heading is None else [state[robot.heading] for state in states],
+            "kinds": "".join(LETTERS.get(kind_of(step), "n") for step in steps),
+            "clearance": [step.clearance for step in steps],
+        }
 
 
 class Dashboard:
@@ -137,7 +145,7 @@ class Dashboard:
         self.metrics = Metrics(robots=self._robots)
         self._panels: dict[str, RobotPanel] = {}
         self._lines: deque[str] = deque(maxlen=LINES)
-        self._returns: dict[str, deque[float]] = {}  # by robot kind
+        self._history = RunHistory()  # of what was watched
         self._started = self._last_message = time.monotonic()
         self._figures: dict[str, Any] = {}
         self._figures_at = -1e9
@@ -176,10 +184,8 @@ class Dashboard:
             self._panels[message.actor] = panel
         if isinstance(message, pb.Episode):
             panel.begin(message)
-            return
-        panel.step(message)
-        if message.terminated or message.truncated:
-            self._returns.setdefault(panel.robot.name, deque(maxlen=EPISODES)).append(panel.reward)
+        else:
+            panel.step(message)
 
     def view(self) -> dict[str, Any]:
         """Return everything that the page shows, for JSON."""
@@ -187,8 +193,9 @@ class Dashboard:
             now = time.monotonic()
             if now - self._figures_at > FIGURES_EVERY:
                 self._figures, self._figures_at = self._counts(), now
+            most = TRAIL // max(1, len(self._panels) // MANY)
             panels = [
-                panel.view() | {"promises": [box for other in self._others(name) for box in other.reservation]}
+                panel.view(most) | {"promises": [box for other in self._others(name) for box in other.reservation]}
                 for name, panel in sorted(self._panels.items())
             ]
             return {"robots": panels, "silent": now - self._last_message} | self._figures
@@ -206,7 +213,10 @@ class Dashboard:
         times = figures.get("decision_ms") or {}
         launcher = self.metrics.processes.get(LAUNCHER)
         reported = totals_from_health(launcher.figures) if launcher is not None else {}
-        counted = reported or run_totals(self.metrics)
+        watched = run_totals(self.metrics)
+        self._history.add(watched)
+        history = history_from_note(launcher.notes.get(NOTE, "")) if launcher is not None else {}
+        counted = reported or watched
         return {
             "run": self._run(),
             # s since this page started; None: the counts cover the whole run.
@@ -216,7 +226,7 @@ class Dashboard:
             "decide": {"p50": times.get("p50"), "p99": times.get("p99")},
             "learners": learners,
             "processes": {name: self._state(name) for name in sorted(figures["processes"])},
-            "returns": {robot: list(returns) for robot, returns in sorted(self._returns.items())},
+            "history": (history or self._history.rows) if counted else {},
             "lines": list(self._lines),
         }
 

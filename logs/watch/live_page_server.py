@@ -15,16 +15,18 @@ from importlib.resources import files
 from typing import Any, Self
 
 from brakeline.logs.json_values import finite
+from brakeline.logs.viewer import SCRIPTS, STYLES
 from brakeline.messaging.http_server import MOST_CLIENTS, BoundedHandler, BoundedServer
 
 RATE = 10.0  # Hz of events
 MOST_STREAMS = MOST_CLIENTS // 2  # pages at the same time; the other places are for short requests
-FILES = {  # path: file in logs/, media type. The report and the live page share svg.js and scene.js.
-    "/": ("watch/page.html", "text/html; charset=utf-8"),
-    "/page.css": ("watch/page.css", "text/css; charset=utf-8"),
-    "/svg.js": ("report_page/svg.js", "text/javascript; charset=utf-8"),
-    "/scene.js": ("report_page/scene.js", "text/javascript; charset=utf-8"),
-    "/page.js": ("watch/page.js", "text/javascript; charset=utf-8"),
+HTML, CSS, SCRIPT = (f"text/{kind}; charset=utf-8" for kind in ("html", "css", "javascript"))
+FILES = {  # path: file in logs/, media type
+    "/": ("watch/page.html", HTML),
+    "/page.css": ("watch/page.css", CSS),
+    "/page.js": ("watch/page.js", SCRIPT),
+    **{f"/{name}": (f"viewer/{name}", CSS) for name in STYLES},
+    **{f"/{name}": (f"viewer/{name}", SCRIPT) for name in SCRIPTS},
 }
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "

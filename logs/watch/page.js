@@ -1,67 +1,69 @@
-// Draws the live page from the server-sent events at /events. It uses svg.js and scene.js of the report.
+// Draws the live page from the server-sent events at /events. It shares the viewer with the report.
 "use strict";
 
 const SILENT = 3; // s without a message on the bus after which the page reports silence
 const CLOSE = 6; // half-width of the close view, in footprints of the robot
 const MAP_SIZE = 600; // px of a map's coordinates
-const WINDOW = 20; // episodes in the moving average of the reward
-const LETTERS = Object.fromEntries(Object.entries(KINDS).map(([letter, { name }]) => [name, letter]));
+const COLUMNS = ["steps", "episodes", "goals", "collisions", "interventions", "reward"]; // of a row of a history
 const cards = new Map();
+let pointed = null; // the card under the pointer
 const at = (id) => document.getElementById(id);
 
 const number = (value, digits = 0) => (value === null || value === undefined ? "–" : value.toFixed(digits));
 const share = (count, of) => (of ? `${count} (${((100 * count) / of).toFixed(1)} %)` : String(count));
 
-/** Return a canvas's context, scaled so that one unit is one CSS pixel, and the canvas's size. */
-function clearCanvas(canvas) {
-  const { width, height } = canvas.getBoundingClientRect();
-  const ratio = window.devicePixelRatio || 1;
-  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-    canvas.width = Math.round(width * ratio);
-    canvas.height = Math.round(height * ratio);
-  }
-  const pen = canvas.getContext("2d");
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  pen.clearRect(0, 0, width, height);
-  return { pen, width, height };
-}
-
 /** Return the card of a robot; create it when the robot first appears. */
 function card(robot) {
   if (!cards.has(robot.actor)) {
     if (cards.size === 0) at("robots").replaceChildren();
-    const parts = { episode: element("span"), status: element("p"), reason: element("p", { class: "why" }), map: element("div"), near: element("div") };
-    parts.box = element("article", { class: "card", "data-actor": robot.actor }, element("h2", {}, robot.actor, parts.episode), element("div", { class: "maps" }, parts.map, parts.near), parts.status, parts.reason);
-    at("robots").append(parts.box);
+    const parts = { episode: element("span"), status: element("p"), reason: element("p", { class: "why" }), near: element("div", { class: "near" }) };
+    const stage = element("div");
+    parts.viewer = new Viewer(stage);
+    const box = element("article", { class: "card", "data-actor": robot.actor }, element("h2", {}, robot.actor, parts.episode), stage, element("div", { class: "beside" }, parts.near, parts.viewer.plots), parts.status, parts.reason);
+    box.addEventListener("pointerenter", () => { pointed = parts; });
+    parts.box = box;
+    at("robots").append(box);
     cards.set(robot.actor, parts);
   }
   return cards.get(robot.actor);
 }
 
-/** The latest state of a robot as a scene for scene.js. */
-function sceneOf(robot) {
-  const marks = new Map(robot.marks.map(([x, y, kind]) => [`${x},${y}`, LETTERS[kind]]));
-  const decision = { from: robot.pose, boxes: robot.tube, arrows: robot.arrows, edge: robot.edge, promises: robot.promises, ...robot.around };
-  const kinds = robot.trail.map(([x, y]) => marks.get(`${x},${y}`) ?? (robot.kind ? "l" : "n"));
-  return { ...robot.arena, start: null, points: robot.trail, kinds, pose: robot.pose, footprint: robot.footprint, discs: robot.discs, decision };
+/** The running episode of a robot, for the viewer. */
+function episodeOf(robot) {
+  const { path, pose, tube, arena } = robot, last = Math.max(0, robot.kinds.length - 1);
+  const decision = { from: pose.slice(0, path.z ? 3 : 2), boxes: tube, arrows: robot.arrows, edge: robot.edge, promises: robot.promises, ...robot.around };
+  const begun = robot.kinds.length > 0, flat = !path.z;
+  return {
+    ...arena, start: robot.first ? null : arena.start, actor: robot.actor, robot: robot.robot, episode: robot.number, first: robot.first, period: robot.period,
+    footprint: robot.footprint, discs: robot.discs, kinds: begun ? robot.kinds : "n", clearance: begun ? robot.clearance : [0],
+    x: begun ? path.x : [pose[0]], y: begun ? path.y : [pose[1]], z: flat ? null : begun ? path.z : [pose[2]],
+    heading: robot.heading && (begun ? robot.heading : [pose.at(-1)]), tubes: tube.length || robot.promises.length || robot.around.hits?.length || robot.around.movers?.length ? { [last]: decision } : {},
+  };
 }
 
 function drawRobot(robot) {
-  const { box, episode, map, near, status, reason } = card(robot);
+  const { box, episode, viewer, near, status, reason } = card(robot);
   episode.textContent = `episode ${robot.number}`;
-  const words = [robot.kind || "no filter", `reward ${number(robot.reward, 1)}`, `${robot.marks.length} interventions`];
+  box.classList.toggle("stuck", robot.stuck > 0);
+  const words = [[robot.kind || "no filter", robot.kind === "allowed" ? robot.limited : ""].filter(Boolean).join(", "), `reward ${number(robot.reward, 1)}`, `${robot.interventions} interventions`];
   if (robot.margin !== null) words.push(`margin ${robot.at_least ? "> " : ""}${number(100 * robot.margin, 1)} cm`);
   if (robot.slow) words.push(`slowed down to ${number(100 * robot.slow)} % of its inputs: more plans left their tubes than stated`);
-  if (robot.height !== null) words.push(`height ${number(robot.height, 1)} m`);
+  if (robot.path.z) words.push(`height ${number(robot.pose[2], 1)} m`);
   if (robot.ended) words.push(`last episode: ${robot.ended}`);
   status.textContent = words.join(" · ");
   const inputs = robot.inputs.map(([name, unit, proposed, executed]) => `${name} ${number(proposed, 2)} → ${number(executed, 2)} ${unit}`);
   reason.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", "), robot.trust].filter(Boolean).join(" · ");
   const { top, bottom } = box.getBoundingClientRect();
   if (!robot.arena.half || bottom < 0 || top > innerHeight) return; // off the screen: 200 robots must not stall the page
-  const scene = sceneOf(robot), edge = 1.04 * robot.arena.half, [x, y] = robot.pose, reach = CLOSE * robot.footprint;
-  map.innerHTML = drawScene(scene, [-edge, -edge, edge, edge], MAP_SIZE, `the arena of ${robot.actor}`);
-  near.innerHTML = drawScene(scene, [x - reach, y - reach, x + reach, y + reach], MAP_SIZE, `the surroundings of ${robot.actor}`);
+  const shown = episodeOf(robot), [x, y] = robot.pose, reach = CLOSE * robot.footprint;
+  viewer.refresh(shown);
+  near.innerHTML = drawScene(sceneAt(shown, shown.x.length - 1), [x - reach, y - reach, x + reach, y + reach], MAP_SIZE, `the surroundings of ${robot.actor}`);
+}
+
+/** Name the robots that are stuck. */
+function drawStuck(robots) {
+  const stuck = robots.filter((robot) => robot.stuck > 0);
+  at("stuck").replaceChildren(...stuck.map((robot) => element("li", {}, `${robot.actor} is stuck: for ${robot.stuck} steps (${number(robot.stuck * robot.period)} s) it has stayed within ${figure(robot.footprint)} m${robot.said ? `. Latest decision: ${robot.said}` : ""}`)));
 }
 
 /** One tile for each count of a robot kind. */
@@ -113,45 +115,38 @@ function drawRun(view) {
   at("done").textContent = steps ? `${done} of ${steps} steps (${((100 * done) / steps).toFixed(0)} %)` : "";
 }
 
-/** Draw one reward curve for each robot kind: rewards of different tasks are not comparable. */
-function drawCurves(all) {
-  for (const [robot, returns] of Object.entries(all)) {
-    let canvas = document.querySelector(`canvas[data-rewards="${CSS.escape(robot)}"]`);
-    if (!canvas) {
-      canvas = element("canvas", { "data-rewards": robot, "aria-label": `reward of the latest episodes of ${robot}, and its mean over ${WINDOW} episodes` });
-      at("curves").append(element("h3", {}, robot), canvas);
+/** What a curve shows of the steps between two rows of a history. */
+const HISTORIES = [
+  { title: "goals reached", unit: "share of episodes", of: (d) => d.episodes ? d.goals / d.episodes : null, form: percents, color: "goal", high: 1 },
+  { title: "reward of an episode", unit: "mean", of: (d) => d.episodes ? d.reward / d.episodes : null, form: figure, color: "ink" },
+  { title: "interventions", unit: "share of steps", of: (d) => d.interventions / d.steps, form: percents, color: "adjusted" },
+  { title: "collisions", unit: "count so far", of: (d, now) => now.collisions, form: figure, color: "failsafe" },
+];
+
+/** Draw the histories of each robot kind: rewards of different tasks are not comparable. */
+function drawCurves(history, totals) {
+  for (const [robot, rows] of Object.entries(history)) {
+    let box = document.querySelector(`[data-history="${CSS.escape(robot)}"]`);
+    if (!box) {
+      box = element("div", { class: "charts", "data-history": robot });
+      at("curves").append(...(Object.keys(history).length > 1 ? [element("h3", {}, robot)] : []), box);
     }
-    drawCurve(canvas, returns);
+    const named = rows.map((row) => Object.fromEntries(COLUMNS.map((name, i) => [name, row[i]]))), now = totals[robot];
+    if (now && now.steps > (named.at(-1)?.steps ?? 0)) named.push({ ...now, reward: (now.mean_reward ?? 0) * now.episodes });
+    const key = `${named.length} ${named.at(-1)?.steps}`;
+    if (box.dataset.drawn === key) continue;
+    box.dataset.drawn = key;
+    box.innerHTML = HISTORIES.map((what) => historyChart(named, what)).join("");
   }
 }
 
-function drawCurve(canvas, returns) {
-  const { pen, width, height } = clearCanvas(canvas);
-  if (returns.length < 2) return;
-  const low = Math.min(...returns, 0), high = Math.max(...returns, 1), foot = 14;
-  const x = (i) => (i / (returns.length - 1)) * (width - 44) + 40;
-  const y = (value) => height - foot - ((value - low) / (high - low)) * (height - foot - 8);
-  pen.font = "11px system-ui, sans-serif";
-  pen.fillStyle = "#667085";
-  pen.textAlign = "right";
-  for (const value of [low, 0, high]) pen.fillText(value.toFixed(0), 34, y(value) + 4);
-  pen.strokeStyle = "#dfe3ea";
-  pen.beginPath();
-  pen.moveTo(40, y(0));
-  pen.lineTo(width, y(0));
-  pen.stroke();
-  pen.fillStyle = "rgba(40, 96, 190, 0.35)";
-  returns.forEach((value, i) => pen.fillRect(x(i) - 1, y(value) - 1, 2.5, 2.5));
-  pen.strokeStyle = "#2860be";
-  pen.lineWidth = 2;
-  pen.beginPath();
-  returns.forEach((_, i) => {
-    const last = returns.slice(Math.max(0, i + 1 - WINDOW), i + 1);
-    const mean = last.reduce((a, b) => a + b, 0) / last.length;
-    if (i) pen.lineTo(x(i), y(mean));
-    else pen.moveTo(x(i), y(mean));
-  });
-  pen.stroke();
+function historyChart(rows, { title, unit, of, form, color: name, high }) {
+  const box = { left: 48, right: 386, top: 24, bottom: 120 }, zero = Object.fromEntries(COLUMNS.map((column) => [column, 0]));
+  const values = rows.map((row, i) => { const before = rows[i - 1] ?? zero; return [row.steps, of(Object.fromEntries(COLUMNS.map((c) => [c, row[c] - before[c]])), row)]; }).filter(([, value]) => value !== null);
+  const low = Math.min(0, ...values.map(([, v]) => v)), most = high ?? Math.max(low + 1e-3, 1.1 * Math.max(...values.map(([, v]) => v), 0)), end = Math.max(1, rows.at(-1)?.steps ?? 1);
+  const top = title === "collisions" ? Math.max(1, most) : most, x = scale(0, end, box.left, box.right), y = scale(low, top, box.bottom, box.top);
+  const path = values.map(([steps, v]) => `${x(steps).toFixed(1)},${y(v).toFixed(1)}`).join(" ");
+  return drawing(396, 142, title, [label(4, 14, `${title} [${unit}]`, { class: "title" }), axes(box, x, y, ticks(0, end, 4), ticks(low, top, 3), { y: form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }), tag("polyline", { points: path, fill: "none", stroke: color(name), "stroke-width": 2 })], { "data-points": values.length });
 }
 
 function drawLists(view) {
@@ -167,18 +162,30 @@ function showConnection(state, words) {
   at("link").textContent = words;
 }
 
+/** The card that keys are meant for: the one under the pointer, else the first one in the window. */
+function chosenCard() {
+  const inside = ({ box }) => { const { top, bottom } = box.getBoundingClientRect(); return bottom > 0 && top < innerHeight; };
+  return pointed ?? [...cards.values()].find(inside);
+}
+
+const keys = listenToKeys((event) => { const viewer = chosenCard()?.viewer; return Boolean(viewer?.episode) && viewer.key(event); });
+at("keys-button").addEventListener("click", keys);
+at("legend").append(legend([...viewerLegend(), ...[["free", "free space by the scan"], ["mover", "moving obstacle and its reachable set"], ["reserved", "reserved by other robots"]].map(([name, words]) => [color(name), words])]));
+
 let drawn = 0;
 const events = new EventSource("/events");
 events.onmessage = ({ data }) => {
   const view = JSON.parse(data);
   const quiet = view.silent > SILENT;
+  at("report").hidden = !(view.run.outcome && view.report);
   if (view.run.outcome) showConnection("ended", `the run has ended: ${view.run.outcome}`);
   else if (quiet) showConnection("down", `no message on the bus for ${view.silent.toFixed(0)} s`);
   else showConnection("up", "live");
   view.robots.forEach(drawRobot);
   drawRun(view);
   drawFigures(view);
-  drawCurves(view.returns);
+  drawStuck(view.robots);
+  drawCurves(view.history, view.totals);
   drawLists(view);
   document.body.dataset.drawn = String((drawn += 1));
 };

@@ -46,19 +46,20 @@ class DisplayedMap:
     swept: Array
 
     def flat(self, hits: int = OUTLINE) -> dict[str, list[Any]]:
-        """Return the map from above as values for JSON: points (x, y) and discs (x, y, radius), rounded to 1 mm.
+        """Return the map as values for JSON, rounded to 1 mm: points (d numbers), and discs or balls (d + 1 numbers).
 
-        hits: largest number of hits.
+        Args:
+            hits: largest number of hits. In space, they are those near the sensor's height.
         """
         level = self.hits
         if level.shape[1] == 3 and len(self.free):
             level = level[np.abs(level[:, 2] - self.free[0, 2]) <= SLICE]
-        some = level[:: max(1, -(-len(level) // hits)), :2]
+        some = level[:: max(1, -(-len(level) // hits))]
         return {
             "hits": some.round(3).tolist(),
-            "free": self.free[:, :2].round(3).tolist(),
-            "movers": self.movers[..., [0, 1, -1]].round(3).tolist(),
-            "swept": self.swept[..., [0, 1, -1]].round(3).tolist(),
+            "free": self.free.round(3).tolist(),
+            "movers": self.movers.round(3).tolist(),
+            "swept": self.swept.round(3).tolist(),
         }
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
-from brakeline.logs.intervention_map import MOST_CELLS, InterventionMap
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
 from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
@@ -169,7 +168,7 @@ def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
     near = by_order[gallery["near"][0]]
     assert near["tubes"] and len(near["tubes"][min(near["tubes"])]["boxes"]) == 3
     drone = pictures["galleries"]["quadrotor"]["episodes"][0]
-    assert len(drone["goal"]) == 2 and drone["heading"] is None and drone["x"], "in space, x and y are drawn"
+    assert len(drone["goal"]) == 3 and drone["heading"] is None and len(drone["z"]) == len(drone["x"]) > 0
     assert pictures["timeline"]["lines"][0]["text"] == "killed soon"
     assert {life["process"] for life in pictures["timeline"]["lives"]} == {"actor-0", "actor-1"}
     json.dumps(pictures, allow_nan=False)
@@ -201,20 +200,18 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
 
 
 def test_bins_become_wider_instead_of_more() -> None:
-    training, places, timeline = LearningCurve(), InterventionMap(), ProcessTimeline()
+    training, timeline = LearningCurve(), ProcessTimeline()
     for k in range(40_000):
         step = pb.Step(
             actor="a", episode=k // 100, step=k % 100, decision=pb.ADJUSTED, terminated=k % 100 == 99, goal=True
         )
         step.goal = step.terminated
         training.step(step)
-        places.step((k % 300 * 0.1, k // 300 * 0.1), step)
         timeline.step(BEGIN + k * SECOND)
     figures = training.figures()
     assert len(figures["bins"]) <= MOST_BINS and figures["bins"][-1]["until"] == 40_000
     assert {row["adjusted"] for row in figures["bins"]} == {1.0}
     assert sum(row["episodes"] for row in figures["bins"]) == 400
-    assert len(places.cells) <= MOST_CELLS and sum(cell[2] for cell in places.figures()["cells"]) == 40_000
     times = timeline.figures()
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
 
@@ -275,7 +272,7 @@ def test_console_output_is_complete_at_any_width(two: Two, columns: int) -> None
     assert str(both["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"
 
 
-def test_steps_after_a_gap_are_in_the_curves_and_the_map(tmp_path: Path) -> None:
+def test_steps_after_a_gap_are_in_the_curves(tmp_path: Path) -> None:
     """A recorder that was cut off stores steps before the learner's message that permits them."""
     writer = Writer(losses=0.0)
 
@@ -292,4 +289,3 @@ def test_steps_after_a_gap_are_in_the_curves_and_the_map(tmp_path: Path) -> None
     run = RunAnalysis("gap", Log([tmp_path / "run.mcap"]), AnalysisOptions(pictures=True))
     figures = run.figures()
     assert figures["steps"] == 7 == sum(row["steps"] for row in figures["training"]["ground"]["bins"])
-    assert sum(cell[0] for cell in run.intervention_maps["ground"].cells.values()) == 7

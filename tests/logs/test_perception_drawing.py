@@ -135,6 +135,7 @@ def test_browsers_draw_the_perceived_surroundings(say: Say, tmp_path: Path) -> N
     with LivePageServer(board.view) as server, Page(tmp_path / "profile") as page:
         page.open(path.as_uri())
         page.until("document.documentElement.dataset.drawn === 'yes'")
+        page.value("document.querySelector('#picker [data-view=above]').click()")
         shown = {
             name: drawn(page, name, "#picker", ".episode-map") for name in ("free", "hit", "mover", "swept", "promise")
         }
@@ -143,9 +144,11 @@ def test_browsers_draw_the_perceived_surroundings(say: Say, tmp_path: Path) -> N
         assert "reserved by other robots" in legend and "recovering" in legend
         page.open(server.url)
         page.until("document.body.dataset.drawn > 0")
+        page.value("document.querySelectorAll('[data-view=above]').forEach(button => button.click())")
+        page.until("document.querySelectorAll('.stage svg').length === 2")
         shown = {name: drawn(page, name, "#robots") for name in ("free", "mover", "swept", "promise")}
         assert shown == {"free": 4, "mover": 4, "swept": 12, "promise": 12}, "two robots, each on two maps"
         assert drawn(page, "hit", "#robots") > 100
-        assert "#8e44ad" in page.value("document.querySelector('#robots').innerHTML"), "recovering is violet"
+        assert "--recovering" in page.value("document.querySelector('#robots').innerHTML"), "recovering has its color"
         assert not re.findall("NaN|undefined|Infinity|null", page.value("document.querySelector('#robots').innerHTML"))
         assert page.complaints == []

@@ -34,7 +34,7 @@ def test_an_episode_is_saved_as_it_is_shown(page: Page) -> None:
     saved = page.value("saved")
     rows = list(csv.DictReader(io.StringIO(saved["text"])))
     fact = "[...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === '{}').textContent"
-    assert saved["name"] == "clearance-over-the-episode.csv"
+    assert saved["name"] == "an-episode-over-time.csv"
     assert len(rows) == int(page.value(fact.format("steps")))
     now = next(row for row in rows if row["step"] == page.value(fact.format("step")))
     assert f"{100 * float(now['clearance_m']):.3g} cm" == page.value(fact.format("clearance"))

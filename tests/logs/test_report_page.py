@@ -89,7 +89,8 @@ def test_it_needs_no_network_and_no_other_file(report: tuple[Path, dict[str, Any
     assert "default-src 'none'" in text
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", text)
     addresses = set(re.findall(r"https?://[^\s\"'<]+", text))
-    assert addresses <= {"http://www.w3.org/2000/svg"}, "a name, not an address that is asked"
+    names = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xhtml"}
+    assert addresses <= names, "names, not addresses that are asked"
     assert len(text) < 3_000_000
 
 
@@ -122,7 +123,7 @@ def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) ->
         curves: [...document.querySelectorAll('#learning svg')].map(s => s.getAttribute('aria-label')),
         maps: document.querySelectorAll('#places svg rect').length,
         near: document.querySelectorAll('#near .card svg').length,
-        tubes: document.querySelectorAll('#near .card svg rect[stroke="#7a4fc0"]').length,
+        tubes: document.querySelectorAll('#near .card svg rect.tube').length,
         bars: document.querySelectorAll('#latency svg rect').length,
         lanes: [...document.querySelectorAll('#timeline svg text')].map(t => t.textContent),
         broken: [...document.querySelectorAll('svg, #picker, .card')].map(e => e.outerHTML).join()
@@ -130,7 +131,7 @@ def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) ->
     })""")
     assert drawn["rates"] == 8 and drawn["near"] == 16 and drawn["tubes"] > 20 and drawn["bars"] > 20
     assert len(drawn["curves"]) == 10 and "goals reached" in drawn["curves"], "of both robot kinds"
-    assert drawn["maps"] > 50 and set(figures["processes"]) <= set(drawn["lanes"])
+    assert drawn["maps"] > 20 and set(figures["processes"]) <= set(drawn["lanes"])
     assert drawn["broken"] is None
 
 
@@ -146,8 +147,13 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
         page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))")
     ), "worst first, of all robots"
     data = page.value("data[0].galleries")
-    every = [episode for gallery in data.values() for episode in gallery["episodes"]]
+    every = [
+        episode
+        for gallery in data.values()
+        for episode in sorted(gallery["episodes"] + gallery["rest"], key=lambda episode: int(episode["order"]))
+    ]
     assert page.value("document.querySelectorAll('#picker option').length") == len(every) > 10
+    assert len(every) == sum(gallery["total"] for gallery in data.values()), "every episode is reachable"
 
     def facts() -> dict[str, str]:
         pairs = "[...document.querySelectorAll('#episode-facts dd')].map(d => [d.dataset.fact, d.textContent])"
@@ -164,7 +170,7 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
         assert said["steps"] == str(episode["steps"]) and said["step"] == str(episode["first"] + episode["closest_at"])
     slide = "r.value = 1; r.dispatchEvent(new Event('input'))"
     page.value(f"(() => {{ const r = document.querySelector('#picker input'); {slide} }})()")
-    assert facts()["step"] == str(every[3]["first"] + 1)
+    assert facts()["step"] == str(every[3]["first"] + every[3].get("at", [0, 1])[1])
     page.value("document.querySelector('#picker button[aria-label=\"next episode\"]').click()")
     assert facts()["episode"] == str(every[4]["episode"])
     page.value("document.querySelectorAll('#near .card button')[2].click()")
@@ -172,8 +178,8 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
     missed = [next(e for e in data[robot]["episodes"] if e["order"] == order) for robot, order in orders]
     near = sorted(missed, key=lambda episode: episode["closest"])[2]
     assert (facts()["actor"], facts()["episode"]) == (near["actor"], str(near["episode"]))
-    page.value("document.querySelector('#picker .bar button:not([aria-label])').click()")
-    page.until("document.querySelector('#picker .bar button:not([aria-label])').textContent === 'play'")
+    page.value("document.querySelector('#picker .play').click()")
+    page.until("document.querySelector('#picker .play').textContent === 'play'")
     assert page.complaints == []
 
 
@@ -254,11 +260,26 @@ def test_keys_step_through_an_episode(page: Page) -> None:
     step = (
         "Number([...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === 'step').textContent)"
     )
-    press = "document.getElementById('episode-map').dispatchEvent(new KeyboardEvent('keydown', {{ key: '{}' }}))"
-    page.value(press.format("Home"))
+    page.value("document.activeElement.blur()")
+    page.value("document.querySelector('#picker .plots svg') && pickers.get(0).viewer.step(0)")
     first = page.value(step)
-    page.value(press.format("ArrowRight"))
+    page.press("ArrowRight")
     assert page.value(step) == first + 1 and page.value("location.hash").endswith(f"step={first + 1}")
+    number = "document.querySelector('#picker select').value"
+    before = int(page.value(number))
+    page.press("n")
+    assert int(page.value(number)) == before + 1
+    page.press("p")
+    assert int(page.value(number)) == before
+    page.press("?")
+    assert page.value(
+        "document.getElementById('keys').open && document.getElementById('keys').textContent.length > 200"
+    )
+    page.press("?")
+    assert not page.value("document.getElementById('keys').open")
+    page.value("document.getElementById('episode-map').focus()")
+    page.press("End")
+    assert page.value(step) > first
 
 
 @pytest.mark.parametrize("which", ["page", "comparison"])

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from brakeline.deploy.run.episode_render import Film, Frame, _FilmAxes
 from brakeline.logs import foxglove_scene
 from brakeline.logs.decision_view import body_discs, decision_view
+from brakeline.logs.viewer import viewer_file
 from brakeline.logs.watch.dashboard import RobotPanel
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import robot_named
@@ -48,9 +49,9 @@ def test_pages_have_all_discs_of_the_body() -> None:
 def test_the_report_draws_the_body_at_its_heading(tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium: the report was not driven in a browser")
-    script = "\n".join((ROOT / "logs" / "report_page" / name).read_text() for name in ("svg.js", "scene.js"))
+    script = "\n".join(map(viewer_file, ("svg.js", "plan.js")))
     (tmp_path / "page.html").write_text(f"<!doctype html><body></body><script>{script}</script>")
-    view = "{ x: (a) => 100 * a, y: (a) => -100 * a, per: 100 }"
+    view = "{ x: (a) => 100 * a, y: (a) => -100 * a, per: 100, pick: ([x, y]) => [x, y] }"
     episode = f"{{ pose: [1, 2, Math.PI / 2], footprint: {CAR.footprint}, discs: {body_discs(CAR)} }}"
     with Page(tmp_path / "browser") as page:
         page.open((tmp_path / "page.html").as_uri())

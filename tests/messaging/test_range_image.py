@@ -245,7 +245,7 @@ def test_what_is_drawn_as_free_is_free_and_hits_lie_on_surfaces():
     edge = corners[k] + rng.random((2000, 1)) * (np.roll(corners, -1, axis=0)[k] - corners[k])
     assert shapes.distance(share * edge).min() > 0.0
     flat = about.flat(50)
-    assert len(flat["hits"]) <= 50 and all(len(point) == 2 for point in (*flat["hits"], *flat["free"]))
+    assert len(flat["hits"]) <= 50 and all(len(point) == 3 for point in (*flat["hits"], *flat["free"]))
 
 
 @pytest.mark.parametrize("given", [lambda a: a.astype(np.float32), np.asfortranarray, np.ndarray.tolist])

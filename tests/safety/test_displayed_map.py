@@ -72,7 +72,7 @@ def test_the_discs_contain_every_position_of_a_mover():
 def test_the_flat_map_of_a_flying_mover_has_the_radius_last():
     plane = Obstacle("sphere", (1.0, 2.0, 3.0), (0.5,), motion=Motion((0.0, 1.0, 0.0), 0.1, speed=1.0))
     request = pb.Request(obstacles=obstacle_messages([plane]))
-    assert map_for_display(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 0.5]]
+    assert map_for_display(QUADROTOR, request).flat()["movers"] == [[1.0, 2.0, 3.0, 0.5]]
 
 
 def test_the_reserved_boxes_are_the_new_ones_or_the_rest_of_the_old_ones():

@@ -1,12 +1,16 @@
 // Small tools for drawing: elements, numbers, scales and axes.
 
+/** Return a color of colors.css for a drawing or a style. */
+const color = (name) => `var(--${name})`;
+
 const KINDS = {
-  l: { name: "allowed", color: "#2b6cb8" },
-  d: { name: "adjusted", color: "#e08600" },
-  a: { name: "failsafe", color: "#c2312a" },
-  e: { name: "recovering", color: "#8e44ad" },
-  n: { name: "no filter", color: "#7b8794" },
+  l: { name: "allowed", color: color("allowed") },
+  d: { name: "adjusted", color: color("adjusted") },
+  a: { name: "failsafe", color: color("failsafe") },
+  e: { name: "recovering", color: color("recovering") },
+  n: { name: "no filter", color: color("unfiltered") },
 };
+const INTERVENTIONS = "dae"; // letters of KINDS
 
 /** Markup made by `tag`. Every other value in a drawing is text and is escaped. */
 class Markup extends String {}
