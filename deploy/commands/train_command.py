@@ -146,12 +146,15 @@ def train(
     if resume:
         shown.print(f"resuming {folder} from the learner's last checkpoint; the log continues in a new file")
     steps = config.steps * len(config.robots)
-    with LivePage(folder, browser) if watch else nullcontext() as page, Display(shown, steps, page) as display:
-        figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
-    if as_json:
-        print_json(figures)
-    else:
-        summary(console, figures, verbose)
+    with LivePage(folder, browser) if watch else nullcontext() as page:
+        with Display(shown, steps, page) as display:
+            figures = Launcher(config, folder, meeting.settings(config, folder)).run(display)
+        if as_json:
+            print_json(figures)
+        else:
+            summary(console, figures, verbose)
+        if page is not None:
+            page.stay(shown.print)
     return 0 if figures["finished"] else STOPPED
 
 

@@ -7,12 +7,14 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from brakeline.deploy.commands.command_output import console
-from brakeline.deploy.commands.common_options import BusOptions, Unprefixed
+from brakeline.deploy.commands.common_options import LATEST, BusOptions, Unprefixed
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
 from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.logs.watch.run_report import RunReport
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -36,6 +38,9 @@ class WatchCommand:
     """Let Foxglove connect at this port. 0 takes any free port; -1 starts no server."""
     origins: tuple[str, ...] = ORIGINS
     """Let these web pages connect to the Foxglove server besides programs, such as https://app.foxglove.dev."""
+    report: Path | None = None
+    """Link to the report of the run in this folder when the run has ended. Defaults to the newest run on this machine
+    if you give no endpoint."""
     json: bool = False
     """Print the addresses as one JSON object on stdout."""
 
@@ -44,7 +49,7 @@ class WatchCommand:
         inbox, board, live = Inbox(), Dashboard(), None
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
-            server = stack.enter_context(LivePageServer(board.view, self.host, self.port))
+            server = stack.enter_context(LivePageServer(board.view, self.host, self.port, self._report()))
             if self.foxglove_port >= 0:
                 live = stack.enter_context(FoxgloveServer(self.host, self.foxglove_port, origins=self.origins))
             stop = stack.enter_context(stop_on_signals(threading.Event()))
@@ -54,6 +59,12 @@ class WatchCommand:
             while not stop.wait(REFRESH_PERIOD):
                 show_received(inbox, board, live, bus.rejected)
         return 0
+
+    def _report(self) -> RunReport | None:
+        """Return the report of the run that is watched, if this machine has its log."""
+        if self.report is None and (self.endpoints.connect or self.endpoints.listen):
+            return None
+        return RunReport((self.report or LATEST).resolve())
 
     def _print_addresses(self, page: str, foxglove: str | None) -> None:
         if self.json:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
 import threading
+import time
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+from urllib.request import urlopen
 
 from brakeline.deploy.interpreter import PYTHON, end_with_parent
 from brakeline.deploy.run.processes import client_settings, launcher_pid
 
-NEXT_LOOK = 0.1  # s between two looks whether the run's router listens
+NEXT_LOOK = 0.1  # s between two looks whether the run's router listens, or whether somebody has the page open
+STAYS = 600.0  # s after the run's end, at most
 ENDS_IN = 3.0  # s
 
 
@@ -29,6 +34,7 @@ class LivePage:
     def __init__(self, folder: Path, browser: bool) -> None:
         """browser: whether to open the page in a browser, if this machine shows one."""
         self.notice = ""
+        self._url = ""
         self._folder, self._browser = folder, browser
         self._ended = threading.Event()
         self._popen: subprocess.Popen[str] | None = None
@@ -44,6 +50,23 @@ class LivePage:
             self._popen.terminate()
         self._thread.join()
 
+    def stay(self, say: Callable[[str], object]) -> None:
+        """After the run: serve the page and its link to the report as long as somebody has the page open."""
+        until = time.monotonic() + STAYS
+        with contextlib.suppress(KeyboardInterrupt):
+            if self._open_pages():
+                say(f"The live page and its report stay at {self._url} until you close the page or press ^C.")
+            while time.monotonic() < until and self._open_pages():
+                time.sleep(NEXT_LOOK)
+
+    def _open_pages(self) -> int:
+        """Return how many browsers have the page open; 0 if there is no page."""
+        try:
+            with urlopen(f"{self._url}view.json", timeout=ENDS_IN) as answer:
+                return int(json.loads(answer.read())["pages"])
+        except (OSError, ValueError, KeyError):
+            return 0
+
     def _serve(self) -> None:
         """Start the page once the run's router listens, and end it with the block."""
         while not self._listens():
@@ -52,6 +75,7 @@ class LivePage:
         bus = client_settings(self._folder)
         keys = [] if bus.keys is None else ["--keys", str(bus.keys)]
         words = ["watch", "--connect", *bus.connect, *keys, "--port", "0", "--foxglove-port", "-1", "--json"]
+        words += ["--report", str(self._folder)]
         command = [*PYTHON, "-m", "brakeline.deploy.run.live_page", str(os.getpid()), *words]
         logs = self._folder / "logs"
         logs.mkdir(exist_ok=True)
@@ -69,10 +93,10 @@ class LivePage:
             if not (line := popen.stdout.readline()):
                 self.notice = f"no live page: see {logs / 'watch.log'}"
                 return
-            url = json.loads(line)["page"]
-            self.notice = f"live page: {url}"
+            self._url = json.loads(line)["page"]
+            self.notice = f"live page: {self._url}"
             if self._browser and has_display():
-                webbrowser.open(url)
+                webbrowser.open(self._url)
             self._ended.wait()
         popen.terminate()
         try:

@@ -1,4 +1,4 @@
-"""Serve the live page: static files, and the dashboard's view as server-sent events.
+"""Serve the live page: static files, the dashboard's view as server-sent events, and the report of an ended run.
 
 By default only this machine can connect. Foreign web pages are rejected, and the page's content security policy forbids
 requests to other servers.
@@ -9,17 +9,21 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from importlib.resources import files
 from typing import Any, Self
 
+from brakeline.errors import LogError
 from brakeline.logs.json_values import finite
 from brakeline.logs.viewer import SCRIPTS, STYLES
+from brakeline.logs.watch.run_report import RunReport
 from brakeline.messaging.http_server import MOST_CLIENTS, BoundedHandler, BoundedServer
 
 RATE = 10.0  # Hz of events
 MOST_STREAMS = MOST_CLIENTS // 2  # pages at the same time; the other places are for short requests
+REPORT = "/report.html"
 HTML, CSS, SCRIPT = (f"text/{kind}; charset=utf-8" for kind in ("html", "css", "javascript"))
 FILES = {  # path: file in logs/, media type
     "/": ("watch/page.html", HTML),
@@ -36,7 +40,37 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 
+# The report's own policy allows its scripts and styles, by their hashes. Both policies hold.
+REPORT_HEADERS = HEADERS | {"Content-Security-Policy": "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"}
+
 View = Callable[[], dict[str, Any]]
+
+
+class OpenPages:
+    """Counts the pages that are open, and limits the event streams of all of them."""
+
+    def __init__(self) -> None:
+        self._free = threading.Semaphore(MOST_STREAMS)
+        self._lock = threading.Lock()
+        self.count = 0
+
+    @contextmanager
+    def one(self, limited: bool) -> Iterator[bool]:
+        """Count one page until the end of the block. Yields False if it is `limited` and there are too many."""
+        if limited and not self._free.acquire(blocking=False):
+            yield False
+            return
+        try:
+            self._add(1)
+            yield True
+        finally:
+            self._add(-1)
+            if limited:
+                self._free.release()
+
+    def _add(self, change: int) -> None:
+        with self._lock:
+            self.count += change
 
 
 class LivePageServer:
@@ -46,11 +80,17 @@ class LivePageServer:
         OSError: the port is in use.
     """
 
-    def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0) -> None:
-        """Create the server; `port` 0 selects a free port. `view` returns what the page shows."""
+    def __init__(self, view: View, host: str = "127.0.0.1", port: int = 0, report: RunReport | None = None) -> None:
+        """Create the server.
+
+        Args:
+            view: returns what the page shows.
+            host: address to listen on.
+            port: 0 selects a free port.
+            report: of the run, which is served when the run has ended; None: this machine does not have its log.
+        """
         self._ended = threading.Event()
-        streams = threading.Semaphore(MOST_STREAMS)
-        self._http = BoundedServer((host, port), partial(_Handler, view, self._ended, streams))
+        self._http = BoundedServer((host, port), partial(_Handler, view, self._ended, OpenPages(), report))
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._http.server_address[1]}/"
 
@@ -67,9 +107,15 @@ class LivePageServer:
 class _Handler(BoundedHandler):
     protocol_version = "HTTP/1.1"
 
-    def __init__(self, view: View, ended: threading.Event, streams: threading.Semaphore, *rest: Any) -> None:
-        self._view, self._ended, self._streams = view, ended, streams
+    def __init__(
+        self, view: View, ended: threading.Event, pages: OpenPages, report: RunReport | None, *rest: Any
+    ) -> None:
+        self._board, self._ended, self._pages, self._report = view, ended, pages, report
         super().__init__(*rest)
+
+    def _view(self) -> dict[str, Any]:
+        """Return the dashboard's view, with whether there is a report, and how many pages are open."""
+        return self._board() | {"report": self._report is not None, "pages": self._pages.count}
 
     def do_GET(self) -> None:
         path = self.path.split("?", 1)[0]
@@ -78,6 +124,8 @@ class _Handler(BoundedHandler):
                 self._events()
             elif path == "/view.json":
                 self._send(200, "application/json", encode(self._view()).encode())
+            elif path == REPORT:
+                self._send_report()
             elif path in FILES:
                 name, kind = FILES[path]
                 self._send(200, kind, (files("brakeline.logs") / name).read_bytes())
@@ -86,8 +134,24 @@ class _Handler(BoundedHandler):
         except (ConnectionError, TimeoutError):  # the client has disconnected
             self.close_connection = True
 
-    def _send(self, status: int, kind: str, body: bytes) -> None:
-        self._head(status, kind)
+    def _send_report(self) -> None:
+        """Send the report of a run that has ended. This takes seconds the first time."""
+        if self._report is None:
+            self.reply_text(404, "no report: start `brakeline watch` on the machine of the run, with --report FOLDER\n")
+        elif "outcome" not in self._view().get("run", {}):
+            self.reply_text(404, "the run goes on: its report is here when it has ended\n")
+        else:
+            with self._pages.one(limited=False):
+                try:
+                    page = self._report.page()
+                except (LogError, OSError, ValueError) as error:
+                    words = f"no report: {error}. Try `brakeline analyse {self._report.folder} --html report.html`\n"
+                    self.reply_text(500, words)
+                else:
+                    self._send(200, HTML, page, REPORT_HEADERS)
+
+    def _send(self, status: int, kind: str, body: bytes, headers: Mapping[str, str] = HEADERS) -> None:
+        self._head(status, kind, headers)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
@@ -95,10 +159,10 @@ class _Handler(BoundedHandler):
     def _events(self) -> None:
         """Send the view repeatedly until the client disconnects or the server stops."""
         self.close_connection = True
-        if not self._streams.acquire(blocking=False):
-            self.reply_text(503, f"{MOST_STREAMS} pages are open already\n")
-            return
-        try:
+        with self._pages.one(limited=True) as allowed:
+            if not allowed:
+                self.reply_text(503, f"{MOST_STREAMS} pages are open already\n")
+                return
             self._head(200, "text/event-stream")
             self.send_header("Connection", "close")
             self.end_headers()
@@ -106,13 +170,11 @@ class _Handler(BoundedHandler):
                 self.wfile.write(b"data: " + encode(self._view()).encode() + b"\n\n")
                 self.wfile.flush()
                 time.sleep(1.0 / RATE)
-        finally:
-            self._streams.release()
 
-    def _head(self, status: int, kind: str) -> None:
+    def _head(self, status: int, kind: str, headers: Mapping[str, str] = HEADERS) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
-        for name, value in HEADERS.items():
+        for name, value in headers.items():
             self.send_header(name, value)
 
 

@@ -56,6 +56,8 @@ class Writer:
         box = pb.Obstacle(kind="box", position=[1.0] * dim, size=[0.5] * dim, yaw=0.3)
         wall = pb.Obstacle(kind="wall", position=[2.5] + [0.0] * (dim - 1), yaw=math.pi)
         about = pb.Episode(robot=robot, actor=actor, episode=number, arena="default", obstacles=[box, wall])
+        if dim == 3:  # a floor and a ceiling
+            about.obstacles.extend(pb.Obstacle(kind="box", position=[0, 0, z], size=[6, 6, 1]) for z in (-0.5, 4.5))
         about.goal[:], about.start[:], about.goal_radius = [2.0] * dim, [0.0] * dim, 0.25
         self.put(f"episode/{place}", about, run)
         length, end = chance.randrange(3, 40), chance.choice(["goal", "collision", "timeout", "goal", "open"])

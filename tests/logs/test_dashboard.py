@@ -1,14 +1,16 @@
 """The live page: counts of the whole run, robot kinds apart, and a run that has ended in order."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from brakeline.logs.metrics import Metrics
-from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.dashboard import STUCK, Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.logs.watch.run_history import MOST_ROWS, RunHistory, history_from_note, history_to_note
 from brakeline.logs.watch.run_totals import run_totals, totals_from_health, totals_to_health
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.browser import CHROMIUM, Page
@@ -98,6 +100,61 @@ def test_totals_survive_a_health_message() -> None:
         "passed over": 0.0,
     }
     assert totals_from_health(totals_to_health(counted) | odd) == counted
+
+
+def counts(steps: float, collisions: float = 0.0) -> dict[str, dict[str, float]]:
+    rest = {"episodes": steps // 10, "goals": steps // 20, "interventions": steps // 5, "failsafes": 0.0}
+    return {"ground": {"steps": steps, "collisions": collisions, "reward": 0.5 * steps, **rest}}
+
+
+def test_a_history_covers_the_run_in_a_bounded_number_of_rows() -> None:
+    history = RunHistory()
+    for steps in range(0, 100_000, 10):
+        history.add(counts(float(steps), steps // 1000))
+    rows = history.rows["ground"]
+    assert MOST_ROWS // 2 <= len(rows) <= MOST_ROWS and rows[-1][0] > 90_000 and rows[0][0] < 5000
+    gaps = {one[0] - before[0] for before, one in pairwise(rows)}
+    assert len(gaps) == 1, "evenly spaced"
+    note = history_to_note(history.rows)
+    assert len(note) < 2500 and history_from_note(note) == history.rows
+
+
+@pytest.mark.parametrize(
+    "rows", ["[[1,2]]", "[[1,0,0,0,0,NaN]]", "[[2,0,0,0,0,0],[1,0,0,0,0,0]]", '"x"', "[[true,0,0,0,0,0]]"]
+)
+def test_a_malformed_history_is_left_out(rows: str) -> None:
+    assert history_from_note(f'{{"ground": {rows}, "air": [[1,0,0,0,0,0]]}}') == {"air": [[1, 0, 0, 0, 0, 0]]}
+    assert history_from_note(rows) == history_from_note("{" * 10_000) == {}
+
+
+def test_histories_begin_with_the_run_not_with_the_page(say: Say, mixed: Dashboard) -> None:
+    history = RunHistory()
+    for steps in (50, 100, 150):
+        history.add(counts(steps))
+    notes = {"run": "late", "history": history_to_note(history.rows)}
+    mixed.add(say("health/launcher", health("launcher", figures=totals_to_health(counts(160.0)), notes=notes)))
+    mixed._figures_at = -1e9
+    assert [row[0] for row in mixed.view()["history"]["ground"]] == [50, 100, 150]
+
+
+def test_a_robot_that_does_not_get_away_is_stuck_until_it_moves(say: Say) -> None:
+    board = Dashboard()
+
+    def drive(x: float, number: int) -> int:
+        step = pb.Step(robot="ground", actor="a", step=number, state=[x, 0.0, 0.0, 0.0, 0.0], decision=pb.FAILSAFE)
+        board.add(say("step/ground/a", step))
+        stuck: int = board.view()["robots"][0]["stuck"]
+        return stuck
+
+    assert [drive(0.1 * k, k) for k in range(30)] == [0] * 30, "it drives"
+    waits = [drive(2.9 + 0.01 * (k % 2), 30 + k) for k in range(STUCK + 3)]
+    assert not any(waits[: STUCK - 1]) and waits[-1] >= STUCK
+    assert drive(4.0, 200) == 0
+    waits = [drive(4.0, 201 + k) for k in range(STUCK)]
+    board.add(
+        say("episode/ground/a", pb.Episode(robot="ground", actor="a", episode=2, start=[0.0] * 5, goal=[1.0, 0.0]))
+    )
+    assert board.view()["robots"][0]["stuck"] == 0
 
 
 @pytest.fixture

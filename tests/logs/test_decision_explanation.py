@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from brakeline.logs.decision_explanation import arrow, explain, sentence
+from brakeline.logs.decision_view import decision_view
+from brakeline.logs.episode_sampler import EpisodeRecord
+from brakeline.logs.episode_view import rows
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot_description import read_robot
 from tests.robots import GROUND, QUADROTOR
@@ -122,3 +125,32 @@ def test_a_proposal_that_is_not_finite_has_no_arrow():
     question, answer = asked(GROUND, (float("nan"), 0.1)), answered(GROUND, pb.FAILSAFE, (0.0, 0.0), by="")
     about = explain(GROUND, question, answer)
     assert about.proposed.tolist() == [0.0, 0.0] and about.said.endswith("verified before: why not")
+
+
+SLEW = [  # proposed, before, executed, which limits
+    ((0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.5, 0.0, 0.0), ""),
+    ((4.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.8, 0.0, 0.0), "slew-limited"),
+    ((9.0, 0.0, 0.0), (4.9, 0.0, 0.0), (5.0, 0.0, 0.0), "clipped to its bounds"),
+    ((9.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.8, 0.0, 0.0), "clipped to its bounds, slew-limited"),
+    ((4.0, 0.0, 0.0), (), (0.8, 0.0, 0.0), "slew-limited"),
+    ((4.0, 0.0, 0.0), (3.9, 0.0, 0.0), (3.95, 0.0, 0.0), "limited by the robot"),
+]
+
+
+@pytest.mark.parametrize(("proposed", "before", "executed", "limited"), SLEW)
+def test_a_changed_input_never_stands_beside_a_bare_allowed(proposed, before, executed, limited):
+    decision = answered(QUADROTOR, pb.ALLOWED, executed, by="")
+    request = asked(QUADROTOR, proposed)
+    request.input_in_force[:] = before
+    exchange = pb.Exchange(request=request, reply=pb.Reply(decision=decision))
+    assert explain(QUADROTOR, request, decision).limited == limited
+    assert decision_view(QUADROTOR, exchange).explanation_json()["limited"] == limited
+    step = pb.Step(state=request.state, proposed=proposed, action=executed, decision=pb.ALLOWED)
+    episode = EpisodeRecord("", 0, None, [step], actor_exchanges=[exchange])
+    (row,) = rows(episode, QUADROTOR)
+    assert row["limited"] == limited
+
+
+def test_other_decisions_say_themselves_what_changed():
+    decision = answered(QUADROTOR, pb.ADJUSTED, (0.8, 0.0, 0.0), normal=(1, 0, 0))
+    assert explain(QUADROTOR, asked(QUADROTOR, (4.0, 0.0, 0.0)), decision).limited == ""

@@ -55,8 +55,9 @@ def test_the_page_shows_robots_and_figures_and_asks_nobody_else(watched: dict[st
         page.until("document.querySelectorAll('#processes .alive').length >= 6")
         page.until("document.getElementById('run').textContent.startsWith('run: method ddpc, arena default')")
         page.until("document.getElementById('done').textContent.includes(' of 100000 steps')")
-        for which in ("first", "last"):
-            page.until(f"document.querySelectorAll('.maps > :{which}-child svg rect[stroke=\"#7a4fc0\"]').length > 5")
+        page.until("document.querySelectorAll('.near svg rect.tube').length > 5")
+        page.until("[...document.querySelectorAll('.stage canvas')].some(canvas => canvas.dataset.frames > 3)")
+        page.until("document.querySelector('[data-history=ground] svg').dataset.points > 0")
         assert page.complaints == []
         assert len(page.requests) >= 4
         assert all(url.startswith((watched["page"], "data:")) for url in page.requests), page.requests
@@ -86,7 +87,7 @@ def test_programs_can_have_the_view_as_json(watched: dict[str, str]) -> None:
     shown = until(complete, "both robots with their arenas")
     for robot in shown["robots"]:
         half = robot["arena"]["half"]
-        assert all(abs(x) <= half and abs(y) <= half for x, y in robot["trail"])
+        assert all(abs(value) <= half for axis in "xy" for value in robot["path"][axis])
         assert all(0.0 < dx < 1.0 and 0.0 < dy < 1.0 for _, _, dx, dy in robot["tube"])
     assert shown["totals"]["ground"]["steps"] > 0 and shown["since"] is None, "counts are those of the whole run"
 

@@ -1,0 +1,90 @@
+"""The live page of a run that has ended links to the run's report, and stays as long as somebody has it open."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+
+from brakeline.deploy.run.live_page import LivePage
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.logs.watch.run_report import RunReport
+from tests.browser import CHROMIUM, Page
+from tests.logs.sample_log import mixed
+
+RUNNING: dict[str, Any] = {"run": "a", "method": "ddpc", "arena": "default", "seed": "0", "steps": "10"}
+
+
+def asked(url: str) -> tuple[int, str]:
+    try:
+        with urlopen(url, timeout=30.0) as answer:
+            return answer.status, answer.read().decode()
+    except HTTPError as error:
+        return error.code, error.read().decode()
+
+
+@pytest.fixture
+def shown() -> dict[str, Any]:
+    return Dashboard().view() | {"run": dict(RUNNING)}
+
+
+@pytest.fixture
+def server(shown: dict[str, Any], tmp_path: Path) -> Iterator[LivePageServer]:
+    log = mixed(tmp_path / "run", episodes=6)
+    with LivePageServer(lambda: shown, report=RunReport(log)) as server:
+        yield server
+
+
+def test_the_report_is_there_when_the_run_has_ended_and_not_before(
+    server: LivePageServer, shown: dict[str, Any]
+) -> None:
+    assert asked(server.url + "report.html") == (404, "the run goes on: its report is here when it has ended\n")
+    shown["run"]["outcome"] = "finished"
+    status, page = asked(server.url + "report.html")
+    assert status == 200 and "Brakeline: run" in page and "script-src 'sha256-" in page
+
+
+def test_without_a_log_the_answer_says_what_to_do(shown: dict[str, Any], tmp_path: Path) -> None:
+    shown["run"]["outcome"] = "finished"
+    with LivePageServer(lambda: shown) as server:
+        status, words = asked(server.url + "report.html")
+    assert status == 404 and "--report" in words
+    with LivePageServer(lambda: shown, report=RunReport(tmp_path / "none")) as server:
+        status, words = asked(server.url + "report.html")
+    assert status == 500 and "brakeline analyse" in words
+
+
+def test_the_page_links_to_the_report_which_draws_itself(
+    server: LivePageServer, shown: dict[str, Any], tmp_path: Path
+) -> None:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the live page was not looked at")
+    with Page(tmp_path / "browser") as page:
+        page.open(server.url)
+        page.until("document.body.dataset.drawn > 0")
+        assert page.value("document.getElementById('report').hidden")
+        shown["run"]["outcome"] = "finished"
+        page.until("!document.getElementById('report').hidden")
+        page.open(page.value("document.querySelector('#report a').href"))
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        assert page.value("document.querySelectorAll('#near .card').length") > 0 and page.complaints == []
+
+
+def test_the_page_stays_while_it_is_open(server: LivePageServer, tmp_path: Path) -> None:
+    page, said = LivePage(tmp_path, browser=False), list[str]()
+    page.stay(said.append)
+    assert said == [], "there is no page"
+    page._url = server.url
+    page.stay(said.append)
+    assert said == [], "nobody has it open"
+    with urlopen(server.url + "events", timeout=10.0) as events:
+        events.readline()
+        assert page._open_pages() == 1
+    deadline = time.monotonic() + 10.0
+    while page._open_pages() and time.monotonic() < deadline:
+        pass
+    assert page._open_pages() == 0

@@ -1,0 +1,191 @@
+"""The viewer of the report: in space, from above and from the side; links, curves and keys lead to an episode."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brakeline.logs.episode_sampler import POINTS, EpisodeSampler
+from brakeline.logs.log_analysis import LogAnalysis
+from brakeline.logs.report_page import render
+from brakeline.logs.viewer import SCRIPTS, viewer_file
+from brakeline.logs.viewer.palette import hex_color, rgb_color
+from brakeline.messaging import brakeline_pb2 as pb
+from tests.browser import CHROMIUM, Page
+from tests.logs.sample_log import Writer
+from tests.robots import GROUND
+
+STAGE = "document.querySelector('#picker .stage')"
+FACT = "[...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === '{}').textContent"
+PIXELS = """(() => { const c = document.querySelector('#picker canvas'), seen = new Set();
+    const data = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+    for (let i = 0; i < data.length; i += 4 * 97) seen.add(data.slice(i, i + 3).join());
+    return seen.size; })()"""
+SHOT = "document.querySelector('#picker canvas').toDataURL()"
+
+
+def view(page: Page, name: str) -> None:
+    page.value(f"document.querySelector('#picker [data-view={name}]').click()")
+
+
+def frame(page: Page, change: str) -> None:
+    """Make a change, and wait until the canvas has been drawn again."""
+    frames = "Number(document.querySelector('#picker canvas').dataset.frames ?? 0)"
+    before = page.value(frames)
+    page.value(change)
+    page.until(f"{frames} > {before}")
+
+
+@pytest.fixture
+def flight(page: Page) -> Iterator[Page]:
+    """The page at an episode of the quadrotor."""
+    page.value("(p => p.show(p.all.findIndex(i => i.robot === 'quadrotor' && !i.episode.at)))(pickers.get(0))")
+    yield page
+    page.value("pickers.get(0).viewer.look('space')")
+    page.value("pickers.get(0).show(0)")
+
+
+def test_an_episode_is_drawn_in_space_and_can_be_turned(flight: Page) -> None:
+    view(flight, "space")
+    flight.until("document.querySelector('#picker canvas').dataset.frames > 0")
+    frame(flight, "pickers.get(0).viewer.draw()")
+    assert flight.value(PIXELS) > 20, "a picture, not an empty canvas"
+    before = flight.value(SHOT)
+    flight.value("document.activeElement.blur()")
+    frame(flight, "document.dispatchEvent(new KeyboardEvent('keydown', { key: 'd', bubbles: true }))")
+    turned = flight.value(SHOT)
+    assert turned != before, "keys turn it"
+    flight.value("document.querySelector('#picker canvas').scrollIntoView({ block: 'center' })")
+    box = flight.value(f"(r => [r.x, r.y, r.width, r.height])({STAGE}.getBoundingClientRect())")
+    x, y = box[0] + 0.5 * box[2], box[1] + 0.5 * box[3]
+    flight.mouse("Moved", x, y)
+    flight.mouse("Pressed", x, y)
+    flight.mouse("Moved", x + 60, y + 20)
+    flight.mouse("Released", x + 60, y + 20)
+    frame(flight, "pickers.get(0).viewer.draw()")
+    assert flight.value(SHOT) != turned, "the mouse turns it"
+    frame(flight, "pickers.get(0).viewer.home()")
+    frame(flight, "pickers.get(0).viewer.draw()")
+    assert flight.complaints == []
+
+
+def test_in_the_air_there_are_a_side_view_and_the_altitude_and_no_grey_map(flight: Page) -> None:
+    view(flight, "side")
+    assert "from the side" in flight.value(f"{STAGE}.querySelector('svg').getAttribute('aria-label')")
+    assert flight.value("document.querySelectorAll('#picker [data-plot]').length") == 2
+    words = flight.value("document.querySelector('#picker [data-plot=altitude]').textContent")
+    assert "altitude [m]" in words and "floor" in words and "ceiling" in words
+    view(flight, "above")
+    covered = f"""(svg => {{ const all = svg.viewBox.baseVal.width;
+        const wide = [...svg.querySelectorAll('polygon[fill="var(--obstacle)"]')].map(p => p.getBBox().width);
+        return wide.filter(width => width > 0.9 * all && width < 10 * all).length; }})({STAGE}.querySelector('svg'))"""
+    assert flight.value(covered) == 0, "neither the floor nor the ceiling covers the map"
+    flight.value("pickers.get(0).show(pickers.get(0).all.findIndex(i => i.robot === 'ground'))")
+    assert flight.value("document.querySelectorAll('#picker [data-plot]').length") == 1
+    assert flight.value("document.querySelector('#picker [data-view=side]').hidden")
+
+
+def test_without_webgl_the_page_says_so_and_draws_the_plan(report: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the report was not driven in a browser")
+    without = "HTMLCanvasElement.prototype.getContext = () => null"
+    with Page(tmp_path / "browser") as page:
+        page.call("Page.addScriptToEvaluateOnNewDocument", source=without)
+        page.open(report[0].as_uri())
+        page.until("document.documentElement.dataset.drawn === 'yes'")
+        assert "no WebGL" in page.value("document.querySelector('#picker .nowebgl').textContent")
+        assert page.value(f"{STAGE}.querySelector('svg') !== null")
+        assert page.value("document.querySelector('#picker [data-view=space]').disabled")
+        page.press("v")
+        page.press("d")
+        assert page.value(f"{STAGE}.querySelector('svg') !== null") and page.complaints == []
+
+
+def test_links_arrive_at_the_episode_and_its_step(page: Page) -> None:
+    top = "document.getElementById('episodes').getBoundingClientRect().top"
+    item = (
+        "(p => p.all.find(i => i.robot === 'ground' && !i.episode.at && i.episode.steps > 9).episode)(pickers.get(0))"
+    )
+    actor, number = page.value(f"{item}.actor"), page.value(f"{item}.episode")
+    for place, step in (("step=7", "7"), (f"time={4 * GROUND.period}", "4")):
+        page.value("scrollTo(0, 0)")
+        page.value(f"location.hash = '#episode-{number}&actor={actor}&{place}'")
+        page.until(f"{FACT.format('step')} === '{step}' && Math.abs({top}) < 200")
+        assert (page.value(FACT.format("actor")), page.value(FACT.format("episode"))) == (actor, str(number))
+    page.value(f"location.hash = '#episode-{number}'")
+    page.until(f"{FACT.format('episode')} === '{number}'")
+    page.value("location.hash = '#episode-123456'")
+    page.until("document.getElementById('message').textContent.includes('does not have episode 123456')")
+    page.value("location.hash = ''")
+    links = page.value("[...document.querySelectorAll('#contents a')].map(a => a.getAttribute('href'))")
+    assert "#episodes" in links and len(links) > 8
+    assert page.value("[...document.querySelectorAll('#contents a')].every(a => document.querySelector(a.hash))")
+
+
+def test_one_line_crosses_all_charts_a_drag_zooms_and_a_click_opens_the_episode(page: Page) -> None:
+    chart = "document.querySelector('[data-robot=ground] [data-chart=\"interventions\"] svg')"
+    page.value(f"{chart}.scrollIntoView({{ block: 'center' }})")
+    x, y, width, height = page.value(f"(r => [r.x, r.y, r.width, r.height])({chart}.getBoundingClientRect())")
+    middle = y + 0.5 * height
+    page.mouse("Moved", x + 0.5 * width, middle)
+    lines = "[...document.querySelectorAll('.cross')].filter(c => c.style.display === 'inline').length"
+    assert page.value(lines) >= page.value("document.querySelectorAll('[data-robot=ground] .chart').length") > 3
+    page.mouse("Pressed", x + 0.4 * width, middle)
+    page.mouse("Moved", x + 0.6 * width, middle)
+    page.mouse("Released", x + 0.6 * width, middle)
+    assert not page.value("document.getElementById('whole').hidden"), "zoomed"
+    page.value("document.getElementById('whole').click()")
+    assert page.value("document.getElementById('whole').hidden")
+    page.mouse("Pressed", x + 0.5 * width, middle)
+    page.mouse("Released", x + 0.5 * width, middle)
+    step = page.value("pickers.get(0).episode.until")
+    assert page.value("pickers.get(0).all[pickers.get(0).at].robot") == "ground"
+    share = ((0.5 * 496) - 56) / (486 - 56)
+    wanted = share * page.value("data[0].training.ground.bins.at(-1).until")
+    others = page.value("pickers.get(0).all.filter(i => i.robot === 'ground').map(i => i.episode.until)")
+    assert step in {min(until for until in others if until >= near * wanted) for near in (0.99, 1.0, 1.01)}
+    page.value("scrollTo(0, 0)")
+    assert page.complaints == []
+
+
+def test_all_programs_have_the_colors_of_the_pages() -> None:
+    assert hex_color("allowed") == "#2b6cb8" and rgb_color("allowed") == (0x2B, 0x6C, 0xB8)
+    folder = Path(__file__).parents[2] / "logs"
+    own = [name for name in SCRIPTS if name != "three.min.js"]
+    scripts = {name: viewer_file(name) for name in own}
+    scripts |= {
+        path.name: path.read_text() for place in ("report_page", "watch") for path in (folder / place).glob("*.js")
+    }
+    scripts["learning.js"] = re.sub(r"const COLORS = .*", "", scripts["learning.js"])  # of runs
+    scripts["save.js"] = scripts["save.js"].replace("#fff", "")  # the paper of a saved figure
+    found = {name: re.findall(r"#[0-9a-f]{3,8}\b", text) for name, text in scripts.items()}
+    assert {name: colors for name, colors in found.items() if colors} == {}
+
+
+def test_the_page_of_60000_steps_has_every_episode_in_three_megabytes(analysis: LogAnalysis) -> None:
+    sampler, writer, length, episodes = EpisodeSampler(GROUND), Writer(5), 85, 706
+    source = sampler.source("actor-0")
+    steps = [writer._step("actor-0", 0, k, "ground", 0) for k in range(length)]
+    source.exchanges.extend(writer._exchange(step, 2) for step in steps)
+    around = [pb.Obstacle(kind="box", position=[0.123 * k, 1.234], size=[0.321, 0.234], yaw=0.5) for k in range(12)]
+    around += [pb.Obstacle(kind="wall", position=[2.5, 0.0], yaw=0.5) for _ in range(4)]
+    for number in range(episodes):
+        about = pb.Episode(robot="ground", actor="actor-0", episode=number, arena="default", obstacles=around)
+        about.goal[:], about.start[:], about.goal_radius = [1.2345, 1.2345], [0.1234, 0.1234], 0.25
+        source.about.append(about)
+        for exchange in source.exchanges:
+            exchange.request.episode = number
+        for step in steps:
+            new = pb.Step()
+            new.CopyFrom(step)
+            new.episode = number
+            sampler.step(source, new)
+    sampler.close()
+    gallery = sampler.figures()
+    [(label, (figures, pictures))] = analysis.by_label().items()
+    page = render(analysis.figures(), {label: (figures, pictures | {"galleries": {"ground": gallery}})})
+    assert len(gallery["episodes"]) + len(gallery["rest"]) == episodes == gallery["total"]
+    assert sum(len(item["at"]) for item in gallery["rest"]) < 4 * POINTS
+    assert len(page) < 3_000_000
