@@ -6,6 +6,7 @@ from PIL import Image
 
 from brakeline.deploy.experiments.evaluate import Evaluation, prepare_evaluation
 from brakeline.deploy.run.episode_render import Film, record, save
+from brakeline.logs.viewer.palette import rgb_color
 from tests.robots import GROUND
 
 
@@ -34,8 +35,8 @@ def test_without_a_filter_there_is_no_tube(data_folder):
 def test_a_picture_shows_the_way_in_the_decisions_colours(film, tmp_path):
     save([film], tmp_path / "deep" / "way.png")
     pixels = np.asarray(Image.open(tmp_path / "deep" / "way.png").convert("RGB"), int)
-    blue = (np.abs(pixels - (0x00, 0x72, 0xB2)).sum(-1) < 40).sum()
-    green = (np.abs(pixels - (0x00, 0x9E, 0x73)).sum(-1) < 40).sum()
+    blue = (np.abs(pixels - rgb_color("allowed")).sum(-1) < 40).sum()
+    green = (np.abs(pixels - rgb_color("goal")).sum(-1) < 40).sum()
     assert pixels.shape[0] > 500 and blue > 20 and green > 20
 
 
