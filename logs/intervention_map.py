@@ -12,7 +12,7 @@ from brakeline.logs.episode_stats import INTERVENTIONS, Figures
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 
-FIRST_CELL = 0.5  # of the robot's footprint
+FIRST_CELL = 0.25  # of the robot's footprint
 MOST_CELLS = 6400
 STILL = 1e-6  # of a proposed motion that has no direction
 

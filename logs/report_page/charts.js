@@ -76,7 +76,7 @@ function interventionMap({ cell, cells, heading, footprint }) {
   for (const v of ticks(-reach, reach, 6)) out.push(label(x(v), frame.bottom + 15, figure(v), { "text-anchor": "middle" }), label(frame.left - 6, y(v) + 4, figure(v), { "text-anchor": "end" }));
   for (let k = 0; k <= 20; k++) out.push(tag("rect", { x: frame.right + 12, y: frame.bottom - 8 - k * 8, width: 12, height: 8.3, fill: heat(k / 20) }));
   for (const k of [0, 10, 20]) out.push(label(frame.right + 29, frame.bottom - k * 8, figure(Math.round((most * k) / 20))));
-  out.push(label(frame.right, frame.bottom + 30, `ahead [m], ${heading ? "as the robot looks" : "in the direction of the proposed motion"}`, { "text-anchor": "end" }), label(frame.left, frame.top - 4, "left [m]", { "text-anchor": "end" }));
+  out.push(label(frame.right, frame.bottom + 30, `ahead [m], ${heading ? "as the robot looks" : "in the direction of the proposed motion"}`, { "text-anchor": "end" }), label(4, frame.bottom + 30, "upwards: left [m]"));
   return drawing(frame.right + 76, frame.bottom + 34, "interventions around the robot, from above", out);
 }
 

@@ -51,7 +51,7 @@ class Picker {
       const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : "", e.at ? "in short" : ""].filter(Boolean);
       this.select.append(element("option", { value: i }, `${e.actor}, episode ${e.episode}: ${marks.join(", ")}`));
     });
-    target.append(element("div", { class: "bar" }, element("button", { onclick: () => this.move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => this.move(1), "aria-label": "next episode" }, "›")));
+    target.append(element("div", { class: "bar choice" }, element("button", { onclick: () => this.move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => this.move(1), "aria-label": "next episode" }, "›")));
     const stage = element("div"), course = element("div", { class: "course" });
     this.viewer = new Viewer(stage, { id: `${mark}episode-map`, onshow: (k) => this.tell(k) });
     this.facts = element("dl", { class: "facts", id: `${mark}episode-facts` });

@@ -186,7 +186,7 @@ function learning(target, controls, runs, open) {
   for (const [share, words] of [[0, "not smoothed"], [0.02, "smoothed over 4 % of the run"], [0.05, "smoothed over 10 % of the run"]]) smooth.append(element("option", { value: share, ...(share === view.share ? { selected: "" } : {}) }, words));
   const raw = element("input", { type: "checkbox", id: "raw", checked: "", onchange: () => { view.raw = raw.checked; draw(); } });
   controls.append(smooth, element("label", {}, raw, " raw values as dots"), whole);
-  target.before(element("p", { class: "small" }, "A click on a curve opens the episode of that step. Drag along the steps to zoom; a double click shows all steps again."));
+  target.before(element("p", { class: "small hint" }, "A click on a curve opens the episode of that step. Drag along the steps to zoom; a double click shows all steps again."));
   target.addEventListener("dblclick", () => zoom(null));
   if (setups.length > new Set(setups).size) {
     const bands = element("input", { type: "checkbox", id: "bands", onchange: () => { view.bands = bands.checked; draw(); } });

@@ -245,9 +245,10 @@ class Space {
   /** Look at the whole arena from the south-west. */
   home(scene = this.scene, reach = scene.half ?? Math.max(1, ...sceneBounds(scene).map(Math.abs))) {
     const low = scene.floor ?? 0, high = scene.ceiling ?? (scene.z ? low + reach : 0);
-    const middle = (low + high) / 2 - 0.1 * reach;
+    const middle = (low + high) / 2, radius = Math.hypot(reach, reach, (high - low) / 2);
+    const away = (0.88 * radius) / Math.sin((0.5 * this.camera.fov * Math.PI) / 180);
     this.controls.target.set(0, 0, middle);
-    this.camera.position.set(-1.4 * reach, -2.4 * reach, middle + 2.15 * reach);
+    this.camera.position.set(-0.4, -0.68, 0.61).multiplyScalar(away).add(this.controls.target);
     this.camera.near = 0.005 * reach;
     this.camera.far = 20 * reach;
     this.camera.updateProjectionMatrix();

@@ -55,6 +55,9 @@ function drawRobot(robot) {
   reason.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", "), robot.trust].filter(Boolean).join(" · ");
   const { top, bottom } = box.getBoundingClientRect();
   if (!robot.arena.half || bottom < 0 || top > innerHeight) return; // off the screen: 200 robots must not stall the page
+  const key = JSON.stringify([robot.number, robot.first, robot.kinds.length, robot.pose, robot.tube[0], robot.promises]);
+  if (box.dataset.shown === key) return; // nothing has moved since the last event
+  box.dataset.shown = key;
   const shown = episodeOf(robot), [x, y] = robot.pose, reach = CLOSE * robot.footprint;
   viewer.refresh(shown);
   near.innerHTML = drawScene(sceneAt(shown, shown.x.length - 1), [x - reach, y - reach, x + reach, y + reach], MAP_SIZE, `the surroundings of ${robot.actor}`);
@@ -132,7 +135,11 @@ function drawCurves(history, totals) {
       at("curves").append(...(Object.keys(history).length > 1 ? [element("h3", {}, robot)] : []), box);
     }
     const named = rows.map((row) => Object.fromEntries(COLUMNS.map((name, i) => [name, row[i]]))), now = totals[robot];
-    if (now && now.steps > (named.at(-1)?.steps ?? 0)) named.push({ ...now, reward: (now.mean_reward ?? 0) * now.episodes });
+    if (now && now.steps > (named.at(-1)?.steps ?? 0)) {
+      const apart = named.length > 1 ? named.at(-1).steps - named.at(-2).steps : 0;
+      if (named.length > 1 && now.steps - named.at(-1).steps < 0.7 * apart) named.pop(); // few steps would show mostly noise
+      named.push({ ...now, reward: (now.mean_reward ?? 0) * now.episodes });
+    }
     const key = `${named.length} ${named.at(-1)?.steps}`;
     if (box.dataset.drawn === key) continue;
     box.dataset.drawn = key;
@@ -146,7 +153,7 @@ function historyChart(rows, { title, unit, of, form, color: name, high }) {
   const low = Math.min(0, ...values.map(([, v]) => v)), most = high ?? Math.max(low + 1e-3, 1.1 * Math.max(...values.map(([, v]) => v), 0)), end = Math.max(1, rows.at(-1)?.steps ?? 1);
   const top = title === "collisions" ? Math.max(1, most) : most, x = scale(0, end, box.left, box.right), y = scale(low, top, box.bottom, box.top);
   const path = values.map(([steps, v]) => `${x(steps).toFixed(1)},${y(v).toFixed(1)}`).join(" ");
-  return drawing(396, 142, title, [label(4, 14, `${title} [${unit}]`, { class: "title" }), axes(box, x, y, ticks(0, end, 4), ticks(low, top, 3), { y: form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }), tag("polyline", { points: path, fill: "none", stroke: color(name), "stroke-width": 2 })], { "data-points": values.length });
+  return drawing(396, 142, title, [label(4, 14, `${title} [${unit}]`, { class: "title" }), axes(box, x, y, ticks(0, end, 4), ticks(low, top, 3), { y: form, x: (v) => v >= 1000 ? `${figure(v / 1000)}k` : figure(v) }), tag("polyline", { points: path, fill: "none", stroke: color(name), "stroke-width": 2 }), ...values.slice(-1).map(([steps, v]) => tag("circle", { cx: x(steps), cy: y(v), r: 2.5, fill: color(name) }))], { "data-points": values.length });
 }
 
 function drawLists(view) {

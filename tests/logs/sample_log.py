@@ -58,7 +58,8 @@ class Writer:
         about = pb.Episode(robot=robot, actor=actor, episode=number, arena="default", obstacles=[box, wall])
         if dim == 3:  # a floor and a ceiling
             about.obstacles.extend(pb.Obstacle(kind="box", position=[0, 0, z], size=[6, 6, 1]) for z in (-0.5, 4.5))
-        about.goal[:], about.start[:], about.goal_radius = [2.0] * dim, [0.0] * dim, 0.25
+        about.goal[:], about.goal_radius = [2.0] * dim, 0.25
+        about.start[:] = [0.0] * robot_named(robot).state_dim
         self.put(f"episode/{place}", about, run)
         length, end = chance.randrange(3, 40), chance.choice(["goal", "collision", "timeout", "goal", "open"])
         for k in range(length):

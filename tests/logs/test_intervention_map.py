@@ -32,7 +32,7 @@ def test_an_obstacle_ahead_is_ahead_wherever_the_robot_is_and_looks(where: tuple
 def test_a_robot_without_a_heading_looks_where_it_wants_to_go() -> None:
     grid = InterventionMap(QUADROTOR)
     grid.exchange(intervened(QUADROTOR, [0.95, 3.13, 2.0], [1.0, 1.0, 2.0], [0.0, 4.0, 0.0], pb.FAILSAFE))
-    assert grid.figures()["cells"] == [[14, 0, 0, 1, 0]]
+    assert grid.figures()["cells"] == [[28, 0, 0, 1, 0]]
     assert not grid.figures()["heading"]
 
 

@@ -347,10 +347,10 @@ def hostile(path: Path, analysis: LogAnalysis) -> Path:
     timeline["lines"].append({"t": 0.0, "process": HOSTILE, "level": HOSTILE, "text": HOSTILE})
     pictures["places"] = {HOSTILE: next(iter(pictures["places"].values()))} | pictures["places"]
     for gallery in pictures["galleries"].values():
-        for episode in gallery["episodes"]:
+        for episode in gallery["episodes"] + gallery["rest"]:
             episode |= {"actor": HOSTILE, "robot": HOSTILE, "arena": HOSTILE, "outcome": HOSTILE}
-            for tube in episode["tubes"].values():
-                tube["reason"] = HOSTILE
+            for tube in episode.get("tubes", {}).values():
+                tube |= {"reason": HOSTILE, "limited": HOSTILE, "said": HOSTILE}
     write(path, figures, {HOSTILE: (figures, pictures)})
     return path
 

@@ -1,6 +1,6 @@
-"""The report looks like its stored screenshots: on a phone and on a desktop, light and dark, and in print.
+"""Report and live page look like their stored screenshots: on a phone and on a desktop, light and dark, and in print.
 
-Of each section a small picture is kept, averaged so much that a browser's next version changes little, and what is
+Of each part a small picture is kept, averaged so much that a browser's next version changes little, and what is
 gone, doubled or in another colour changes much. They are of one font, which has to be there. After a
 change that is meant, run `BRAKELINE_PICTURES=write pytest tests/logs/test_report_screenshots.py`
 and look at what it wrote.
@@ -10,13 +10,19 @@ import base64
 import io
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser import Page
+from brakeline.logs.watch.dashboard import Dashboard
+from brakeline.logs.watch.live_page_server import LivePageServer
+from brakeline.messaging.bus import Sample
+from brakeline.messaging.topics import TOPICS
+from tests.browser import CHROMIUM, Page
+from tests.logs.sample_log import Writer
 
 FONT = "DejaVu Sans"  # the one that Debian's fontconfig comes with
 STORED = Path(__file__).parent.parent / "truth" / "pictures"
@@ -26,6 +32,7 @@ TALLER = 0.12  # of a section's height
 LAYOUTS = {f"{width}-{scheme}": (width, "screen", scheme) for width in (390, 1400) for scheme in ("light", "dark")} | {
     "print": (680, "print", "light")
 }
+FEW = ("390-dark", "1400-light", "print")
 
 
 def installed(font: str) -> bool:
@@ -35,10 +42,13 @@ def installed(font: str) -> bool:
         return False
 
 
-def sections(page: Page) -> tuple[np.ndarray, np.ndarray]:
-    """Return small pictures (n, EDGE, EDGE, 3) of the page's sections, and the sections' heights [px]."""
+needs_font = pytest.mark.skipif(not installed(FONT), reason=f"no {FONT}: the pages were not compared with pictures")
+
+
+def sections(page: Page, selector: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return small pictures (n, EDGE, EDGE, 3) of parts of the page, and the parts' heights [px]."""
     places = page.value(
-        "[...document.querySelectorAll('section')].map(s => s.getBoundingClientRect())"
+        f"[...document.querySelectorAll('{selector}')].map(s => s.getBoundingClientRect())"
         ".filter(r => r.height > 0).map(r => [r.x + scrollX, r.y + scrollY, r.width, r.height])"
     )
     tiles = []
@@ -57,35 +67,78 @@ def apart(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stored(name: str) -> tuple[np.ndarray, np.ndarray]:
-    picture = np.asarray(Image.open(STORED / f"report-{name}.png").convert("RGB"), dtype=float)
-    heights = np.loadtxt(STORED / f"report-{name}.txt", ndmin=1)
+    picture = np.asarray(Image.open(STORED / f"{name}.png").convert("RGB"), dtype=float)
+    heights = np.loadtxt(STORED / f"{name}.txt", ndmin=1)
     return picture.reshape(-1, EDGE, EDGE, 3), heights
 
 
-@pytest.mark.skipif(not installed(FONT), reason=f"no {FONT}: the report was not compared with its pictures")
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_the_report_looks_like_the_stored_screenshots(page: Page, name: str) -> None:
+def compare(page: Page, what: str, name: str, selector: str, essential: str) -> None:
+    """Compare parts of the page with their stored pictures; without what is `essential` they must differ."""
     width, medium, scheme = LAYOUTS[name]
     page.size(width, 900)
     page.media(medium, scheme)
     page.value(f"document.body.style.fontFamily = '{FONT}'")
+    page.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 50))))")
+    hide = f"[...document.querySelectorAll('{essential}')].forEach(part => part.style.visibility = '{{}}')"
     try:
-        now, heights = sections(page)
-        page.value("[...document.querySelectorAll('.charts')].forEach(c => c.style.visibility = 'hidden')")
-        bare, _ = sections(page)
+        now, heights = sections(page, selector)
+        page.value(hide.format("hidden"))
+        bare, _ = sections(page, selector)
     finally:
         page.value("document.body.style.fontFamily = ''")
-        page.value("[...document.querySelectorAll('.charts')].forEach(c => c.style.visibility = '')")
+        page.value(hide.format(""))
         page.media()
         page.size(1280, 900)
     if os.environ.get("BRAKELINE_PICTURES") == "write":
         STORED.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(now.reshape(-1, EDGE, 3).astype(np.uint8)).save(STORED / f"report-{name}.png")
-        np.savetxt(STORED / f"report-{name}.txt", heights, fmt="%.0f")
-    before, tall = stored(name)
-    assert len(now) == len(before), "a section is gone, or new"
+        Image.fromarray(now.reshape(-1, EDGE, 3).astype(np.uint8)).save(STORED / f"{what}-{name}.png")
+        np.savetxt(STORED / f"{what}-{name}.txt", heights, fmt="%.0f")
+    before, tall = stored(f"{what}-{name}")
+    assert len(now) == len(before), "a part is gone, or new"
     assert (np.abs(heights - tall) <= TALLER * tall).all(), (heights, tall)
     mean, tile = apart(now, before)
     assert (mean <= MEAN).all() and (tile <= TILE).all(), (mean.round(1), tile.round(1))
     mean, tile = apart(bare, before)
-    assert (mean > MEAN).any() or (tile > TILE).any(), "without its charts it would not be told from what is stored"
+    assert (mean > MEAN).any() or (tile > TILE).any(), f"without {essential} it would not be told from what is stored"
+
+
+@needs_font
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_the_report_looks_like_the_stored_screenshots(page: Page, name: str) -> None:
+    compare(page, "report", name, "section", ".charts")
+
+
+@needs_font
+@pytest.mark.parametrize("name", FEW)
+def test_a_flight_looks_like_the_stored_screenshots(page: Page, name: str) -> None:
+    page.value("(p => p.show(p.all.findIndex(i => i.robot === 'quadrotor' && !i.episode.at)))(pickers.get(0))")
+    compare(page, "flight", name, "#picker .stage, #picker .plots", ".stage canvas")
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """The live page of a run of a ground robot and a quadrotor, each in the middle of an episode."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: the live page was not looked at")
+    writer, board = Writer(seed=2, losses=0.0), Dashboard()
+    for number in range(8):
+        writer.episode("actor-0", number)
+        writer.episode("drone-0", number, robot="quadrotor")
+    for entry in writer.entries:
+        topic = next(topic for topic in TOPICS if entry.type is topic.message)
+        board.add(Sample(topic, entry.key, entry.payload, entry.log_time))
+    folder = tmp_path_factory.mktemp("live")
+    with LivePageServer(board.view) as server, Page(folder) as page:
+        page.open(server.url)
+        page.until("document.body.dataset.drawn > 1")
+        yield page
+
+
+@needs_font
+@pytest.mark.parametrize("name", FEW)
+def test_the_live_page_looks_like_the_stored_screenshots(live: Page, name: str) -> None:
+    live.size(LAYOUTS[name][0], 2400)
+    frames = "[...document.querySelectorAll('.stage canvas')].map(c => Number(c.dataset.frames ?? 0))"
+    live.until(f"{frames}.length === 2 && {frames}.every(n => n > 0)")
+    compare(live, "live", name, ".card .stage, .card .beside, .below .wide", ".stage canvas")
+    assert live.complaints == []
