@@ -9,7 +9,7 @@ $(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter
 	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()'
 endef
 
-.PHONY: demo setup test test-fast check style types compiled unit bench messages docs safety-gymnasium bullet-safety-gym clean
+.PHONY: demo setup test test-fast check style types compiled unit bench messages docs three safety-gymnasium bullet-safety-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -68,6 +68,13 @@ docs: setup
 messages: setup
 	$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --mypy_out=. \
 		--plugin=protoc-gen-mypy=$(BIN)/protoc-gen-mypy messaging/brakeline.proto
+
+# Bundles the parts of three.js that the viewer of the pages uses. Needs npm; only to change them or their version.
+three:
+	folder=$$(mktemp -d) && cp logs/viewer/three.entry.js $$folder && cd $$folder && \
+		npm install --silent three@0.187.0 esbuild@0.28.2 && npx esbuild three.entry.js --bundle --minify --format=iife \
+		--global-name=THREE --legal-comments=inline --outfile=$(CURDIR)/logs/viewer/three.min.js && \
+		cp node_modules/three/LICENSE $(CURDIR)/logs/viewer/three.LICENSE && rm -r $$folder
 
 # Other authors' environments, each in a virtual environment of its own (docs/environments.md).
 safety-gymnasium: examples/safety_gymnasium/.venv/.installed

@@ -48,7 +48,7 @@ class Picker {
     if (!this.all.length) return void target.append(nothing("The log has no episode."));
     this.select = element("select", { "aria-label": "episode", onchange: () => this.show(+this.select.value) });
     this.all.forEach(({ episode: e, near: rank }, i) => {
-      const marks = [e.outcome, `${e.steps} steps`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : "", e.at ? "in short" : ""].filter(Boolean);
+      const marks = [e.outcome, `${e.steps} step${e.steps === 1 ? "" : "s"}`, e.failsafes ? `${e.failsafes} failsafe` : "", rank >= 0 ? `near miss ${rank + 1}` : "", e.at ? "in short" : ""].filter(Boolean);
       this.select.append(element("option", { value: i }, `${e.actor}, episode ${e.episode}: ${marks.join(", ")}`));
     });
     target.append(element("div", { class: "bar choice" }, element("button", { onclick: () => this.move(-1), "aria-label": "previous episode" }, "‹"), this.select, element("button", { onclick: () => this.move(1), "aria-label": "next episode" }, "›")));

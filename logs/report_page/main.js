@@ -4,6 +4,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const pickers = new Map(); // by index of the run
 let shown = 0; // index of the run
+let remembered = 0; // timer of the address
 document.body.append(tip);
 learning(document.getElementById("learning"), document.getElementById("learning-controls"), data, (run, robot, step) => {
   show(data.indexOf(run));
@@ -28,11 +29,12 @@ function show(place) {
   timeline(at("timeline"), run.timeline);
 }
 
-/** Put the step that is shown into the address. */
+/** Put the step that is shown into the address, once it stays: browsers limit how often a page may change its address. */
 function remember(place, episode, step) {
   if (!document.documentElement.dataset.drawn) return;
   const words = new URLSearchParams({ actor: episode.actor, step, ...(data.length > 1 ? { run: place } : {}) });
-  history.replaceState(null, "", `#episode-${episode.episode}&${words}`);
+  clearTimeout(remembered);
+  remembered = setTimeout(() => history.replaceState(null, "", `#episode-${episode.episode}&${words}`), 250);
 }
 
 /** Show the run, the episode and the step of the address. */

@@ -246,7 +246,7 @@ class Space {
   home(scene = this.scene, reach = scene.half ?? Math.max(1, ...sceneBounds(scene).map(Math.abs))) {
     const low = scene.floor ?? 0, high = scene.ceiling ?? (scene.z ? low + reach : 0);
     const middle = (low + high) / 2, radius = Math.hypot(reach, reach, (high - low) / 2);
-    const away = (0.88 * radius) / Math.sin((0.5 * this.camera.fov * Math.PI) / 180);
+    const away = (0.96 * radius) / Math.sin((0.5 * this.camera.fov * Math.PI) / 180);
     this.controls.target.set(0, 0, middle);
     this.camera.position.set(-0.4, -0.68, 0.61).multiplyScalar(away).add(this.controls.target);
     this.camera.near = 0.005 * reach;

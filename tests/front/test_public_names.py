@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import brakeline
+from brakeline.logs.viewer import SCRIPTS, STYLES
 
 ROOT = Path(__file__).parents[2]
 # The names, the files and the decisions are tested here, so the kernels of another folder are not compiled: it takes
@@ -134,6 +135,7 @@ def test_a_wheel_has_everything(wheel):
     needed = {"py.typed", "policies/ground/trained.safetensors", *(f"robots/{name}" for name in robots)}
     needed |= {"sim/ground.xml", "sim/quadrotor.xml", "deploy/experiments/paper.json", "messaging/brakeline.proto"}
     needed |= {"logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json"}
+    needed |= {f"logs/viewer/{name}" for name in (*STYLES, *SCRIPTS, "three.LICENSE")}
     assert needed <= files, needed - files
     tracked = subprocess.run(["git", "ls-files", *PARTS], capture_output=True, text=True, check=True, cwd=ROOT)
     assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= files, "a package is missing in pyproject.toml"

@@ -264,7 +264,8 @@ def test_keys_step_through_an_episode(page: Page) -> None:
     page.value("document.querySelector('#picker .plots svg') && pickers.get(0).viewer.step(0)")
     first = page.value(step)
     page.press("ArrowRight")
-    assert page.value(step) == first + 1 and page.value("location.hash").endswith(f"step={first + 1}")
+    assert page.value(step) == first + 1
+    page.until(f"location.hash.endsWith('step={first + 1}')")
     number = "document.querySelector('#picker select').value"
     before = int(page.value(number))
     page.press("n")
