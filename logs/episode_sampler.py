@@ -98,14 +98,20 @@ class EpisodeSampler:
 
     Attributes:
         label: prefix of the run.
+        sketches: most episodes in short.
         wanted: number of an episode that is always selected, of every actor or only of `actor`.
         requested_episodes: the episodes with this number, with all their steps.
     """
 
     def __init__(
-        self, robot: Robot | None, label: str = "", wanted: int | None = None, actor: str | None = None
+        self,
+        robot: Robot | None,
+        label: str = "",
+        wanted: int | None = None,
+        actor: str | None = None,
+        sketches: int = SKETCHES,
     ) -> None:
-        self.robot, self.label = robot, label
+        self.robot, self.label, self.sketches = robot, label, sketches
         self.wanted, self.actor = wanted, actor
         self.requested_episodes: list[Figures] = []
         self.last: EpisodeRecord | None = None
@@ -190,7 +196,7 @@ class EpisodeSampler:
         points = min(MOST_POINTS, max(FEWEST_POINTS, POINTS // (order + 1)))
         about = {"order": order, "until": episode.until, **sketch(episode, self.robot, points)}
         self._sketches[order] = json.dumps(finite(about)).encode()
-        if len(self._sketches) > SKETCHES:
+        if len(self._sketches) > self.sketches:
             self._sketch_stride *= 2
             self._sketches = {k: item for k, item in self._sketches.items() if k % self._sketch_stride == 0}
 

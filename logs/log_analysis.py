@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from brakeline.logs.episode_sampler import ActorBuffer, EpisodeSampler
+from brakeline.logs.episode_sampler import SKETCHES, ActorBuffer, EpisodeSampler
 from brakeline.logs.episode_stats import Figures, closed_loop
 from brakeline.logs.intervention_map import InterventionMap
 from brakeline.logs.learning_curve import LearningCurve
@@ -32,11 +32,13 @@ class AnalysisOptions:
         pictures: the data that the report draws.
         episode: number of an episode to list step by step.
         actor: only this actor's episode; None: every actor's.
+        sketches: most episodes of each robot kind that the pictures have in short.
     """
 
     pictures: bool = False
     episode: int | None = None
     actor: str | None = None
+    sketches: int = SKETCHES
 
 
 class RunAnalysis:
@@ -130,7 +132,8 @@ class RunAnalysis:
         if series not in self._buffers:
             if series.robot not in self.samplers:
                 robot, options = self.log.robots.named(series.robot), self.options
-                self.samplers[series.robot] = EpisodeSampler(robot, self.prefix, options.episode, options.actor)
+                wanted = options.episode, options.actor
+                self.samplers[series.robot] = EpisodeSampler(robot, self.prefix, *wanted, options.sketches)
             sampler = self.samplers[series.robot]
             self._buffers[series] = sampler, sampler.source(series.actor)
         return self._buffers[series]
@@ -225,13 +228,14 @@ class LogAnalysis:
 
 
 def analyse_runs(paths: Paths, options: AnalysisOptions | None = None) -> LogAnalysis:
-    """Analyse the logs at `paths`, run by run.
+    """Analyse the logs at `paths`, run by run. The runs share the sketches, so that their page does not become large.
 
     Raises:
         LogError: a path has no log, or a file is not an MCAP file.
     """
-    runs = by_run(find(paths))
+    runs, options = by_run(find(paths)), options or AnalysisOptions()
     several = len(runs) > 1
+    options = replace(options, sketches=options.sketches // max(1, len(runs)))
     return LogAnalysis(
         [RunAnalysis(label, Log(files), options, f"{label}/" if several else "") for label, files in runs.items()]
     )

@@ -2,7 +2,7 @@
 
 const VIEWS = { space: "3-D", above: "from above", side: "from the side" };
 const KEYS = [
-  ["space", "play or pause"],
+  ["space", "play or pause, while the picture is in the window"],
   ["← →", "step back or ahead"],
   ["Home End", "the first or the last step, after a click on the picture"],
   ["p n", "previous or next episode"],
@@ -142,12 +142,13 @@ class Viewer {
   /** Follow a key; return false if it means nothing here. */
   key(event) {
     const focused = this.stage.contains(document.activeElement), available = Object.keys(VIEWS).filter((view) => (view !== "space" || renderer()) && (view !== "side" || this.episode.z));
+    const { top, bottom } = this.stage.getBoundingClientRect(), seen = bottom > 0 && top < innerHeight;
     const turn = (...by) => () => this.view === "space" && this.space.orbit(...by);
     const moves = {
       ArrowRight: () => { this.stop(); this.step(this.k + 1); },
       ArrowLeft: () => { this.stop(); this.step(this.k - 1); },
       ...(focused ? { Home: () => { this.stop(); this.step(0); }, End: () => { this.stop(); this.step(this.episode.x.length - 1); } } : {}),
-      " ": () => this.toggle(),
+      ...(seen ? { " ": () => this.toggle() } : {}), // else the space bar scrolls the page
       v: () => this.look(available[(available.indexOf(this.view) + 1) % available.length]),
       a: turn(-0.15, 0), d: turn(0.15, 0), w: turn(0, 0.1), s: turn(0, -0.1), "+": turn(0, 0, 0.85), "=": turn(0, 0, 0.85), "-": turn(0, 0, 1.18),
       f: () => this.follow(),

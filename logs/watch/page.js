@@ -188,7 +188,7 @@ events.onmessage = ({ data }) => {
   if (view.run.outcome) showConnection("ended", `the run has ended: ${view.run.outcome}`);
   else if (quiet) showConnection("down", `no message on the bus for ${view.silent.toFixed(0)} s`);
   else showConnection("up", "live");
-  view.robots.forEach(drawRobot);
+  if (!document.hidden) view.robots.forEach(drawRobot);
   drawRun(view);
   drawFigures(view);
   drawStuck(view.robots);

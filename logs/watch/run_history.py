@@ -35,7 +35,7 @@ class RunHistory:
         for robot, counts in totals.items():
             rows, width = self.rows.setdefault(robot, []), self._width.setdefault(robot, FIRST_WIDTH)
             row = [round(counts[name], 1) for name in COLUMNS]
-            if row[0] < (rows[-1][0] if rows else 0.0) + width:
+            if row[0] < (rows[-1][0] if rows else 0.0) + width or not all(map(math.isfinite, row)):
                 continue
             rows.append(row)
             if len(rows) > MOST_ROWS:

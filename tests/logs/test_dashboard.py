@@ -1,5 +1,6 @@
 """The live page: counts of the whole run, robot kinds apart, and a run that has ended in order."""
 
+import math
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -117,6 +118,13 @@ def test_a_history_covers_the_run_in_a_bounded_number_of_rows() -> None:
     assert len(gaps) == 1, "evenly spaced"
     note = history_to_note(history.rows)
     assert len(note) < 2500 and history_from_note(note) == history.rows
+
+
+def test_a_reward_that_is_not_a_number_leaves_a_history_whole() -> None:
+    history = RunHistory()
+    history.add({"ground": counts(60.0)["ground"] | {"reward": math.nan}})
+    history.add({"ground": counts(80.0)["ground"] | {"reward": math.inf}})
+    assert history_from_note(history_to_note(history.rows)) == {"ground": []}
 
 
 @pytest.mark.parametrize(

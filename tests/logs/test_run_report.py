@@ -16,7 +16,8 @@ from brakeline.logs.watch.run_report import RunReport
 from tests.browser import CHROMIUM, Page
 from tests.logs.sample_log import mixed
 
-RUNNING: dict[str, Any] = {"run": "a", "method": "ddpc", "arena": "default", "seed": "0", "steps": "10"}
+HOSTILE = '"><img src=x onerror="document.title=\'owned\'"><script>document.title="owned"</script>\''
+RUNNING: dict[str, Any] = {"run": HOSTILE, "method": "ddpc", "arena": "default", "seed": "0", "steps": "10"}
 
 
 def asked(url: str) -> tuple[int, str]:
@@ -29,7 +30,9 @@ def asked(url: str) -> tuple[int, str]:
 
 @pytest.fixture
 def shown() -> dict[str, Any]:
-    return Dashboard().view() | {"run": dict(RUNNING)}
+    counts = {"steps": 60, "episodes": 2, "goals": 1, "collisions": 0, "interventions": 6, "failsafes": 1}
+    named = {"totals": {HOSTILE: counts | {"mean_reward": 1.0}}, "history": {HOSTILE: [[50, 1, 1, 0, 5, 2.0]]}}
+    return Dashboard().view() | named | {"run": dict(RUNNING), "lines": [HOSTILE], "processes": {HOSTILE: "alive"}}
 
 
 @pytest.fixture
@@ -67,6 +70,9 @@ def test_the_page_links_to_the_report_which_draws_itself(
         page.open(server.url)
         page.until("document.body.dataset.drawn > 0")
         assert page.value("document.getElementById('report').hidden")
+        page.until("document.querySelectorAll('[data-history] svg').length === 4")
+        assert page.value("document.querySelectorAll('img, body script:not([src])').length") == 0, "names are text"
+        assert page.value("document.title") == "brakeline: live" and page.complaints == []
         shown["run"]["outcome"] = "finished"
         page.until("!document.getElementById('report').hidden")
         page.open(page.value("document.querySelector('#report a').href"))

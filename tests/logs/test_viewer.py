@@ -189,3 +189,18 @@ def test_the_page_of_60000_steps_has_every_episode_in_three_megabytes(analysis: 
     assert len(gallery["episodes"]) + len(gallery["rest"]) == episodes == gallery["total"]
     assert sum(len(item["at"]) for item in gallery["rest"]) < 4 * POINTS
     assert len(page) < 3_000_000
+
+
+def test_of_too_many_episodes_evenly_spread_ones_are_kept() -> None:
+    sampler = EpisodeSampler(GROUND, sketches=50)
+    source = sampler.source("actor-0")
+    for number in range(1000):
+        for k in range(2):
+            step = pb.Step(robot="ground", actor="actor-0", episode=number, step=k, state=[0.1] * 5, clearance=1.0)
+            step.truncated = k == 1
+            sampler.step(source, step)
+    sampler.close()
+    gallery = sampler.figures()
+    spread = [item["order"] for item in gallery["rest"]]
+    assert 12 < len(spread) <= 50 and gallery["total"] == 1000
+    assert spread[0] < 100 and spread[-1] > 900
