@@ -1,31 +1,39 @@
-"""Draw how the cost of a decision grows: with obstacles, with the size of a batch, and with the robots of a question.
+"""Draw how the cost of a decision grows: with obstacles, requests at once, robots of a question, periods of a plan.
 
     python -m benchmarks growth
 
-All figures are processor times of one thread, with the model sets in use and requests of the trained policy. The plot
-is `docs/figures/growth.png`.
+All figures are processor times of one thread, with requests of the trained policy. The model sets are those in use; for
+longer plans, linear ones of the same recording. The plot is `docs/figures/growth.png`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from benchmarks import situations
 from benchmarks.batch_decide import SIZES, beside, crowded, seconds
+from benchmarks.set_widths import part_of
 from benchmarks.timing import Figures
+from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.simulated_recording import data_for
+from brakeline.deploy.policy_loading import policy_named
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.model_config import AUTO
+from brakeline.safety.model.model_config import AUTO, DIRECT, ModelConfig
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from brakeline.safety.service.wire import MAX_REQUESTS
 
 PLOT = Path(__file__).parents[1] / "docs" / "figures" / "growth.png"
 ROBOTS = ("ground", "quadrotor")
 TOGETHER = (1, 2, 4, 8, 16, 32, MAX_REQUESTS)  # robots of a question
+HORIZONS = {"ground": (3, 4, 6, 8, 12, 16), "quadrotor": (8, 10, 12, 16)}
+MINUTES = 150.0  # of recorded driving
+DECISIONS = 400
 SINGLE, BATCH = "one by one", "as a batch"
 
 
@@ -41,6 +49,7 @@ def run() -> Figures:
         figures |= _rows(name, "obstacles", crowded(ready, requests))
         figures |= _rows(name, "requests", [(size, beside(ready, requests[:size])) for size in SIZES])
         figures[f"{name}, robots of a question, the service"] = _together(ready, messages)
+        figures[f"{name}, periods of a plan, {SINGLE}"] = {str(n): _of_plans(robot, n) for n in HORIZONS[name]}
     _draw(figures)
     return figures
 
@@ -69,6 +78,23 @@ def _together(ready: Filter, messages: list[pb.Request]) -> dict[str, float]:
     return row
 
 
+def _of_plans(robot: RobotWithTask, horizon: int) -> float:
+    """Return the time of a decision with plans of so many periods [µs]."""
+    other: dict[str, Any] = {"name": f"{robot.name}-{horizon}", "horizon": horizon}  # a name of its own for other plans
+    longer, data = replace(robot, **other), part_of(data_for(robot), MINUTES)
+    data = replace(data, robot=replace(data.robot, **other))
+    safety, _ = certify(data, ModelConfig(mode=DIRECT).of_minutes())
+    ready, drive = Filter(safety), situations.driven_behind(safety, policy_named("trained", robot, 0), 5, longer)
+    asked = list(situations.requests(ready, [outcome.request for _, outcome, _ in islice(drive, DECISIONS)]))
+
+    def work() -> None:
+        for request in asked:
+            ready.decide(request)
+
+    work()
+    return 1e6 * min(seconds(work, 1) for _ in range(5)) / len(asked)
+
+
 def _draw(figures: Figures) -> None:
     import matplotlib
 
@@ -79,8 +105,9 @@ def _draw(figures: Figures) -> None:
         "obstacles": "obstacles of a request",
         "requests": "requests at once",
         "robots of a question": "robots of a question",
+        "periods of a plan": "periods of a plan",
     }
-    figure, axes = plt.subplots(1, len(panels), figsize=(12.0, 3.6), constrained_layout=True)
+    figure, axes = plt.subplots(1, len(panels), figsize=(15.0, 3.6), constrained_layout=True)
     for (what, label), axis in zip(panels.items(), axes, strict=True):
         for title, row in figures.items():
             robot, about, way = title.split(", ")

@@ -19,6 +19,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.model.model_set import DIRECT, ModelConfig, ModelSet
 from brakeline.safety.service.wire import request_of
+from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.sim_conditions import Conditions
 
 STEPS = 1500
@@ -37,13 +38,20 @@ def driven(
     Yields:
         At each step: the message of the episode at its first step, else None; the outcome of the request; the step.
     """
-    ask = in_process(model(mode=mode, robot=robot))
+    chosen = policy_named(policy, robot, seed)
+    yield from driven_behind(model(mode=mode, robot=robot), chosen, seed, robot, conditions)
+
+
+def driven_behind(
+    safety: ModelSet, policy: Policy, seed: int, robot: RobotWithTask, conditions: Conditions | None = None
+) -> Iterator[tuple[pb.Episode | None, DecisionOutcome, pb.Step]]:
+    """Drive a policy behind the filter of a model set, however loose, without end; see `driven`."""
+    ask = in_process(safety, accept_bound=1.0)
     driver = EpisodeRunner(robot, environment(robot, "default", seed, conditions), ActorIdentity("actor-0", 0, seed))
-    choose = policy_named(policy, robot, seed)
     for number in count():
         episode: pb.Episode | None = driver.begin(number)
         while driver.running:
-            proposal = np.asarray(choose(driver.observation, driver.info), dtype=float)
+            proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
             outcome = driver.decide(proposal, ask)
             assert outcome is not None
             yield episode, outcome, driver.execute(proposal, outcome)
