@@ -93,20 +93,18 @@ def align(
         if any(len(time) < 2 for time, _ in series.values()):
             continue
         begin, end = max(t[0] for t, _ in series.values()), min(t[-1] for t, _ in series.values())
-        clock = next(iter(series.values()))[0]
-        clock = clock[(clock >= begin) & (clock <= end)]
-        if len(clock) < FEWEST_ROWS:
-            continue
-        for name, (time, values) in series.items():
-            if name in inputs:
-                rows[name].append(values[np.searchsorted(time, clock + 1e-9, "right") - 1])
-            else:
-                rows[name].append(np.interp(clock, time, np.unwrap(values) if name == heading else values))
-        offset = (times[-1][-1] + BETWEEN_RUNS if times else 0.0) - clock[0]
-        times.append(clock + offset)
-        at = [time[1:][np.diff(values) != 0.0] for time, values in (series[name] for name in inputs)]
-        moments = np.unique(np.concatenate([clock[:0], *at]))
-        changes.append(moments[(moments >= clock[0]) & (moments <= clock[-1])] + offset)
+        whole = next(iter(series.values()))[0]
+        for clock in _pieces(whole[(whole >= begin) & (whole <= end)]):
+            for name, (time, values) in series.items():
+                if name in inputs:
+                    rows[name].append(values[np.searchsorted(time, clock + 1e-9, "right") - 1])
+                else:
+                    rows[name].append(np.interp(clock, time, np.unwrap(values) if name == heading else values))
+            start = times[-1][-1] + BETWEEN_RUNS if times else 0.0
+            times.append(start + (clock - clock[0]))
+            at = [time[1:][np.diff(values) != 0.0] for time, values in (series[name] for name in inputs)]
+            moments = np.unique(np.concatenate([clock[:0], *at]))
+            changes.append(start + (moments[(moments >= clock[0]) & (moments <= clock[-1])] - clock[0]))
     if not times:
         raise NoSource(f"fewer than {FEWEST_ROWS} rows have values in all columns")
     columns = {name: np.concatenate(parts) for name, parts in rows.items()}
@@ -116,6 +114,16 @@ def align(
     # Messages of one moment have stamps that differ a little.
     every = every[np.diff(every, prepend=-np.inf) > 0.5 * input_step]
     return AlignedLog(np.concatenate(times), columns, positions, inputs, heading, units, input_step, every)
+
+
+def _pieces(clock: Array) -> list[Array]:
+    """Return the parts of a run's stamps that are long enough, cut where a damaged stamp is as far away as another run.
+
+    Such a stamp would make all later ones equal, because their differences are too small beside it.
+    """
+    clock = clock[np.diff(clock, prepend=-np.inf) > 0.0]
+    parts = np.split(clock, np.flatnonzero(np.diff(clock) >= BETWEEN_RUNS) + 1)
+    return [part for part in parts if len(part) >= FEWEST_ROWS]
 
 
 def joined(logs: Sequence[AlignedLog]) -> AlignedLog:

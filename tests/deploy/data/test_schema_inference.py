@@ -48,6 +48,18 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
     assert len(import_sources([log], robot).data.trajectories) > 5
 
 
+@pytest.mark.parametrize("absurd", [1e17, 1e30, 1e300])
+def test_an_absurd_stamp_costs_only_its_row(driven, absurd):
+    """It made the stamps of the next run equal: their differences were too small beside it."""
+    time, values = driven[0].copy(), driven[1]
+    half = len(time) // 2
+    time[half] = absurd
+    runs = np.repeat([0, 1], [half + 1, len(time) - half - 1])
+    given = Table("", time, dict(zip(COLUMNS, values.T, strict=True)), runs)
+    schema, whole = infer_schema([given]), infer_schema([table(*driven)])
+    assert schema.period == pytest.approx(whole.period) and schema.states == whole.states
+
+
 def test_what_is_what_is_seen_by_the_motion_whatever_the_names(driven):
     time, values = driven
     names = ("x", "y", "a", "b", "c", "d", "e")
