@@ -41,7 +41,7 @@ class DecisionView:
 
     def boxes_json(self) -> list[list[float]]:
         """Return the tube for JSON: center (d) and half-width (d) of each box."""
-        return [rounded(row) for row in np.column_stack([self.centers, self.half_widths])]
+        return [rounded(row, 3) for row in np.column_stack([self.centers, self.half_widths])]
 
     def explanation_json(self) -> Figures:
         """Return the explanation, the inputs, their arrows and the edge of the blocking half-space.

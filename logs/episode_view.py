@@ -21,7 +21,7 @@ from brakeline.safety.perception.displayed_map import reserved_boxes
 if TYPE_CHECKING:
     from brakeline.logs.episode_sampler import EpisodeRecord
 
-MOST_TUBES, FEW_TUBES = 40, 12  # tubes in one picture; in one of an ordinary episode
+MOST_TUBES, FEW_TUBES = 28, 12  # tubes in one picture; in one of an ordinary episode
 CORNERS, HITS = 48, 90  # corners of the free space's outline and scan hits in the picture of one step
 NEAR = 8  # steps before and after the closest approach for which the picture has tubes
 SKETCHED = 2  # digits after the decimal point in a sketch: cm
@@ -134,7 +134,7 @@ def _dim(robot: Robot | None) -> int:
     return 2 if robot is None else robot.position_dim
 
 
-def _path(steps: Sequence[pb.Step], robot: Robot | None, digits: int = 4) -> Figures:
+def _path(steps: Sequence[pb.Step], robot: Robot | None, digits: int = 3) -> Figures:
     """Return the coordinates of the measured positions by axis; z is None in the plane."""
 
     def axis(k: int) -> list[float]:

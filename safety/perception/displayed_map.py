@@ -25,6 +25,7 @@ from brakeline.safety.perception.scan_coverage import gaps
 Array = NDArray[np.float64]
 
 OUTLINE = 120  # corners of a drawn outline, about
+SWEPT = 4  # periods at whose end the reach of a moving obstacle is drawn on pages
 SLICE = 0.5  # m: hits this far above or below the sensor are drawn from above
 
 
@@ -50,16 +51,19 @@ class DisplayedMap:
 
         Args:
             hits: largest number of hits. In space, they are those near the sensor's height.
+
+        Of the periods of `swept`, it has the last one and at most `SWEPT` - 1 before it, evenly spread.
         """
         level = self.hits
         if level.shape[1] == 3 and len(self.free):
             level = level[np.abs(level[:, 2] - self.free[0, 2]) <= SLICE]
+        every = max(1, -(-self.swept.shape[1] // SWEPT))
         some = level[:: max(1, -(-len(level) // hits))]
         return {
             "hits": some.round(3).tolist(),
             "free": self.free.round(3).tolist(),
             "movers": self.movers.round(3).tolist(),
-            "swept": self.swept.round(3).tolist(),
+            "swept": self.swept[:, ::-1][:, ::every][:, ::-1].round(3).tolist(),
         }
 
 

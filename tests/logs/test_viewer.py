@@ -13,9 +13,10 @@ from brakeline.logs.report_page import render
 from brakeline.logs.viewer import SCRIPTS, viewer_file
 from brakeline.logs.viewer.palette import hex_color, rgb_color
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import Robot
 from tests.browser import CHROMIUM, Page
 from tests.logs.sample_log import Writer
-from tests.robots import GROUND
+from tests.robots import GROUND, QUADROTOR
 
 STAGE = "document.querySelector('#picker .stage')"
 FACT = "[...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === '{}').textContent"
@@ -164,31 +165,35 @@ def test_all_programs_have_the_colors_of_the_pages() -> None:
     assert {name: colors for name, colors in found.items() if colors} == {}
 
 
-def test_the_page_of_60000_steps_has_every_episode_in_three_megabytes(analysis: LogAnalysis) -> None:
-    sampler, writer, length, episodes = EpisodeSampler(GROUND), Writer(5), 85, 706
+@pytest.mark.parametrize(("robot", "length", "episodes"), [(GROUND, 85, 706), (QUADROTOR, 200, 300)])
+def test_the_page_of_60000_steps_has_every_episode_in_three_megabytes(
+    analysis: LogAnalysis, robot: Robot, length: int, episodes: int
+) -> None:
+    sampler, writer, dim = EpisodeSampler(robot), Writer(5), robot.position_dim
     source = sampler.source("actor-0")
-    steps = [writer._step("actor-0", 0, k, "ground", 0) for k in range(length)]
-    source.exchanges.extend(writer._exchange(step, 2) for step in steps)
-    around = [pb.Obstacle(kind="box", position=[0.123 * k, 1.234], size=[0.321, 0.234], yaw=0.5) for k in range(12)]
-    around += [pb.Obstacle(kind="wall", position=[2.5, 0.0], yaw=0.5) for _ in range(4)]
+    steps = [writer._step("actor-0", 0, k, robot.name, 0) for k in range(length)]
+    source.exchanges.extend(writer._exchange(step, dim) for step in steps)
+    box = pb.Obstacle(kind="box", position=[1.2345] * dim, size=[0.3214] * dim, yaw=0.5)
+    around = [box] * (12 if dim == 2 else 24)
+    around += [pb.Obstacle(kind="wall", position=[2.5, 0.0, 0.0][:dim], yaw=0.5) for _ in range(4)]
     for number in range(episodes):
-        about = pb.Episode(robot="ground", actor="actor-0", episode=number, arena="default", obstacles=around)
-        about.goal[:], about.start[:], about.goal_radius = [1.2345, 1.2345], [0.1234, 0.1234], 0.25
+        about = pb.Episode(robot=robot.name, actor="actor-0", episode=number, arena="default", obstacles=around)
+        about.goal[:], about.start[:], about.goal_radius = [1.2345] * dim, [0.1234] * robot.state_dim, 0.25
         source.about.append(about)
         for exchange in source.exchanges:
             exchange.request.episode = number
         for step in steps:
             new = pb.Step()
             new.CopyFrom(step)
-            new.episode = number
+            new.episode, new.clearance = number, step.clearance + 1.0 / (1 + number)  # each one nearer than before
             sampler.step(source, new)
     sampler.close()
     gallery = sampler.figures()
     [(label, (figures, pictures))] = analysis.by_label().items()
-    page = render(analysis.figures(), {label: (figures, pictures | {"galleries": {"ground": gallery}})})
+    page = render(analysis.figures(), {label: (figures, pictures | {"galleries": {robot.name: gallery}})})
     assert len(gallery["episodes"]) + len(gallery["rest"]) == episodes == gallery["total"]
     assert sum(len(item["at"]) for item in gallery["rest"]) < 4 * POINTS
-    assert len(page) < 3_000_000
+    assert len(page) < 3_000_000, f"{len(page)} bytes"
 
 
 def test_of_too_many_episodes_evenly_spread_ones_are_kept() -> None:
