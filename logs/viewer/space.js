@@ -51,11 +51,10 @@ function solid(group, shape, at, size, look, yaw = 0) {
   return mesh;
 }
 
-function line(group, points, name, { opacity = 1, loop = false, dashed = false } = {}) {
+function line(group, points, name, { opacity = 1, loop = false } = {}) {
   const geometry = new THREE.BufferGeometry().setFromPoints(points.map((p) => new THREE.Vector3(...p)));
   const look = new THREE.LineBasicMaterial({ color: paint(name), transparent: opacity < 1, opacity });
-  const Kind = dashed ? THREE.LineSegments : loop ? THREE.LineLoop : THREE.Line;
-  group.add(new Kind(geometry, look));
+  group.add(loop ? new THREE.LineLoop(geometry, look) : new THREE.Line(geometry, look));
 }
 
 /** The edges of a box. */
