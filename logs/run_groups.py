@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 METHOD_COLORS = {  # a palette for colour-blind readers
     **{"ddpc": "#0072b2", "sailr": "#e69f00", "secas": "#009e73", "none": "#d55e00"}
 }
+OTHER_COLORS = ("#56b4e9", "#cc79a7", "#5d6b7c", "#b39800")  # of groups that share their method with another
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 POINTS = 60  # steps of a curve
@@ -72,16 +73,18 @@ def compare_groups(runs: Sequence[GroupedRun]) -> Figures:
     """Return the groups of several runs, and how likely a run of one group scores better than one of another.
 
     Returns:
-        `groups`: a row for each robot kind and configuration, with its runs, seeds, scores, performance profile and
-        curves. `improvements`: for each two groups of a robot kind, the probability that a run of the first scores
+        `groups`: a row for each robot kind and configuration, with its runs, seeds, scores, performance profile, curves
+        and color. `improvements`: for each two groups of a robot kind, the probability that a run of the first scores
         better than a run of the second; ties count half. An interval is None for a group of one run.
     """
     members: defaultdict[tuple[str, tuple[tuple[str, str], ...]], list[GroupedRun]] = defaultdict(list)
-    for run in runs:
+    for run in sorted(runs, key=lambda run: run.robot):
         setup = dict(_flat(run.setup))
         members[run.robot, tuple((name, str(value)) for name, value in setup.items() if not _seed(name))].append(run)
     names = _names([dict(setup) for _, setup in members])
     groups = [_group(robot, name, group) for ((robot, _), group), name in zip(members.items(), names, strict=True)]
+    for group, color in zip(groups, _colors(groups), strict=True):
+        group["color"] = color
     pairs = itertools.combinations(groups, 2)
     return {
         "groups": groups,
@@ -123,6 +126,19 @@ def _names(setups: list[dict[str, str]]) -> list[str]:
         for name, setup in zip(names, setups, strict=True):
             name.append(f"{key} {setup.get(key)}")
     return [", ".join(name) for name in names]
+
+
+def _colors(groups: list[Figures]) -> list[str]:
+    """Return a color for each group: that of its method, unless another group of its robot kind has it already."""
+    colors: list[str] = []
+    others, taken = itertools.cycle(OTHER_COLORS), set()
+    for group in groups:
+        color = METHOD_COLORS.get(group["method"])
+        if color is None or (group["robot"], color) in taken:
+            color = next(others)
+        taken.add((group["robot"], color))
+        colors.append(color)
+    return colors
 
 
 def _group(robot: str, name: str, runs: list[GroupedRun]) -> Figures:

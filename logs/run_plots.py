@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import cycle
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.logs.episode_stats import Figures
-from brakeline.logs.run_groups import METHOD_COLORS
 from brakeline.logs.viewer.palette import hex_color
-
-OTHER_COLORS = ("#56b4e9", "#cc79a7", "#5d6b7c", "#b39800")  # of groups that share their method with another
 
 
 def _value_or_nan(name: str) -> Callable[[Figures], float]:
@@ -53,19 +49,6 @@ def draw(figures: Figures, path: Path) -> None:
     picture.savefig(path, dpi=200)
 
 
-def group_colors(groups: list[Figures]) -> list[str]:
-    """Return a color for each group: that of its method, unless another group of its robot kind has it already."""
-    colors: list[str] = []
-    others, taken = cycle(OTHER_COLORS), set()
-    for group in groups:
-        color = METHOD_COLORS.get(group["method"])
-        if color is None or (group["robot"], color) in taken:
-            color = next(others)
-        taken.add((group["robot"], color))
-        colors.append(color)
-    return colors
-
-
 def _run(training: Figures) -> Figure:
     """Draw one run. If its sets could be widened, three more rows show how; a line marks each new model set."""
     adapts = any(row["widening"] is not None for robot in training.values() for row in robot["bins"])
@@ -88,11 +71,11 @@ def _groups(groups: list[Figures]) -> Figure:
     """Draw groups of runs: mean and interval, thin where fewer than all runs of a group go on."""
     robots = list(dict.fromkeys(group["robot"] for group in groups))
     picture, grid = _panels(robots, list(OF_GROUPS.values()))
-    for group, color in zip(groups, group_colors(groups), strict=True):
+    for group in groups:
         column, curves, runs = grid[robots.index(group["robot"])], group["curves"], len(group["runs"])
         for axes, name in zip(column, OF_GROUPS, strict=True):
             if curves["step"]:
-                _curve(axes, curves, name, color, f"{group['name']}, {runs} run{'s' if runs > 1 else ''}")
+                _curve(axes, curves, name, group["color"], f"{group['name']}, {runs} run{'s' if runs > 1 else ''}")
     for column in grid:
         column[0].legend(loc="best", frameon=False, fontsize=8)
     return picture

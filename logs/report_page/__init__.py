@@ -28,8 +28,8 @@ from brakeline.logs.viewer import SCRIPTS, STYLES, viewer_file
 
 OWN_STYLES = ("report.css",)
 PAGE = "report.html.j2"
-PIECES = ("headline.html.j2", "details.html.j2")
-OWN_SCRIPTS = ("save.js", "learning.js", "charts.js", "episodes.js", "main.js")
+PIECES = ("headline.html.j2", "details.html.j2", "groups.html.j2")
+OWN_SCRIPTS = ("save.js", "groups.js", "learning.js", "charts.js", "episodes.js", "main.js")
 
 RATES = (  # name, unit, description
     ("goals", "episodes", "goals reached"),
@@ -67,6 +67,7 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         ],
         style="\n".join([*map(viewer_file, STYLES), *map(_text, OWN_STYLES)]),
         script="\n".join(['"use strict";', *map(viewer_file, SCRIPTS), *map(_text, OWN_SCRIPTS)]),
+        groups=embedded(figures.get("groups", [])),
         data=embedded([_drawing_data(label, own, pictures) for label, (own, pictures) in runs.items()]),
     )
 

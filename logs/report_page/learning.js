@@ -1,13 +1,12 @@
-// Learning curves: one curve per run, raw and smoothed values, bands over seeds.
+// Learning curves: one curve per run, raw and smoothed values, or bands over the seeds of a group.
 
 const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6b7c"]; // distinguishable with color vision deficiency
-const GRID = 60; // steps at which seeds are averaged
 
 const CURVES = [
-  { title: "goals reached", unit: "share of episodes", of: "bins", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
-  { title: "reward of an episode", unit: "without the intervention penalty", of: "bins", value: (b) => b.reward, form: figure, weight: "episodes" },
-  { title: "interventions", unit: "share of steps", of: "bins", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
-  { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, low: 0 },
+  { title: "goals reached", unit: "share of episodes", of: "bins", grouped: "goals", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
+  { title: "reward of an episode", unit: "without the intervention penalty", of: "bins", grouped: "reward", value: (b) => b.reward, form: figure, weight: "episodes" },
+  { title: "interventions", unit: "share of steps", of: "bins", grouped: "interventions", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
+  { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, most: 0 },
   { title: "windows outside their sets", unit: "share, without widening", of: "bins", value: (b) => b.beyond, form: percents, low: 0, weight: "steps" },
   { title: "widening of the sets", unit: "largest factor in a bin", of: "bins", value: (b) => b.widening, form: figure },
   { title: "half-width of a tube", unit: "cm, largest axis", of: "bins", value: (b) => b.half_width === null ? null : 100 * b.half_width, form: figure, low: 0 },
@@ -45,34 +44,13 @@ function between(points, step) {
   return a.smooth + ((b.smooth - a.smooth) * (step - a.step)) / Math.max(1e-9, b.step - a.step);
 }
 
-/** 97.5 % quantiles of Student's t distribution for 1, 2, … degrees of freedom. */
-const T95 = [12.71, 4.3, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26];
-
-/** Mean and 95 % interval over runs that differ only in their seed, up to the end of the shortest run. */
-function bandOf(curves) {
-  const end = Math.min(...curves.map((points) => points.at(-1).step)), n = curves.length;
-  const band = [];
-  for (let k = 1; k <= GRID; k++) {
-    const step = (end * k) / GRID, values = curves.map((points) => between(points, step)).filter((v) => v !== null);
-    if (values.length < n) continue;
-    const mean = values.reduce((a, b) => a + b, 0) / n;
-    const half = (T95[n - 2] ?? 1.96) * Math.sqrt(values.reduce((a, v) => a + (v - mean) ** 2, 0) / (n - 1) / n);
-    band.push({ step, mean, low: mean - half, high: mean + half });
+/** Lines of a chart: one line per run, or one with a band for each group of runs that differ only in their seed. */
+function linesOf(runs, groups, robot, what, view) {
+  if (view.bands && what.grouped) {
+    const shown = (group) => group.robot === robot && group.runs.some((name) => runs.some((run) => run.run === name));
+    return groups.filter(shown).map((group) => groupLine(group, what.grouped)).filter(Boolean);
   }
-  return band;
-}
-
-/** Lines of a chart: one line per run, or one band per configuration with several seeds. */
-function linesOf(runs, robot, what, view) {
-  const single = (run, color) => ({ run, name: run.run, color, points: pointsOf(run, robot, what, view.share) });
-  if (!view.bands) return runs.map((run) => single(run, run.color)).filter((line) => line.points.length > 1);
-  const groups = new Map();
-  for (const run of runs) groups.set(run.group, [...(groups.get(run.group) ?? []), run]);
-  return [...groups].map(([group, members]) => {
-    const lines = members.map((run) => single(run, members[0].color)).filter((line) => line.points.length > 1);
-    if (lines.length < 2) return lines[0];
-    return { name: `${group}, ${lines.length} seeds`, color: members[0].color, band: bandOf(lines.map((line) => line.points)), points: [] };
-  }).filter(Boolean);
+  return runs.map((run) => ({ run, name: run.run, color: run.color, points: pointsOf(run, robot, what, view.share) })).filter((line) => line.points.length > 1);
 }
 
 /** Draw one chart. `view`: also the steps that all charts show; `on.click(run, step)`, `on.zoom(from, to)`. */
@@ -80,9 +58,9 @@ function chart(lines, what, view, on) {
   const frame = { left: 56, right: 486, top: 30, bottom: 178 };
   const [from, to] = view.range ?? [0, Infinity], inside = (p) => p.step >= from && p.step <= to;
   const end = view.range ? to : Math.max(...lines.flatMap((line) => (line.band ?? line.points).map((p) => p.step)));
-  const values = lines.flatMap((line) => line.band ? line.band.filter(inside).flatMap((p) => [p.low, p.high]) : line.points.filter(inside).flatMap((p) => view.raw && p.raw !== null ? [p.raw, p.smooth] : [p.smooth]));
+  const values = lines.flatMap((line) => line.band ? line.band.filter(inside).flatMap((p) => [p.low ?? p.mean, p.high ?? p.mean]) : line.points.filter(inside).flatMap((p) => view.raw && p.raw !== null ? [p.raw, p.smooth] : [p.smooth]));
   if (!values.length) return null;
-  const low = what.low ?? Math.min(...values), high = what.high ?? (Math.max(...values) * (what.low === 0 ? 1.1 : 1) || 1);
+  const low = what.low ?? Math.min(what.most ?? Infinity, ...values), high = what.high ?? (Math.max(...values) * (what.low === 0 ? 1.1 : 1) || 1);
   const x = scale(from, end, frame.left, frame.right), y = scale(low, high > low ? high : low + 1, frame.bottom, frame.top);
   const spot = (px, py) => `${px.toFixed(1)},${Math.min(frame.bottom, Math.max(frame.top, py)).toFixed(1)}`;
   const parts = [label(4, 14, [what.title, ` [${what.unit}]`].join(""), { class: "title" })];
@@ -90,14 +68,18 @@ function chart(lines, what, view, on) {
   for (const line of lines) {
     const drawn = (line.band ?? line.points).filter(inside);
     if (line.band) {
-      const edge = [...drawn.map((p) => spot(x(p.step), y(p.high))), ...drawn.toReversed().map((p) => spot(x(p.step), y(p.low)))];
-      parts.push(tag("polygon", { points: edge.join(" "), fill: line.color, opacity: 0.2, class: "band" }));
+      const wide = drawn.filter((p) => p.low !== null);
+      const edge = [...wide.map((p) => spot(x(p.step), y(p.high))), ...wide.toReversed().map((p) => spot(x(p.step), y(p.low)))];
+      if (edge.length) parts.push(tag("polygon", { points: edge.join(" "), fill: line.color, opacity: 0.2, class: "band" }));
     } else if (view.raw && (what.weight || what.of === "learner")) {
       const raw = drawn.filter((p) => p.raw !== null).map((p) => tag("circle", { cx: x(p.step), cy: Math.min(frame.bottom, Math.max(frame.top, y(p.raw))), r: 1.5, fill: line.color }));
       parts.push(tag("g", { opacity: 0.35, class: "raw" }, raw));
     }
-    const path = drawn.map((p) => spot(x(p.step), y(line.band ? p.mean : p.smooth))).join(" ");
-    parts.push(tag("polyline", { points: path, fill: "none", stroke: line.color, "stroke-width": 1.8, "stroke-linejoin": "round", "data-run": line.name }));
+    const path = (points) => points.map((p) => spot(x(p.step), y(line.band ? p.mean : p.smooth))).join(" ");
+    const style = { fill: "none", stroke: line.color, "stroke-width": 1.8, "stroke-linejoin": "round" };
+    const some = line.band ? drawn.filter((p) => p.runs < line.all) : []; // where some runs of the group have ended
+    parts.push(tag("polyline", { points: path(line.band ? drawn.filter((p) => p.runs === line.all) : drawn), ...style, "data-run": line.name }));
+    if (some.length) parts.push(tag("polyline", { points: path(some), ...style, "stroke-width": 1, "stroke-dasharray": "4 3", class: "some" }));
   }
   parts.push(tag("rect", { y: frame.top, height: frame.bottom - frame.top, width: 0, class: "zooming" }), tag("line", { y1: frame.top, y2: frame.bottom, class: "cross" }));
   parts.push(label(frame.right, 208, "steps of all actors of the run", { "text-anchor": "end" }));
@@ -109,13 +91,13 @@ function chart(lines, what, view, on) {
     const step = stepAt(px);
     const said = lines.map((line) => {
       const drawn = line.band ?? line.points, p = drawn.find((p) => p.step >= step);
-      return p && `${lines.length > 1 ? `${line.name}: ` : ""}${what.form(line.band ? p.mean : p.smooth)}${line.band ? ` (${what.form(p.low)} to ${what.form(p.high)})` : ""}`;
+      return p && `${lines.length > 1 ? `${line.name}: ` : ""}${what.form(line.band ? p.mean : p.smooth)}${line.band && p.low !== null ? ` (${what.form(p.low)} to ${what.form(p.high)})` : ""}${line.band && p.runs < line.all ? `, ${p.runs} of ${line.all} runs` : ""}`;
     }).filter(Boolean);
     return said.length ? `step ${figure(step, 6)}\n${said.join("\n")}` : null;
   });
   box.cross = (step) => place(box.querySelector(".cross"), step, x, from, end);
   followPointer(box, stepAt, x, { ...on, nearest: (step, py) => nearestLine(lines, step, (p) => Math.abs(y(p) - py)) });
-  saves(box, what.title, () => lines.flatMap((line) => line.band ? line.band.map((p) => ({ run: line.name, step: p.step, mean: p.mean, low: p.low, high: p.high })) : line.points.map((p) => ({ run: line.name, ...p }))));
+  saves(box, what.title, () => lines.flatMap((line) => line.band ? line.band.map((p) => ({ group: line.name, ...p })) : line.points.map((p) => ({ run: line.name, ...p }))));
   return box;
 }
 
@@ -158,12 +140,12 @@ function followPointer(box, stepAt, x, on) {
 }
 
 /** Draw the curves with their controls. `runs` is the page's data; a click on a curve calls `open(run, robot, step)`. */
-function learning(target, controls, runs, open) {
+function learning(target, controls, runs, groups, open) {
   const robots = [...new Set(runs.flatMap((run) => Object.keys(run.training)))].sort();
-  const setups = runs.map((run) => Object.entries(run.setup).filter(([name]) => name !== "seed").map(([, value]) => value).filter(Boolean).join(", ") || "run");
-  runs.forEach((run, k) => { run.group = setups[k]; run.color = COLORS[(setups.length === new Set(setups).size ? k : [...new Set(setups)].indexOf(setups[k])) % COLORS.length]; });
-  if (runs.length > 1 && new Set(setups).size < runs.length) runs.forEach((run, k) => { run.color = COLORS[k % COLORS.length]; });
-  const view = { share: 0.02, raw: true, bands: false, shown: new Set(runs), range: null };
+  const seeds = groups.some((group) => group.runs.length > 1);
+  const own = (run) => groups.find((group) => group.runs.includes(run.run))?.color;
+  runs.forEach((run, k) => { run.color = own(run) ?? COLORS[k % COLORS.length]; });
+  const view = { share: 0.02, raw: true, bands: seeds, shown: new Set(runs), range: null };
   const cross = (step) => target.querySelectorAll("figure.chart").forEach((box) => box.cross(step));
   const zoom = (from, to) => { view.range = from === null ? null : [from, to]; draw(); };
   const whole = element("button", { id: "whole", hidden: "", onclick: () => zoom(null) }, "show all steps");
@@ -172,7 +154,7 @@ function learning(target, controls, runs, open) {
     whole.hidden = view.range === null;
     const shown = runs.filter((run) => view.shown.has(run));
     for (const robot of robots) {
-      const drawn = CURVES.map((what) => [what, linesOf(shown, robot, what, view)]).map(([what, lines]) => lines.length ? chart(lines, what, view, { cross, zoom, click: (run, step) => open(run, robot, step) }) : null).filter(Boolean);
+      const drawn = CURVES.map((what) => [what, linesOf(shown, groups, robot, what, view)]).map(([what, lines]) => lines.length ? chart(lines, what, view, { cross, zoom, click: (run, step) => open(run, robot, step) }) : null).filter(Boolean);
       if (!drawn.length) continue;
       if (robots.length > 1) target.append(element("h3", {}, robot));
       const grid = element("div", { class: "charts", "data-robot": robot });
@@ -188,8 +170,8 @@ function learning(target, controls, runs, open) {
   controls.append(smooth, element("label", {}, raw, " raw values as dots"), whole);
   target.before(element("p", { class: "small hint" }, "A click on a curve opens the episode of that step. Drag along the steps to zoom; a double click shows all steps again."));
   target.addEventListener("dblclick", () => zoom(null));
-  if (setups.length > new Set(setups).size) {
-    const bands = element("input", { type: "checkbox", id: "bands", onchange: () => { view.bands = bands.checked; draw(); } });
+  if (seeds) {
+    const bands = element("input", { type: "checkbox", id: "bands", checked: "", onchange: () => { view.bands = bands.checked; draw(); } });
     controls.append(element("label", {}, bands, " seeds as mean and 95 % interval"));
   }
   draw();

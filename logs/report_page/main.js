@@ -2,11 +2,14 @@
 // A link to an episode is `#episode-12`, also with `&step=40` or `&time=8.2` (s), `&actor=actor-0` and `&run=1`.
 
 const data = JSON.parse(document.getElementById("data").textContent);
+const groups = JSON.parse(document.getElementById("group-data").textContent);
 const pickers = new Map(); // by index of the run
 let shown = 0; // index of the run
 let remembered = 0; // timer of the address
 document.body.append(tip);
-learning(document.getElementById("learning"), document.getElementById("learning-controls"), data, (run, robot, step) => {
+if (groups.length) profiles(document.getElementById("profiles"), groups);
+document.querySelectorAll(".swatch").forEach((mark) => { mark.style.background = groups[Number(mark.dataset.color)].color; });
+learning(document.getElementById("learning"), document.getElementById("learning-controls"), data, groups, (run, robot, step) => {
   show(data.indexOf(run));
   pickers.get(shown).openAt(robot, step);
 });

@@ -1,7 +1,6 @@
 """The report in a real browser: it draws without errors or requests, with the values of `--json`."""
 
 import json
-import math
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -209,6 +208,7 @@ def test_runs_are_laid_over_each_other_and_never_joined(
         run["robots"]["ground"]["steps"] for run in runs
     ]
     lines = "[...document.querySelectorAll('[data-robot=ground] [data-chart=\"goals reached\"] polyline')]"
+    page.value("document.getElementById('bands').click()")
     assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "b", "c"]
     edges = page.value(f"{lines}.map(line => Number(line.getAttribute('points').split(' ').at(-1).split(',')[0]))")
     steps = [run["robots"]["ground"]["steps"] for run in runs]
@@ -218,26 +218,37 @@ def test_runs_are_laid_over_each_other_and_never_joined(
     page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
     assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "c"]
     page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
+    page.value("document.getElementById('bands').click()")
 
 
-def test_seeds_of_a_method_become_a_band(comparison: Page) -> None:
+def test_seeds_of_a_method_are_a_band_of_the_color_of_the_method(comparison: Page) -> None:
     page, chart = comparison, "document.querySelector('[data-robot=ground] [data-chart=\"goals reached\"]')"
+    groups = page.value("groups.filter(group => group.robot === 'ground')")
+    assert [(group["name"], group["runs"]) for group in groups] == [("ddpc", ["a", "b"]), ("none", ["c"])]
+    lines = page.value(
+        f"[...{chart}.querySelectorAll('polyline[data-run]')].map(l => [l.dataset.run, l.getAttribute('stroke')])"
+    )
+    assert lines == [["ddpc, 2 runs", groups[0]["color"]], ["none", groups[1]["color"]]]
+    assert page.value(f"{chart}.querySelectorAll('.band').length") == 1
+    assert page.value(f"{chart}.querySelectorAll('.some').length") == 1, "the shorter run does not cut the longer one"
+    page.value("document.getElementById('bands').click()")
     assert page.value(f"{chart}.querySelectorAll('.raw').length") == 3, "raw values beside smoothed ones"
     page.value("document.getElementById('raw').click()")
     assert page.value(f"{chart}.querySelectorAll('.raw').length") == 0
     page.value("document.getElementById('raw').click()")
     page.value("document.getElementById('bands').click()")
-    names = page.value(f"[...{chart}.querySelectorAll('polyline')].map(line => line.dataset.run)")
-    assert names == ["ddpc, residual, learning, default, 2 seeds", "c"]
-    assert page.value(f"{chart}.querySelectorAll('.band').length") == 1
-    low, mean, high = page.value("""(() => {
-        const curve = (at) => [{ step: 0, smooth: at }, { step: 100, smooth: at }];
-        const p = bandOf([curve(1), curve(2), curve(6)]).at(-1);
-        return [p.low, p.mean, p.high];
-    })()""")
-    assert (low, mean, high) == pytest.approx((3 - 4.3 * math.sqrt(7 / 3), 3, 3 + 4.3 * math.sqrt(7 / 3)))
-    page.value("document.getElementById('bands').click()")
     assert page.complaints == []
+
+
+def test_groups_have_their_scores_profiles_and_differences(comparison: Page) -> None:
+    page = comparison
+    rows = page.value("[...document.querySelectorAll('#group-scores tbody tr')].map(row => row.dataset.group)")
+    assert sorted(rows) == ["ddpc", "ddpc", "none", "none"], "a row for each robot kind"
+    assert page.value("[...document.querySelectorAll('#profiles polyline')].map(l => l.dataset.group)") == rows
+    assert page.value("document.querySelectorAll('#profiles figure').length") == 2
+    assert page.value("document.querySelectorAll('#improvements tbody tr').length") == 2
+    names = page.value("[...document.querySelectorAll('#differences tbody tr')].map(row => row.cells[0].textContent)")
+    assert names == ["method", "certificate"]
 
 
 def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared: tuple[Path, Any]) -> None:

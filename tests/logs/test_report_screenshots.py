@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
+from brakeline.logs.report_page import write
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import TOPICS
-from tests.browser import CHROMIUM, Page
-from tests.logs.sample_log import Writer
+from tests.browser import CHROMIUM, Page, drawn
+from tests.logs.sample_log import ABOUT, Writer, mixed
 
 FONT = "DejaVu Sans"  # the one that Debian's fontconfig comes with
 STORED = Path(__file__).parent.parent / "truth" / "pictures"
@@ -142,3 +144,25 @@ def test_the_live_page_looks_like_the_stored_screenshots(live: Page, name: str) 
     live.until(f"{frames}.length === 2 && {frames}.every(n => n > 0)")
     compare(live, "live", name, ".card .stage, .card .beside, .below .wide", ".stage canvas")
     assert live.complaints == []
+
+
+@pytest.fixture(scope="module")
+def methods(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """The report of four methods with three seeds each."""
+    folder = tmp_path_factory.mktemp("methods")
+    with pytest.MonkeyPatch.context() as patch:
+        for number, method in enumerate(("ddpc", "sailr", "secas", "none")):
+            for seed in range(3):
+                patch.setitem(ABOUT, "run", ABOUT["run"] | {"method": method, "seed": str(seed)})
+                mixed(folder / f"{method}-{seed}", 3 * number + seed, 6, later=1e4 * (3 * number + seed))
+    analysis = analyse_runs(sorted(folder.iterdir()), AnalysisOptions(pictures=True))
+    write(folder / "page.html", analysis.figures(), analysis.by_label())
+    with drawn(folder / "page.html", tmp_path_factory.mktemp("browser")) as page:
+        yield page
+
+
+@needs_font
+@pytest.mark.parametrize("name", FEW)
+def test_four_methods_with_three_seeds_look_like_the_stored_screenshots(methods: Page, name: str) -> None:
+    compare(methods, "methods", name, "#comparison, #groups, #learning-section", ".charts")
+    assert methods.complaints == []

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu, trim_mean
 
 from brakeline.logs.run_groups import GroupedRun, compare_groups, differences, interquartile_mean
-from brakeline.logs.run_plots import draw, group_colors
+from brakeline.logs.run_plots import draw
 
 SHARES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12)
 
@@ -91,7 +91,7 @@ def test_runs_that_differ_in_more_than_the_seed_are_not_pooled() -> None:
     groups = compare_groups([run("a", "ddpc", 0, 0.5), run("b", "ddpc", 1, 0.5), other])["groups"]
     assert [group["runs"] for group in groups] == [["a", "b"], ["c"]]
     assert [group["name"] for group in groups] == ["128", "256"]
-    assert len(set(group_colors(groups))) == 2
+    assert len({group["color"] for group in groups}) == 2
 
 
 def test_differences_name_each_setting_and_each_run() -> None:
