@@ -34,6 +34,11 @@ TALLER = 0.12  # of a section's height
 LAYOUTS = {f"{width}-{scheme}": (width, "screen", scheme) for width in (390, 1400) for scheme in ("light", "dark")} | {
     "print": (680, "print", "light")
 }
+# Resolves when no canvas has been drawn again for some frames of the browser.
+STILL = """new Promise(done => { let last = '', same = 0; const look = () => {
+    const frames = [...document.querySelectorAll('canvas')].map(c => c.dataset.frames).join();
+    [same, last] = [frames === last ? same + 1 : 0, frames];
+    if (same > 5) done(true); else requestAnimationFrame(look); }; look(); })"""
 FEW = ("390-dark", "1400-light", "print")
 
 
@@ -80,7 +85,8 @@ def compare(page: Page, what: str, name: str, selector: str, essential: str) -> 
     page.size(width, 900)
     page.media(medium, scheme)
     page.value(f"document.body.style.fontFamily = '{FONT}'")
-    page.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 50))))")
+    page.until(f"innerWidth === {width}")
+    page.value(STILL)
     hide = f"[...document.querySelectorAll('{essential}')].forEach(part => part.style.visibility = '{{}}')"
     try:
         now, heights = sections(page, selector)
@@ -131,17 +137,17 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         board.add(Sample(topic, entry.key, entry.payload, entry.log_time))
     folder = tmp_path_factory.mktemp("live")
     with LivePageServer(board.view) as server, Page(folder) as page:
+        page.size(1400, 2400)
         page.open(server.url)
-        page.until("document.body.dataset.drawn > 1")
+        frames = "[...document.querySelectorAll('.stage canvas')].map(c => Number(c.dataset.frames ?? 0))"
+        page.until(f"{frames}.length === 2 && {frames}.every(n => n > 0)")
+        page.value("events.close()")  # the time since the last message would go on, and move what is below it
         yield page
 
 
 @needs_font
 @pytest.mark.parametrize("name", FEW)
 def test_the_live_page_looks_like_the_stored_screenshots(live: Page, name: str) -> None:
-    live.size(LAYOUTS[name][0], 2400)
-    frames = "[...document.querySelectorAll('.stage canvas')].map(c => Number(c.dataset.frames ?? 0))"
-    live.until(f"{frames}.length === 2 && {frames}.every(n => n > 0)")
     compare(live, "live", name, ".card .stage, .card .beside, .below .wide", ".stage canvas")
     assert live.complaints == []
 

@@ -7,7 +7,10 @@ from typing import Any
 
 import pytest
 
+from brakeline.deploy.run.episode_render import COLOURS
+from brakeline.logs import foxglove_scene
 from brakeline.logs.episode_sampler import POINTS, EpisodeSampler
+from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.log_analysis import LogAnalysis
 from brakeline.logs.report_page import render
 from brakeline.logs.viewer import SCRIPTS, viewer_file
@@ -153,6 +156,9 @@ def test_one_line_crosses_all_charts_a_drag_zooms_and_a_click_opens_the_episode(
 
 def test_all_programs_have_the_colors_of_the_pages() -> None:
     assert hex_color("allowed") == "#2b6cb8" and rgb_color("allowed") == (0x2B, 0x6C, 0xB8)
+    in_foxglove = foxglove_scene.EXECUTED
+    assert [round(255 * value) for value in (in_foxglove.r, in_foxglove.g, in_foxglove.b)] == [*rgb_color("executed")]
+    assert {kind: hex_color(kind) for kind in KINDS.values()} | {"no filter": hex_color("unfiltered")} == COLOURS
     folder = Path(__file__).parents[2] / "logs"
     own = [name for name in SCRIPTS if name != "three.min.js"]
     scripts = {name: viewer_file(name) for name in own}
