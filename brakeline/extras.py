@@ -6,7 +6,7 @@ from brakeline.errors import MissingExtra
 
 # pyproject.toml lists the same packages under [project.optional-dependencies].
 EXTRAS: dict[str, tuple[str, ...]] = {
-    "sim": ("imageio_ffmpeg", "matplotlib", "mujoco"),
+    "sim": ("cma", "imageio_ffmpeg", "matplotlib", "mujoco"),
     "train": ("torch",),
     "mavlink": ("pymavlink", "pyulog"),
     "ros2": ("rosbags", "xxhash"),

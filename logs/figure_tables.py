@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from brakeline.logs.episode_stats import CONTACTS, KINDS, Figures
+from brakeline.logs.episode_stats import CONTACTS, KINDS, RUN_INTO, Figures
 from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.reader import Paths
 from brakeline.logs.stacking_table import PLAIN, StackingTable
@@ -144,7 +144,10 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
         yield "[red]steps that do not count[/]", f"{figures['refused']}: repeated, or not permitted by the learner"
     yield "episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"])
     for name in ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts"):
-        yield name.replace("_", " "), _share(figures[name], episodes, within.get(name))
+        if name == RUN_INTO:
+            yield name.replace("_", " "), _mean_number(figures[name], within.get(name))
+        else:
+            yield name.replace("_", " "), _share(figures[name], episodes, within.get(name))
     interventions = _share(figures["interventions"], steps, within.get("interventions"))
     yield "interventions", f"{interventions}, {figures['failsafes']} of them failsafe"
     yield "adjusted", _share(figures["adjusted"], steps)
@@ -309,6 +312,11 @@ def _metadata(metadata: Figures) -> Table:
 def _share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
     text = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
     return text + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
+
+
+def _mean_number(count: int, within: list[float] | None = None) -> str:
+    """Format a count of what may happen several times in an episode, with the interval of its mean number."""
+    return f"{count}" + (f", 95 %: {within[0]:.2g} to {within[1]:.2g} in an episode" if within is not None else "")
 
 
 def _optional(form: str, value: Any) -> str:

@@ -15,6 +15,7 @@ from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
 from brakeline.deploy.progress import PERCENT, WorkProgress, under_way
 from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
+from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.model.model_config import KINDS, MODES, ONE_STEP, RESIDUAL, ModelConfig
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
@@ -230,7 +231,7 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
-            *(f"{s.bound_step:.3%}", f"{s.bound_plan:.3%}", f"{s.bound_episode:.1%}", f"≤ {s.outside_hour:.0f} steps"),
+            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f} steps"),
             *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
             width(s.clearance_margin),
         )
@@ -246,8 +247,8 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
 
     lines = [
         f"{s.certificate}, {s.mode}, in words, at {CONFIDENCE:.0%} confidence, from {s.windows} held-out plans:",
-        f"  a step: at most {s.bound_step:.2%} of steps leave their predicted set ({s.step_violations} did)",
-        f"  a plan, driven to its stop: at most {s.bound_plan:.2%} of plans leave their tube ({s.violations} did)",
+        f"  a step: at most {percent(s.bound_step)} of steps leave their predicted set ({s.step_violations} did)",
+        f"  a plan, driven to its stop: at most {percent(s.bound_plan)} of plans leave their tube ({s.violations} did)",
         f"  an episode of {EPISODE} steps ({EPISODE * period:.0f} s): at most {s.outside_episode:.2g} steps outside on "
         f"average; at least one in up to {s.bound_episode:.0%} of episodes, if steps are independent",
         f"  an hour of driving ({round(HOUR / period):,} steps): at most {s.outside_hour:.3g} steps outside on average",
@@ -263,8 +264,8 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
         ]
     if s.in_place_windows:
         lines.append(
-            f"  a turn on the spot: at most {s.bound_in_place:.2%} of {s.in_place_windows} such plans leave their tube "
-            f"({s.in_place_violations} did)"
+            f"  a turn on the spot: at most {percent(s.bound_in_place)} of {s.in_place_windows} such plans leave their "
+            f"tube ({s.in_place_violations} did)"
         )
     lines += [
         "A step outside is no collision by itself, but the filter has verified nothing about where the robot then is.",
@@ -281,7 +282,7 @@ def group_table(report: ValidationReport) -> StackingTable:
         table.add_column(column, justify="right")
     for group in report.groups:
         counts = str(group.windows), str(group.plans), str(group.violations)
-        shares = f"{group.marginal:.2%}", f"{group.bound:.2%}", f"{group.excess:.0%} of its set"
+        shares = f"{group.marginal:.2%}", percent(group.bound), f"{group.excess:.0%} of its set"
         table.add_row(group.name, *counts, *shares)
     table.caption = "windows may overlap, plans do not; bounds at 99 % confidence"
     return table

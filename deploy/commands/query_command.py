@@ -33,6 +33,7 @@ SHOWN = (
     *("kind", "action", "plan", "tube_center", "tube_half_width", "margin", "at_least", "for_clearance", "reason"),
     *("verified", "bound", "model", "time_ms"),
 )
+NOTHING = 1e-9  # an input that is smaller counts as zero
 OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
 
 
@@ -103,7 +104,8 @@ def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:
 def quantity(name: str, value: float) -> str:
     """Return an input as text: `speed 0.25 m/s` for the name `speed [m/s]`."""
     word, _, unit = name.partition(" [")
-    return f"{word} {value:.4g} {unit.removesuffix(']')}".rstrip()
+    shown = value if abs(value) > NOTHING else 0.0
+    return f"{word} {shown:.4g} {unit.removesuffix(']')}".rstrip()
 
 
 def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:

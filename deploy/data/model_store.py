@@ -18,6 +18,7 @@ from brakeline.deploy.data.data_paths import method_path, model_path, record_pat
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
+from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.methods import METHODS, Model
 from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT
@@ -119,8 +120,8 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
         model, report = certify(data, model_config)
     console.print(
         f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "
-        f"{report.violations} of {report.windows} held-out plans left their sets; at most {report.bound_plan:.2%} of "
-        f"plans and {report.bound_step:.2%} of steps leave them (99 % confidence)"
+        f"{report.violations} of {report.windows} held-out plans left their sets; at most "
+        f"{percent(report.bound_plan)} of plans and {percent(report.bound_step)} of steps leave them (99 % confidence)"
     )
     model.save(path)
     return model

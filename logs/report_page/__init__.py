@@ -25,6 +25,7 @@ from brakeline.logs.json_values import finite
 from brakeline.logs.log_analysis import SETUP
 from brakeline.logs.tube_stats import stated
 from brakeline.logs.viewer import SCRIPTS, STYLES, viewer_file
+from brakeline.messaging import stated_share
 
 OWN_STYLES = ("report.css",)
 PAGE = "report.html.j2"
@@ -49,7 +50,7 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         loader=FunctionLoader(_text), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(number=number, percent=percent, moment=moment, pretty=pretty, raw=raw, hashed=hashed)
-    environment.filters.update(within=within, stated=stated)
+    environment.filters.update(within=within, stated=stated, bound=stated_share.percent)
     return environment.get_template(PAGE).render(
         f=figures,
         several=len(runs) > 1,

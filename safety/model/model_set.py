@@ -17,6 +17,7 @@ from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import FORMER_LAYOUTS, REAL_TIME_SUFFIX, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.stated_share import percent
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout
 from brakeline.safety.model.error_bounds import ErrorBound
@@ -250,7 +251,7 @@ class ModelSet:
             BadModel: the file holds no model set, or no shipped robot has that name. The message names the source.
 
         >>> ModelSet.load("ground")
-        ModelSet('ground', residual, direct, version '65e60d68390b', at most 0.42% of plans outside)
+        ModelSet('ground', residual, direct, version '65e60d68390b', at most 0.43 % of plans outside)
         """
         path = Path(source)
         if isinstance(source, str) and not path.suffix and not path.exists():
@@ -270,7 +271,7 @@ class ModelSet:
     def __repr__(self) -> str:
         """Return one line that tells model sets apart; arrays are left out."""
         try:
-            stated = f"at most {float(self.about['bound_plan']):.2%} of plans outside"
+            stated = f"at most {percent(float(self.about['bound_plan']))} of plans outside"
         except (KeyError, ValueError):
             stated = "no bound stated"
         kind = f"{self.model_config.certificate}, {self.model_config.mode}"

@@ -27,6 +27,7 @@ from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
+from brakeline.messaging.stated_share import percent
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
 from brakeline.safety.model.validation import ValidationReport
@@ -247,8 +248,8 @@ def test_certify_states_each_error_bound_in_json_in_words_and_with_its_condition
     assert status == 0 and "{" not in page and "certifying residual, direct: 0 of 1" in err
     for text in (
         f"residual, direct, in words, at 99% confidence, from {s['windows']} held-out plans",
-        f"at most {s['bound_step']:.2%} of steps leave their predicted set ({s['step_violations']} did)",
-        f"at most {s['bound_plan']:.2%} of plans leave their tube ({s['violations']} did)",
+        f"at most {percent(s['bound_step'])} of steps leave their predicted set ({s['step_violations']} did)",
+        f"at most {percent(s['bound_plan'])} of plans leave their tube ({s['violations']} did)",
         f"an episode of 300 steps (60 s): at most {300 * s['bound_step']:.2g} steps outside on average",
         f"at least one in up to {s['bound_episode']:.0%} of episodes, if steps are independent",
         f"an hour of driving (18,000 steps): at most {s['outside_hour']:.3g} steps outside on average",
@@ -315,9 +316,9 @@ def test_the_validation_table_is_complete_at_any_width(columns):
         "certificate",
         "matrix-zonotope",
         "≤ per plan",
-        "2.000%",
+        "2 %",
         "≤ per episode",
-        "95.1%",
+        "96 %",
         "≤ 180 steps",
         "1.5 m",
     ):

@@ -78,9 +78,9 @@ def test_it_says_in_words_how_sure_a_model_set_is(analysis: LogAnalysis) -> None
     assert f"{steps} {number(0.003 * figures['steps'])} steps outside on average." in before
     whole = said(bound_plan="0.02", windows="300", bound_episode="0.594", outside_hour="54")
     assert "from 300 held-out plans, that" in whole
-    assert "and at most 2.0 % of the plans their tube, driven to the stop." in whole
+    assert "and at most 2 % of the plans their tube, driven to the stop." in whole
     assert "over an hour of driving to 54, over an episode of 300 steps to at least one with a probability of" in whole
-    assert "up to 59.4 %, if steps are independent." in whole
+    assert "up to 60 %, if steps are independent." in whole
 
 
 def test_it_needs_no_network_and_no_other_file(report: tuple[Path, dict[str, Any]]) -> None:
