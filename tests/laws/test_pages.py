@@ -42,7 +42,10 @@ def missing_files(table: str) -> list[str]:
             if not FILE.fullmatch(code) or code.isupper() or any(word.isupper() for word in re.split(r"[/._]", code)):
                 continue  # a name that stands for a name: `policies/ROBOT/NAME.safetensors`
             if (ROOT / code).exists() or (folder / code).exists() or (ROOT / "brakeline" / code).exists():
-                folder = ROOT / code if (ROOT / code).is_dir() else folder
+                inside = (
+                    folder != ROOT and (folder / code).exists()
+                )  # a row of `deploy/` means its own `data/`, not one of a checkout
+                folder = ROOT / code if (ROOT / code).is_dir() and not inside else folder
             else:
                 missing.append(code)
     return missing
