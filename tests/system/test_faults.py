@@ -145,7 +145,7 @@ def _is_asked(there: tuple[object, ...], folder: Path) -> None:
     assert shown["processes"]["safety-0"]["model ground"] and shown["learners"]["ground"]["steps"] > 0
     near = ("query", "ground", *there, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
     answer = json.loads(brakeline(*near, "--json").stdout)
-    assert answer.keys() >= {"decision", "plan", "tube", "margin", "time_ms", "model"}
+    assert answer.keys() >= {"kind", "action", "plan", "tube_center", "margin", "time_ms", "model"}
     assert answer["kind"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
     assert len(answer["plan"]) == len(answer["tube_center"]) == len(answer["tube_half_width"]) == GROUND.horizon
     assert answer["kind"] in brakeline(*near).stdout
@@ -154,7 +154,7 @@ def _is_asked(there: tuple[object, ...], folder: Path) -> None:
         (folder / "scan.json").write_text(json.dumps(scan))
         query = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
         assert json.loads(query.stdout)["kind"] in said
-    wrong = brakeline("query", "ground", *there, "--state", 1, 2)
+    wrong = brakeline("query", "ground", *there, "--known-free", "--state", 1, 2)
     assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
 
 
