@@ -25,7 +25,7 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BrakelineError
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.dataset import RESTLESS, Dataset
 from brakeline.safety.model.model_config import KINDS, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 
@@ -56,15 +56,19 @@ def run() -> Figures:
 
 
 def part_of(data: Dataset, minutes: float) -> Dataset:
-    """Return whole trajectories that last so long together, in a fixed random order; all of them if they are fewer."""
-    data = data.steady()
+    """Return whole trajectories that last so long together, in a fixed random order; all of them if they are fewer.
+
+    Restless ones are among them. They come last, as in the recording, and only mode one-step is fitted to them.
+    """
     order, periods = np.random.default_rng(SEED).permutation(len(data.trajectories)), 60.0 * minutes / data.robot.period
     taken: list[int] = []
     for i in order.tolist():
         if sum(len(data.trajectories[k].inputs) for k in taken) >= periods:
             break
         taken.append(i)
-    return replace(data, trajectories=tuple(data.trajectories[i] for i in sorted(taken)))
+    steady = len(data.steady().trajectories)
+    about = data.about | {RESTLESS: str(sum(i >= steady for i in taken))}
+    return replace(data, trajectories=tuple(data.trajectories[i] for i in sorted(taken)), about=about)
 
 
 def _row(robot: RobotWithTask, data: Dataset, config: ModelConfig) -> dict[str, float]:

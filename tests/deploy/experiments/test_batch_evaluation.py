@@ -12,7 +12,7 @@ from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 
 GROUND = robot_with_task("ground")
-TRAINED = Evaluation(policy="trained", arena="dense", episodes=24, model_config=ModelConfig(mode="direct"))
+TRAINED = Evaluation(policy="trained", arena="dense", episodes=12, model_config=ModelConfig(mode="direct"))
 COUNTED = ("episodes", "goals", "collisions", "timeouts")
 
 
@@ -37,7 +37,7 @@ def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeyp
         ended: list[EpisodeStats] = []
         (part,) = parts_of(GROUND, replace(TRAINED, method="none", backend="batch"))
         driven = part.drive(ended.append)
-        assert len(ended) == 24 and len(driven.stats) == 24 // turns
+        assert len(ended) == 12 and len(driven.stats) == 12 // turns
         found.append(sorted(value for stats in driven.stats.values() for value in stats.returns))
     assert found[1] == pytest.approx(found[0], abs=1.0)
 
