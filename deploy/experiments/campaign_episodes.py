@@ -20,7 +20,7 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_batch
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process
-from brakeline.deploy.experiments.trials import COLUMNS, Column, EpisodeTable, TrialLog
+from brakeline.deploy.experiments.trials import COLUMNS, Column, EpisodeTable, TrialLog, take_step
 from brakeline.deploy.policy_loading import network_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch
@@ -96,12 +96,7 @@ class CampaignDriver:
         if log is not None:
             log.put(EPISODE, message)
         while runner.running:
-            time = float(runner.info["time"])
-            proposal = np.asarray(policy(runner.observation, runner.info), dtype=float)
-            outcome = runner.decide(proposal, self.ask)
-            if log is not None and outcome is not None:
-                log.put_exchange(outcome.exchange(time))
-            step = runner.execute(proposal, outcome)
+            step = take_step(runner, policy, self.ask, requests=log)
             if log is not None:
                 log.put_step(step)
             yield step

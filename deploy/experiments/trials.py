@@ -156,8 +156,13 @@ class EpisodeTable:
         return {"mean": mean, "std": max(self.squares / max(self.decisions, 1) - mean * mean, 0.0) ** 0.5}
 
 
-def take_step(driver: EpisodeRunner, policy: Policy, question: Ask | None, version: int = 0) -> pb.Step:
+def take_step(
+    driver: EpisodeRunner, policy: Policy, question: Ask | None, version: int = 0, requests: TrialLog | None = None
+) -> pb.Step:
     """Take one step: propose an action, request a decision, execute it.
+
+    Args:
+        requests: log that gets the request with its reply.
 
     Raises:
         RuntimeError: there is no decision. In one process this is a defect, never the network.
@@ -168,6 +173,8 @@ def take_step(driver: EpisodeRunner, policy: Policy, question: Ask | None, versi
     outcome = driver.decide(proposal, question)
     if outcome is not None and outcome.answer is None:
         raise RuntimeError(f"no decision: {outcome.failure}")
+    if requests is not None and outcome is not None:
+        requests.put_exchange(outcome.exchange(float(driver.info["time"])))
     step = driver.execute(proposal, outcome, version)
     step.propose_ms = spent_ms
     return step

@@ -19,6 +19,7 @@ from brakeline.deploy.experiments.campaign_episodes import ROWS, CampaignDriver,
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
 from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog
 from brakeline.deploy.vehicle_factory import environment
+from brakeline.errors import NoArena
 from brakeline.messaging.obstacle import WALL, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
@@ -32,6 +33,7 @@ MOVED = 6  # obstacles that a candidate moves
 PIECES = 10  # of the proposed inputs
 PERIODS = 60  # of an episode
 AN_ARENA = 300  # episodes that are spent on one drawn arena
+MOST_ARENAS = 10  # without a single episode that counts
 SPREAD = 0.5  # first standard deviation of a candidate's numbers, which are used within -1 and 1
 FAR = 4.0  # footprints, by which an obstacle is moved at most
 TOUCHED = 1.0  # m, by which a candidate with a contact is better than any without one
@@ -82,8 +84,11 @@ def search(
         path: of the log.
 
     Returns:
-        `episodes`, `collisions`, `steps`, `closest` [m] (the least distance without the start's), `number` and `values`
-        of the worst candidate, `history` (the least distance after each episode), and the log's path.
+        `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, `history` (the
+        distance of the worst candidate so far, after each episode), and the log's path.
+
+    Raises:
+        NoArena: in no drawn arena does a candidate begin with room around the robot.
     """
     import cma
 
@@ -116,6 +121,8 @@ def search(
             )
             say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
         number += 1
+        if not found.episodes and number == MOST_ARENAS:
+            raise NoArena(f"every candidate in {number} arenas {what.arena!r} began too near to something")
     worst = found.worst
     if worst is not None:
         with driver.log(path, episode=str(worst.number), policy="worst-case search") as log:
