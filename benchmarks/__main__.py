@@ -58,9 +58,9 @@ class Bench:
     json: bool = False
     """Print one JSON object on stdout."""
     seed: int = 0
-    """Draw the faults of chaos, campaign and cuts, and the messages of fuzz, from this seed."""
+    """Draw the faults of chaos, fault-campaign and cuts, and the messages of fuzz, from this seed."""
     kills: int = 100
-    """Cause this many faults in chaos and campaign."""
+    """Cause this many faults in chaos and fault-campaign."""
     faults: int = 60
     """Cause this many faults in cuts."""
     delay: float = 0.0
@@ -78,7 +78,7 @@ class Bench:
     against: Path | None = None
     """Run step with the code of this checkout, too, at the same time."""
     folder: Path = Path("runs/flights")
-    """Store the data, logs and figures of flights, upsets, cuts and campaign here. What the folder has is not
+    """Store the data, logs and figures of flights, upsets, cuts and fault-campaign here. What the folder has is not
     repeated."""
 
 
@@ -124,7 +124,9 @@ BENCHMARKS = {
     "limit": Benchmark(service_limit, lambda _: service_limit.run()),
     "growth": Benchmark(growth, lambda _: growth.run(), named=True),
     "step": Benchmark(step_cost, lambda given: step_cost.run(given.against), named=True),
-    "campaign": Benchmark(campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True),
+    "fault-campaign": Benchmark(
+        campaign, lambda given: campaign.campaign(given.kills, given.seed, given.folder), named=True
+    ),
     "chaos": Benchmark(chaos, lambda given: chaos.chaos(given.kills, given.seed, given.delay), named=True),
 }
 

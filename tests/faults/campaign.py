@@ -1,6 +1,6 @@
 """A run over five hosts with faults of six kinds, several at a time: kills, stops, full disks, clock jumps and more.
 
-python -m benchmarks campaign [--kills 1000] [--seed 0] [--folder runs/campaign]
+python -m benchmarks fault-campaign [--kills 1000] [--seed 0] [--folder runs/fault-campaign]
 
 The other kinds are lost links and damaged files. The campaign has legs of 100 faults, each with a run of its own. A leg
 draws one to twelve faults at a time; the next ones come when every process is back and both robots go on. Each leg adds

@@ -88,7 +88,7 @@ def test_hosts_are_cut_off_killed_and_left_and_the_run_ends_with_every_step_coun
 
 @pytest.mark.long
 def test_a_slice_of_the_campaign_of_random_faults(tmp_path, monkeypatch):
-    """The whole is `python -m benchmarks campaign`."""
+    """The whole is `python -m benchmarks fault-campaign`."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     for name in ROBOTS:
         ModelSet.load(name).save(model_path(robot_named(name), ModelConfig()))
