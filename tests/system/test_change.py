@@ -7,6 +7,8 @@ import json
 import shutil
 import signal
 
+from scipy.stats import binomtest
+
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.accepting import WORDS
@@ -18,8 +20,14 @@ ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however 
 
 
 def share(steps):
-    compared = [step for step in steps if step.compared]
-    return sum(not step.contained for step in compared) / len(compared)
+    violations, compared = counted(steps)
+    return violations / compared
+
+
+def counted(steps):
+    """The violations, and the steps that were compared with their sets."""
+    contained = [step.contained for step in steps if step.compared]
+    return len(contained) - sum(contained), len(contained)
 
 
 def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_folder, tmp_path):
@@ -49,7 +57,9 @@ def test_a_payload_is_noticed_and_a_new_model_set_takes_over_in_mid_run(data_fol
     assert len(anew) > 400
     assert share(recorded) <= 0.01
     assert share(loaded) > 0.05, "the old model set does not know the payload"
-    assert share(anew) <= published["bound_step"] < share(loaded), "the new one does, and states how well"
+    assert published["bound_step"] < share(loaded), "the new one does"
+    # The bound holds for the share, not for what is counted in a few hundred steps.
+    assert binomtest(*counted(anew), published["bound_step"], "greater").pvalue > 1e-3, "and states how well"
 
 
 def beyond(exchanges):
