@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from time import process_time
@@ -32,10 +32,10 @@ from scipy.special import betaincinv
 
 from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, Models, ModelTubes, Noise
 from benchmarks.timing import Words
-from benchmarks.unicycle_barrier import Tuning, UnicycleBarrier
 from brakeline.deploy.data import collect
 from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.importer import import_sources
+from brakeline.deploy.data.rival_pretraining import BarrierConfig
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.stated_share import CONFIDENCE
@@ -45,11 +45,13 @@ from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.methods import Method
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import MATRIX_ZONOTOPE
-from brakeline.safety.model.model_config import DIRECT, FREE, ONE_STEP, PLAN, RECURSION, ModelConfig
+from brakeline.safety.model.model_config import CBF, DIRECT, FREE, ONE_STEP, PLAN, RECURSION, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.one_step import features_for
 from brakeline.safety.model.one_step_fitting import choose, samples_of
 from brakeline.safety.model.windows import displacement, non_overlapping, plan_regressor_map, windows
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
 from brakeline.sim.sim_conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -63,7 +65,7 @@ CHUNK = 64  # windows at once: an exact matrix zonotope has thousands of rows
 TIMED_S = 0.2  # processor time of the tubes that are timed
 EPISODES = 200  # of the adversary; the planner drives half as many
 TUNING_EPISODES = 20
-TUNINGS = [Tuning(*values) for values in product((0.02, 0.05), (1.0, 2.0, 4.0), (0.0,))]
+TUNINGS = [BarrierConfig(*values) for values in product((0.02, 0.05), (1.0, 2.0, 4.0), (0.0,))]
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,7 @@ def run() -> Words:
             figures[f"{recording.name}: {name}"] = peer(recording, fit)
     tuning = tuned()
     for name in ("diff", "skid"):  # the skid steer has the same inputs, but is late and slips
-        barrier = UnicycleBarrier(robot_named(str(OWN_LOG / f"{name}.toml")), tuning)
+        barrier = barrier_for(robot_named(str(OWN_LOG / f"{name}.toml")), tuning)
         figures[f"{name}: CBF-QP, unicycle, {tuning}"] = decisions(name, barrier, EPISODES, SEED)
     return figures
 
@@ -281,10 +283,15 @@ def decisions(name: str, method: Method, episodes: int, seed: int) -> dict[str, 
     }
 
 
-def tuned() -> Tuning:
+def barrier_for(robot: Robot, tuning: BarrierConfig) -> UnicycleBarrier:
+    """Return the control barrier function of a robot without a task."""
+    return UnicycleBarrier(Pretrained(robot, CBF, {}, asdict(tuning)))
+
+
+def tuned() -> BarrierConfig:
     """Return the settings with the fewest collisions, most goals and nearest approach, in episodes of other seeds."""
     robot, found = robot_named(str(OWN_LOG / "diff.toml")), {}
     for tuning in TUNINGS:
-        had = decisions("diff", UnicycleBarrier(robot, tuning), TUNING_EPISODES, SEED + 5000)
+        had = decisions("diff", barrier_for(robot, tuning), TUNING_EPISODES, SEED + 5000)
         found[tuning] = had["collisions"], -int(str(had["goals"]).split()[0]), float(had["nearest cm"])
     return min(found, key=found.__getitem__)

@@ -13,7 +13,8 @@ from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.plan_batch import BatchOutcome
-from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.batch.row_by_row import BatchMethod
+from brakeline.safety.filter.request import FAILSAFE
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.wire import KIND_NUMBERS
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
@@ -38,7 +39,7 @@ class BatchRobots:
         self,
         robot: RobotWithTask,
         names: Sequence[str],
-        safety: Filter | None,
+        safety: BatchMethod | None,
         next_episode: NextEpisode,
         *,
         arena: str = "default",
@@ -46,6 +47,7 @@ class BatchRobots:
         penalty: float = 0.0,
         accept_bound: float | None = None,
         conditions: Conditions | None = None,
+        ends_on_intervention: bool = False,
     ) -> None:
         """Begin the first episode of every robot.
 
@@ -54,6 +56,7 @@ class BatchRobots:
             next_episode: gives number and seed of the episode that a robot begins.
             seed_key, arena, conditions: see `BatchNavigationEnv`.
             penalty, accept_bound: see `BatchSafetyWrapper`.
+            ends_on_intervention: see `EpisodeRunner`.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -61,6 +64,7 @@ class BatchRobots:
         """
         size = len(names)
         self.names, self._robot, self._next_episode = list(names), robot, next_episode
+        self._ends_on_intervention = ends_on_intervention
         self._episodes = np.zeros(size, dtype=np.int64)
         self.steps, self._index = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._env = BatchNavigationEnv(
@@ -92,7 +96,12 @@ class BatchRobots:
         end_step = self._env.end_step if self._filtered is None else self._filtered.end_step
         self.observations, rewards, terminated, truncated, infos = end_step()
         after, size = infos.get("final_info", infos), len(self.names)
-        penalty = infos.get("penalty", np.zeros(size))
+        penalty, cut = infos.get("penalty", np.zeros(size)), np.zeros(size, dtype=bool)
+        rewards = rewards + penalty
+        if self._ends_on_intervention and self._outcome is not None and self._outcome.answers is not None:
+            cut = self._outcome.decided & (self._outcome.answers.kind == KINDS.index(FAILSAFE))
+            penalty = np.where(cut, np.maximum(rewards - self._robot.task.reward.cut, 0.0), 0.0)
+        ended = terminated | truncated
         columns: dict[str, Any] = {
             "episode": episodes,
             "step": steps,
@@ -101,10 +110,11 @@ class BatchRobots:
             "proposed": np.where(self._decided() | np.isfinite(self._proposals), self._proposals, self._inputs),
             "action": self._inputs,
             "next_observation": infos.get("final_obs", self.observations),
-            "reward": rewards + penalty,
+            "reward": rewards,
             "penalty": penalty,
             "terminated": terminated,
-            "truncated": truncated,
+            "truncated": truncated | (cut & ~ended),
+            "cut": cut,
             "goal": after["at_goal"],
             "state": after["state"],
             "true_state": after["true_state"],
@@ -114,10 +124,11 @@ class BatchRobots:
             **({} if self._outcome is None else _decisions(self._outcome)),
         }
         messages = list(self._messages(columns, after["time"], weights_version))
-        ended = np.flatnonzero(terminated | truncated)
         self.steps, self._index, self._infos = self.steps + 1, index, infos
-        self.steps[ended] = 0
-        return messages, ended.tolist()
+        if self._filtered is not None and (cut & ~ended).any():
+            self.observations, self._infos = self._filtered.reset(options={"reset_mask": cut & ~ended})
+        self.steps[ended | cut] = 0
+        return messages, np.flatnonzero(ended | cut).tolist()
 
     def episode_message(self, number: int) -> pb.Episode:
         """Describe the episode in which a robot is now."""

@@ -104,11 +104,13 @@ class LidarLayout:
 
 @dataclass(frozen=True)
 class Rivals:
-    """Settings of SECAS and SAILR that differ from the defaults, and the margins [m] that SECAS's tuning tries."""
+    """Settings of the rivals that differ from the defaults, and the margins [m] that SECAS's tuning tries."""
 
     __pydantic_config__ = _STRICT
     secas: dict[str, float] = field(default_factory=dict)
     sailr: dict[str, float] = field(default_factory=dict)
+    cbf: dict[str, float] = field(default_factory=dict)
+    psf: dict[str, float] = field(default_factory=dict)
     margins: tuple[float, ...] = ()
 
 

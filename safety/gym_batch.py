@@ -13,7 +13,7 @@ from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
 
 if TYPE_CHECKING:
-    from brakeline.safety.filter.filter import Filter
+    from brakeline.safety.filter.batch.row_by_row import BatchMethod
 
 Array = NDArray[np.float64]
 StepBatch = tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -30,9 +30,13 @@ class BatchSafetyWrapper(VectorWrapper):
     """
 
     def __init__(
-        self, env: VectorEnv[Any, Any, Any], filter: Filter, penalty: float = 0.0, accept_bound: float | None = None
+        self,
+        env: VectorEnv[Any, Any, Any],
+        filter: BatchMethod,
+        penalty: float = 0.0,
+        accept_bound: float | None = None,
     ) -> None:
-        """Wrap an environment; see `SafetyWrapper` for the arguments.
+        """Wrap an environment; see `SafetyWrapper` for the arguments. `RowByRow` makes a filter of a rival.
 
         Raises:
             TooLoose: the validation report states a larger probability than accepted, or there is no report.
@@ -41,17 +45,18 @@ class BatchSafetyWrapper(VectorWrapper):
         from brakeline.safety.model.stated_bound import check_bound
 
         super().__init__(env)
-        check_bound(filter.model, filter.robot, accept_bound)
+        check_bound(getattr(filter, "model", None), filter.robot, accept_bound)
         self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs), penalty
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._infos: dict[str, Any] | None = None
+        self._observations: Any = None
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._deciding: tuple[Array, Array, BatchOutcome] | None = None
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        observations, self._infos = self.env.reset(seed=seed, options=options)
+        self._observations, self._infos = self.env.reset(seed=seed, options=options)
         self.plans.reset(np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool))
-        return observations, self._infos
+        return self._observations, self._infos
 
     def step(self, actions: Any) -> StepBatch:
         self.begin_step(actions)
@@ -62,7 +67,8 @@ class BatchSafetyWrapper(VectorWrapper):
         if self._infos is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         proposed, before = np.asarray(actions, dtype=float), self.plans.input_in_force
-        outcome = self.plans.decide(self._infos["state"], proposed, ObstacleArrays(**self._infos["obstacles"]))
+        obstacles = ObstacleArrays(**self._infos["obstacles"])
+        outcome = self.plans.decide(self._infos["state"], proposed, obstacles, self._observations)
         self.env.unwrapped.begin_step(outcome.inputs)  # type: ignore[attr-defined]
         self._deciding = proposed, before, outcome
         return outcome
@@ -84,5 +90,5 @@ class BatchSafetyWrapper(VectorWrapper):
         resets, self._ended = self._ended, terminated | truncated
         if self._mode != AutoresetMode.DISABLED:
             self.plans.reset(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
-        self._infos = infos
+        self._infos, self._observations = infos, observations
         return observations, rewards - penalty, terminated, truncated, infos

@@ -1,7 +1,7 @@
 """THE table of the methods that a safety service can serve: the filter and its rivals, behind one interface.
 
-A robot without a filter (method `none`) uses no service. The filter and SECAS are imported when a model is made ready:
-with them come compiled kernels and a solver, which take a second to load. Who only reads a model needs neither.
+A robot without a filter (method `none`) uses no service. The filter and most rivals are imported when a model is made
+ready: with them come compiled kernels and a solver, which take a second to load. Who only reads a model needs neither.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Protocol
 from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.request import Decision, Request
-from brakeline.safety.model.model_config import DDPC, SAILR, SECAS
+from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.tensor_file import has_entry
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
@@ -48,7 +48,19 @@ def _secas(model: Pretrained) -> Method:
     return Secas(model)
 
 
-RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: _secas, SAILR: Sailr}
+def _barrier(model: Pretrained) -> Method:
+    from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
+
+    return UnicycleBarrier(model)
+
+
+def _predictive(model: Pretrained) -> Method:
+    from brakeline.safety.rivals.predictive_filter import PredictiveFilter
+
+    return PredictiveFilter(model)
+
+
+RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: _secas, SAILR: Sailr, CBF: _barrier, PSF: _predictive}
 METHODS = (DDPC, *RIVALS)
 
 

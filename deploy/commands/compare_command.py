@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.markdown import Markdown
@@ -20,7 +20,9 @@ from brakeline.deploy.experiments.comparison_cells import (
     RUNS,
     SEEDS,
     CellConfig,
+    backend_for,
     cell_configs,
+    learning,
     quick,
 )
 from brakeline.deploy.experiments.experiment_jobs import Job, complete
@@ -46,6 +48,9 @@ class CompareCommand:
     """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas."""
     methods: tuple[str, ...] = METHODS
     """Compare these methods."""
+    backend: Literal["single", "batch"] | None = None
+    """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
+    the arenas allow it."""
     quick: bool = False
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
@@ -98,7 +103,9 @@ class CompareCommand:
         jobs: list[Job] = []
         for cell in cell_configs(robot, seeds):
             if cell.method in self.methods:
-                own = replace(cell, penalty=self.penalty, td3=self.td3, arenas=self.arenas)
+                backend = self.backend or backend_for(robot, self.arenas)
+                own = replace(cell, penalty=self.penalty, arenas=self.arenas, backend=backend)
+                own = replace(own, td3=learning(self.td3, backend))
                 jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))

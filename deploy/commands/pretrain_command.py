@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class PretrainCommand:
     """The options of `brakeline pretrain`."""
 
-    method: Annotated[Literal["secas", "sailr"], tyro.conf.Positional]
-    """Pre-train this rival method."""
+    method: Annotated[Literal["secas", "sailr", "cbf", "psf"], tyro.conf.Positional]
+    """Pre-train this rival method, or choose the settings of one that knows its model by hand."""
     robot: Robot = "ground"
     samples: int | None = None
     """Drive this many steps. Defaults to the number that the comparison uses."""
@@ -45,6 +45,10 @@ class PretrainCommand:
         robot = robot_with_task(self.robot)
         config = config_for(self.method, robot)
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
+        if changed and not hasattr(config, "samples"):
+            raise ValueError(
+                f"{self.method} knows its model by hand and drives nothing: leave out --samples and --seed"
+            )
         model = pretrained(robot, self.method, replace(config, **changed), again=not self.tune)
         if self.tune:
             return self._tune(model, robot)

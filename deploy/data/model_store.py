@@ -185,7 +185,7 @@ def _load_rival(path: Path, config: RivalConfig) -> Pretrained:
 def _pretrain(path: Path, robot: RobotWithTask, method: str, config: RivalConfig) -> Pretrained:
     from brakeline.deploy.data.rival_pretraining import pretrain
 
-    with under_way(f"pre-training {method} for {robot.name}", config.samples) as advance:
+    with under_way(f"pre-training {method} for {robot.name}", getattr(config, "samples", 0)) as advance:
         model = pretrain(robot, config, advance)
     model.save(path)
     about = model.about

@@ -1,10 +1,13 @@
-"""Pre-train the networks that a rival needs before it can filter, and record the cost (`brakeline pretrain`)."""
+"""Make the model that a rival needs before it can filter, and record the cost (`brakeline pretrain`).
+
+SECAS and SAILR train networks. The others know a unicycle by hand, and drive nothing.
+"""
 
 from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -12,13 +15,32 @@ from brakeline.deploy.data.rival_rollouts import Each, SailrConfig, SecasConfig,
 from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.model.model_config import CBF, PSF, SAILR, SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.sailr import SAILR
-from brakeline.safety.rivals.secas import SECAS
 
-RivalConfig = SecasConfig | SailrConfig
+
+@dataclass(frozen=True)
+class BarrierConfig:
+    """Configuration of the control barrier function (safety/rivals/unicycle_barrier.py)."""
+
+    ahead: float = 0.05  # m
+    rate: float = 2.0  # 1/s, tuned
+    margin: float = 0.0  # m
+
+
+@dataclass(frozen=True)
+class PredictiveConfig:
+    """Configuration of the predictive safety filter (safety/rivals/predictive_filter.py)."""
+
+    lag: float = 0.05  # s, the time constant of the speeds
+    margin: float = 0.02  # m, tuned
+
+
+RivalConfig = SecasConfig | SailrConfig | BarrierConfig | PredictiveConfig
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
-CONFIGS: dict[str, type[SecasConfig] | type[SailrConfig]] = {SECAS: SecasConfig, SAILR: SailrConfig}
+CONFIGS: dict[str, type[RivalConfig]] = {
+    **{SECAS: SecasConfig, SAILR: SailrConfig, CBF: BarrierConfig, PSF: PredictiveConfig}
+}
 
 
 def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
@@ -41,11 +63,21 @@ def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: Non
     started = time.perf_counter()
     if isinstance(config, SecasConfig):
         method, (networks, settings, about) = SECAS, _secas(robot, config, each)
-    else:
+    elif isinstance(config, SailrConfig):
         method, (networks, settings, about) = SAILR, _sailr(robot, config, each)
+    else:
+        return _by_hand(robot, config)
     about |= {"recipe": json.dumps(asdict(config)), "seconds": f"{time.perf_counter() - started:.0f}"}
     about |= {name: str(getattr(config, name)) for name in ("samples", "arena", "seed")}
     return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
+
+
+def _by_hand(robot: RobotWithTask, config: BarrierConfig | PredictiveConfig) -> Pretrained:
+    """Return the model of a rival that knows a unicycle by hand: settings alone."""
+    settings = asdict(config)
+    about = {"recipe": json.dumps(settings), "samples": "0", "collisions": "0", "seconds": "0"}
+    about["error"] = "nothing was fitted"
+    return Pretrained(robot, CBF if isinstance(config, BarrierConfig) else PSF, {}, settings, about)
 
 
 def _secas(robot: RobotWithTask, config: SecasConfig, each: Each) -> Made:

@@ -7,8 +7,9 @@ decision has no time of its own; its time is the batch's, divided by its robots.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brakeline.actors.episode_runner import EPISODE_STRIDE
 from brakeline.deploy.batch_robots import BatchRobots
@@ -16,10 +17,11 @@ from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.policy_loading import network_named
 from brakeline.errors import NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.filter.batch.row_by_row import BatchMethod, RowByRow
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.model_config import DDPC
-from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.methods import Model, ready
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Evaluation
@@ -32,12 +34,7 @@ ONE_BY_ONE = "evaluate without --backend batch"
 def drive_batch(
     robot: RobotWithTask, what: Evaluation, first: int, episodes: int, take: Callable[[pb.Step], object]
 ) -> None:
-    """Drive episodes `first`, `first + 1`, …; whichever robot is free begins the next one.
-
-    A robot that finds no episode left drives one that does not count, until all others have ended.
-
-    Args:
-        take: called with each step of these episodes. The steps of a robot (`step.actor`) come in order.
+    """Drive the episodes of an evaluation: see `drive_episodes`.
 
     Raises:
         NoBatch: this robot, policy, method, arena or fleet can only be evaluated one by one.
@@ -46,43 +43,69 @@ def drive_batch(
     from brakeline.deploy.experiments.evaluate import FRESH
 
     safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
-    numbers = iter(range(first, 2**31))
+    others = {"accept_bound": what.accept_bound, "conditions": what.conditions}
+    drive_episodes(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take, **others)
+
+
+def drive_episodes(
+    robot: RobotWithTask,
+    safety: BatchMethod | None,
+    policy: MLP,
+    arena: str,
+    seed_key: int,
+    numbers: range,
+    take: Callable[[pb.Step], object],
+    begin: Callable[[pb.Episode], object] = lambda message: None,
+    **others: Any,
+) -> None:
+    """Drive the episodes with these numbers; whichever robot is free begins the next one.
+
+    A robot that finds no episode left drives one that does not count, until all others have ended.
+
+    Args:
+        take: called with each step of these episodes. The steps of a robot (`step.actor`) come in order.
+        begin: called with the description of each of these episodes, before its first step.
+        others: accept_bound, conditions: see `BatchRobots`.
+
+    Raises:
+        NoBatch, TooLoose: see `BatchRobots`.
+    """
+    upcoming, episodes = itertools.count(numbers.start), len(numbers)
 
     def next_episode(_: int) -> tuple[int, int]:
-        number = next(numbers)
+        number = next(upcoming)
         return number, number * EPISODE_STRIDE
 
-    robots = BatchRobots(
-        robot,
-        [f"evaluate.{i}" for i in range(min(-(-episodes // TURNS), MOST_ROBOTS))],
-        safety,
-        next_episode,
-        arena=what.arena,
-        seed_key=FRESH + what.seed,
-        accept_bound=what.accept_bound,
-        conditions=what.conditions,
-    )
-    ended = 0
+    names = [f"evaluate.{i}" for i in range(min(-(-episodes // TURNS), MOST_ROBOTS))]
+    robots = BatchRobots(robot, names, safety, next_episode, arena=arena, seed_key=seed_key, **others)
+    ended, begun = 0, list(range(len(names)))
     try:
         while ended < episodes:
+            for message in map(robots.episode_message, begun):
+                if message.episode in numbers:
+                    begin(message)
             robots.begin_period(policy.of_many(robots.observations))
-            for step in robots.end_period()[0]:
-                if step.episode < first + episodes:
+            steps, begun = robots.end_period()
+            for step in steps:
+                if step.episode in numbers:
                     take(step)
                     ended += step.terminated or step.truncated
     finally:
         robots.close()
 
 
-def batch_filter(robot: RobotWithTask, what: Evaluation) -> Filter | None:
-    """Return the filter, or None for the method `none`. Raises NoBatch if no batch decides by this method."""
+def batch_filter(robot: RobotWithTask, what: Evaluation) -> BatchMethod | None:
+    """Return what decides, or None for the method `none`. Raises NoBatch if no batch has this policy or fleet."""
     if what.fleet:
         raise NoBatch(f"robots of a fleet see each other, which no batch simulates: {ONE_BY_ONE}")
     if what.policy in robot.task.policies or what.policy.endswith(".csv"):
         raise NoBatch(f"a batch is driven by a network, not by {what.policy}: {ONE_BY_ONE}")
     if what.method == "none":
         return None
-    model = method_for(robot, what.method, what.model_config, what.accept_bound)
-    if what.method != DDPC or not isinstance(model, ModelSet):
-        raise NoBatch(f"a batch filters by {DDPC}, not by {what.method}: {ONE_BY_ONE}")
-    return Filter(model)
+    return batch_method(method_for(robot, what.method, what.model_config, what.accept_bound))
+
+
+def batch_method(model: Model) -> BatchMethod:
+    """Return the filter of a model set, or a rival that decides row by row."""
+    method = ready(model)
+    return method if isinstance(method, Filter) else RowByRow(method)

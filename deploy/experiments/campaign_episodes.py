@@ -138,14 +138,12 @@ class CampaignDriver:
         return True
 
     def _drive_batch(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
-        tables: dict[str, EpisodeTable] = {}
-        rows: dict[int, Row] = {}
+        table, rows = EpisodeTable(ROWS), dict[int, Row]()
 
         def take(step: pb.Step) -> None:
-            table = tables.setdefault(step.actor, EpisodeTable(ROWS))
             table.step(step)
             if step.terminated or step.truncated:
-                rows[step.episode] = table.rows.pop()
+                rows[step.episode] = table.pop()
                 each()
 
         drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take)

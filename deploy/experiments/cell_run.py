@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,17 +14,31 @@ from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import load_or_record
-from brakeline.deploy.experiments.comparison_cells import LEARNING, NONE, CellConfig, Report, TrialConfig
+from brakeline.deploy.experiments.batch_evaluation import batch_method, drive_episodes
+from brakeline.deploy.experiments.comparison_cells import (
+    LEARNING,
+    NONE,
+    ROBOTS,
+    TIMED,
+    CellConfig,
+    Report,
+    TrialConfig,
+)
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, run_trial
-from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, policy_named
+from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, driving, network_named
+from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import ResultError
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.figure_tables import analyse
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.messaging.topics import EPISODE
+from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.safety.methods import Model
 from brakeline.safety.model.model_config import DDPC, SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
@@ -32,6 +48,8 @@ POLICY = "policy.safetensors"
 COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_moving"}
 COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
 LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
+
+Take, Begin = Callable[[pb.Step], object], Callable[[pb.Episode], object]
 
 
 class CellRun:
@@ -59,41 +77,108 @@ class CellRun:
         }
 
     def _train(self) -> dict[str, Any]:
-        cell = self.cell
+        cell, table = self.cell, EpisodeTable()
         trial = TrialConfig(LEARNING, cell.method, cell.arenas[0], 0)
-        config = LearnerConfig(td3=cell.td3, seed=cell.seed, steps=cell.steps)
-        driver, ask = self._driver(trial, cell.seed, cell.name)
-        trainer, table = Trainer(driver, ask, Learner(self.robot, config)), EpisodeTable()
+        learner = Learner(self.robot, LearnerConfig(td3=cell.td3, seed=cell.seed, steps=cell.steps))
+        train = self._train_batch if cell.backend == "batch" else self._train_single
         with self._log("training", trial) as log:
-            for count, step in enumerate(trainer.run(log), 1):
+
+            def take(step: pb.Step) -> None:
                 table.step(step)
-                if count % 1000 == 0:
-                    last = table.rows[-50:]
-                    self.say(f"step {count}, goals {sum(row['goal'] for row in last) / max(len(last), 1):.0%}")
-        trainer.policy.save(self.folder / POLICY)
-        return _checked(table, log.path) | {"steps": cell.steps, "updates": trainer.learner.updates}
+                log.put_step(step)
+                if table.decisions % 1000 == 0:
+                    goals = [row["goal"] for row in table.rows[-50:]] or [0]
+                    self.say(f"step {table.decisions}, goals {sum(goals) / len(goals):.0%}")
+
+            policy = train(trial, learner, take, partial(log.put, EPISODE))
+        policy.save(self.folder / POLICY)
+        figures = _checked(table, log.path)
+        figures["episodes"] |= table.span_columns()
+        return figures | {"steps": cell.steps, "updates": learner.updates}
+
+    def _train_single(self, trial: TrialConfig, learner: Learner, take: Take, begin: Begin) -> MLP:
+        """Train with one robot and one learner in lockstep."""
+        driver, ask = self._driver(trial, self.cell.seed, self.cell.name)
+        trainer = Trainer(driver, ask, learner)
+        for step in trainer.run(begin):
+            take(step)
+        return trainer.policy
+
+    def _train_batch(self, trial: TrialConfig, learner: Learner, take: Take, begin: Begin) -> MLP:
+        """Train with many robots at once."""
+
+        def publish(number: int, message: pb.Step | pb.Episode) -> None:
+            if isinstance(message, pb.Step):
+                take(message)
+            else:
+                begin(message)
+
+        cell, safety = self.cell, self._safety(trial)
+        trainer = BatchTrainer(
+            learner,
+            safety,
+            ROBOTS,
+            cell.name,
+            publish,
+            arena=trial.arena,
+            seed=cell.seed,
+            penalty=cell.penalty,
+            ends_on_intervention=_cuts(trial),
+        )
+        try:
+            while not learner.done:
+                trainer.period()
+        finally:
+            trainer.close()
+        if learner.weights_due():
+            learner.publish()
+        return decode(learner.weights().file, self.robot)
 
     def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
         self.say(trial.name)
-        name = str(self.folder / POLICY) if trial.policy == TRAINED else UNTRAINED
-        driver, ask = self._driver(trial, FRESH, trial.name)
+        policy = self._policy(trial)
         with self._log(trial.name, trial) as log:
-            policy = policy_named(name, self.robot, self.cell.seed)
-            table = run_trial(driver, policy, ask, trial.episodes, log)
-        return _checked(table, log.path)
+            if self.cell.backend == "single":
+                driver, ask = self._driver(trial, FRESH, trial.name)
+                table = run_trial(driver, driving(policy), ask, trial.episodes, log)
+            else:
+                table = self._evaluate_batch(trial, policy, log)
+        figures = _checked(table, log.path)
+        if self.cell.backend == "batch":
+            driver, ask = self._driver(trial, FRESH, trial.name)
+            figures["decision_ms"] = run_trial(driver, driving(policy), ask, min(TIMED, trial.episodes)).decision_ms()
+        return figures
+
+    def _evaluate_batch(self, trial: TrialConfig, policy: MLP, log: TrialLog) -> EpisodeTable:
+        """Drive the episodes of `run_trial`, many at once."""
+        table = EpisodeTable()
+
+        def take(step: pb.Step) -> None:
+            table.step(step)
+            log.put_step(step)
+
+        begin, numbers = partial(log.put, EPISODE), range(trial.episodes)
+        drive_episodes(self.robot, self._safety(trial), policy, trial.arena, FRESH, numbers, take, begin)
+        return table
+
+    def _policy(self, trial: TrialConfig) -> MLP:
+        name = str(self.folder / POLICY) if trial.policy == TRAINED else UNTRAINED
+        return network_named(name, self.robot, self.cell.seed)
+
+    def _safety(self, trial: TrialConfig) -> BatchMethod | None:
+        """Return what decides for a batch; None for the method `none`."""
+        return None if trial.method == NONE else batch_method(self.models[trial.method])
 
     def _driver(self, trial: TrialConfig, seed: int, actor: str) -> tuple[EpisodeRunner, Ask | None]:
         """Return the episode runner of a trial, and the function that asks its filter."""
         ask = None if trial.method == NONE else in_process(self.models[trial.method])
-        # SAILR's training ends an episode at an intervention. An evaluation continues, else goals could not compare.
-        cuts = trial.method == SAILR and trial.policy == LEARNING
         driver = EpisodeRunner(
             self.robot,
             environment(self.robot, trial.arena, seed),
             ActorIdentity(actor, 0, self.cell.seed),
             penalty=self.cell.penalty,
             filtered=ask is not None,
-            ends_on_intervention=cuts,
+            ends_on_intervention=_cuts(trial),
         )
         return driver, ask
 
@@ -103,6 +188,11 @@ class CellRun:
             about["certificate"] = self.cell.model_config.certificate
         metadata = {"run": about, "configuration": {"json": json.dumps(configuration(self.cell))}}
         return TrialLog(self.folder / f"{name}.mcap", metadata)
+
+
+def _cuts(trial: TrialConfig) -> bool:
+    """Return whether an intervention ends an episode: in SAILR's training. In an evaluation, goals must compare."""
+    return trial.method == SAILR and trial.policy == LEARNING
 
 
 def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:

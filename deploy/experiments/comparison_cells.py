@@ -13,17 +13,24 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
+from brakeline.deploy.run.run_config import BATCH_TD3
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.evaluate import Backend
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
 NONE, LEARNING = "none", "learning"
 METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
 SEEDS = (0, 1, 2)
 EPISODES = 500  # of each evaluation
+TIMED = 10  # episodes that time single decisions, where a batch makes the others
+ROBOTS = 64  # of a batch that trains
+PHYSICS = 2  # of the simulators; raise it with a change after which older results are not comparable
 
 Report = Callable[[str], object]
 
@@ -56,6 +63,8 @@ class CellConfig:
     penalty: float = 1.0
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
+    backend: Backend = "single"  # batch: trains and evaluates many robots at once
+    physics: int = PHYSICS
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
 
     @property
@@ -83,6 +92,28 @@ class CellConfig:
         from brakeline.deploy.experiments.cell_run import CellRun  # brings simulators and learner
 
         return CellRun(self, folder, say).result()
+
+
+def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
+    """Return the backend of a robot's cells: batch, where the robot and all arenas allow it."""
+    from brakeline.errors import NoBatch
+    from brakeline.messaging.task import robot_with_task
+    from brakeline.sim.batch.batch_env import check_batch
+    from brakeline.sim.sim_conditions import Conditions
+
+    try:
+        for arena in arenas:
+            check_batch(robot_with_task(robot), arena, Conditions())
+    except NoBatch:
+        return "single"
+    return "batch"
+
+
+def learning(td3: TD3Config, backend: Backend) -> TD3Config:
+    """Return the learner's settings with those of a batch in place of the defaults, if a batch trains."""
+    default = TD3Config()
+    changed = {name: value for name, value in BATCH_TD3.items() if getattr(td3, name) == getattr(default, name)}
+    return replace(td3, **changed) if backend == "batch" else td3
 
 
 def quick(cell: CellConfig) -> CellConfig:

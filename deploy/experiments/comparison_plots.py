@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
 from brakeline.deploy.experiments.comparison_cells import METHODS
-from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW
+from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW, spans
 from brakeline.logs.run_groups import METHOD_COLORS
 
 Array = NDArray[np.float64]
@@ -30,16 +30,21 @@ def _smooth(values: Array) -> Array:
 
 
 def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
-    """Return curves (seeds, POINTS) of a training figure over steps: collisions are summed, others averaged."""
+    """Return curves (seeds, POINTS) of a training figure over steps.
+
+    Collisions are summed at the ends of the episodes. Other figures are means over episodes that began before a step.
+    """
     lines = []
     for result in results:
         episodes = result["training"]["episodes"]
-        ends, values = np.cumsum(episodes["steps"]), np.array(episodes[name], float)
+        (begins, ends), values = spans(episodes), np.array(episodes[name], float)
+        if name == "collision":
+            order = np.argsort(ends, kind="stable")
+            lines.append(np.interp(grid, ends[order], np.cumsum(values[order]), left=0.0))
+            continue
         if name == "interventions":
             values = values / np.array(episodes["steps"], float)
-        curve = np.cumsum(values) if name == "collision" else _smooth(values)
-        before = 0.0 if name == "collision" else np.nan  # no value before the first episode ends
-        lines.append(np.interp(grid, ends, curve, left=before))
+        lines.append(np.interp(grid, begins, _smooth(values)))
     return np.array(lines)
 
 
@@ -66,7 +71,7 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
             axes.set_ylim(-0.02, 1.02)
     panels[0].legend(loc="best", frameon=False)
     for axes in panels[2:]:
-        axes.set_xlabel(f"steps (means over {WINDOW} episodes)")
+        axes.set_xlabel(f"steps (means over the last {WINDOW} episodes that began)")
     png.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(png, dpi=120, metadata={"Software": None})
 

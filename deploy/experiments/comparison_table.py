@@ -7,11 +7,13 @@ times; all others are determined by the seeds.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, ratio
 from brakeline.deploy.experiments.comparison_cells import METHODS, NONE
@@ -21,6 +23,7 @@ from brakeline.safety.model.model_config import DDPC
 
 Result = dict[str, Any]
 Row = dict[str, Any]
+Array = NDArray[np.float64]
 
 NAMES = {DDPC: "ours", "sailr": "SAILR", "secas": "SECAS", NONE: "TD3"}
 PAPER = Path(__file__).with_name("paper.json")
@@ -29,14 +32,22 @@ LEARNED = 0.9  # the goal rate that counts as learned
 TOUCHED = ("run into while moving", "run into while standing")  # the table's names of CONTACTS
 
 
+def spans(episodes: dict[str, list[float]]) -> tuple[Array, Array]:
+    """Return the training steps before and after each episode. In older results, one robot trained alone."""
+    ends = np.array(episodes.get("end", np.cumsum(episodes["steps"])), float)
+    return np.array(episodes.get("begin", ends - episodes["steps"]), float), ends
+
+
 def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:
-    """Return the training steps until a share `LEARNED` of `WINDOW` episodes reached the goal; `steps` if never."""
-    goals, taken = np.array(episodes["goal"], float), np.cumsum(episodes["steps"])
-    if len(goals) < WINDOW:
+    """Return the training steps until a share `LEARNED` of `WINDOW` episodes had reached the goal; `steps` if never.
+
+    The episodes of a window began one after the other. So a batch, where short episodes end first, gains nothing.
+    """
+    if len(episodes["goal"]) < WINDOW:
         return float(steps)
-    rate = np.convolve(goals, np.full(WINDOW, 1.0 / WINDOW), "valid")
-    reached = np.flatnonzero(rate >= LEARNED - 1e-9)
-    return float(taken[WINDOW - 1 + reached[0]]) if len(reached) else float(steps)
+    reached = np.where(np.array(episodes["goal"], bool), spans(episodes)[1], np.inf)
+    windows = np.sort(np.lib.stride_tricks.sliding_window_view(reached, WINDOW), axis=1)
+    return float(min(windows[:, math.ceil(LEARNED * WINDOW) - 1].min(), steps))
 
 
 def evaluation_rows(results: Sequence[Result], trial: str) -> Row:

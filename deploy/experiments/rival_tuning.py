@@ -1,6 +1,6 @@
-"""Tune the threshold of each rival in closed loop; the results are the `rivals` of the task files.
+"""Tune one setting of each rival in closed loop; the results are the `rivals` of the task files.
 
-The rule is the same for both rivals. Among the values with which A* loses no goal, choose the one with the fewest
+The rule is the same for all rivals. Among the values with which A* loses no goal, choose the one with the fewest
 collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy.
 """
 
@@ -12,18 +12,21 @@ from dataclasses import asdict, dataclass, replace
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.model.model_config import CBF, PSF, SAILR, SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.sailr import SAILR
-from brakeline.safety.rivals.secas import SECAS
 
 ORACLE, GREEDY = "astar", "greedy"
-ADVANTAGES = (0.03, 0.05, 0.08, 0.15)  # η; its authors' is 0.08
-SETTING = {SECAS: "clearance", SAILR: "threshold"}
+VALUES = {
+    SAILR: (0.03, 0.05, 0.08, 0.15),  # η; its authors' is 0.08
+    CBF: (0.5, 1.0, 2.0, 4.0),  # α [1/s]
+    PSF: (0.0, 0.01, 0.02, 0.04),  # margin [m]
+}
+SETTING = {SECAS: "clearance", SAILR: "threshold", CBF: "rate", PSF: "margin"}
 
 
 @dataclass(frozen=True)
 class ThresholdTrial:
-    """A threshold (SECAS: margin to the footprint in m; SAILR: η) and its results over `episodes` per policy."""
+    """A value of `SETTING` (SECAS: its margin to the footprint) and its results over `episodes` per policy."""
 
     value: float
     episodes: int
@@ -39,7 +42,7 @@ class ThresholdTrial:
 
 def values_for(model: Pretrained, robot: RobotWithTask) -> tuple[float, ...]:
     """Return the thresholds to try."""
-    return robot.task.rivals.margins if model.method == SECAS else ADVANTAGES
+    return robot.task.rivals.margins if model.method == SECAS else VALUES[model.method]
 
 
 def try_threshold(

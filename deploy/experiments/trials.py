@@ -116,39 +116,61 @@ class TrialLog:
 
 @dataclass
 class EpisodeTable:
-    """One row per finished episode with the values of its columns, and statistics of the decision times."""
+    """One row per finished episode with the values of its columns, and statistics of the decision times.
+
+    Steps of several actors may alternate.
+
+    Attributes:
+        rows: in the order in which the episodes ended.
+        spans: for each row, the number of steps, of all actors, before its first step and after its last one.
+    """
 
     which: Mapping[str, Column] = field(default_factory=lambda: COLUMNS)
     rows: list[dict[str, float]] = field(default_factory=list)
+    spans: list[tuple[int, int]] = field(default_factory=list)
     decisions: int = 0
     milliseconds: float = 0.0
     squares: float = 0.0  # ms²
-    _running: dict[str, float] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
-        self._running = {name: column.start for name, column in self.which.items()}
+    _running: dict[str, tuple[int, dict[str, float]]] = field(default_factory=dict)  # by actor: begin, row
 
     def step(self, step: pb.Step) -> None:
-        """Add the next step."""
+        """Add the next step of an actor."""
+        begin, row = self._running.get(step.actor) or self._begin(step.actor)
         for name, column in self.which.items():
-            self._running[name] = column.combine(self._running[name], column.value(step))
+            row[name] = column.combine(row[name], column.value(step))
         spent = COLUMNS["milliseconds"].value(step)
         self.decisions += 1
         self.milliseconds += spent
         self.squares += spent * spent
         if step.terminated or step.truncated:
-            self.rows.append(self._running)
-            self._begin()
+            del self._running[step.actor]
+            self.rows.append(row)
+            self.spans.append((begin, self.decisions))
+
+    def _begin(self, actor: str) -> tuple[int, dict[str, float]]:
+        self._running[actor] = self.decisions, {name: column.start for name, column in self.which.items()}
+        return self._running[actor]
+
+    def pop(self) -> dict[str, float]:
+        """Remove the row of the episode that ended last, and return it."""
+        self.spans.pop()
+        return self.rows.pop()
 
     def columns(self) -> dict[str, list[float]]:
-        """Return the columns, rounded to four digits; counts are integers."""
+        """Return the columns in the order in which the episodes began, rounded to four digits; counts are integers."""
+        rows = [self.rows[i] for i in self._order()]
         return {
-            name: [int(row[name]) if column.count else round(float(row[name]), 4) for row in self.rows]
+            name: [int(row[name]) if column.count else round(float(row[name]), 4) for row in rows]
             for name, column in self.which.items()
         }
+
+    def span_columns(self) -> dict[str, list[int]]:
+        """Return the columns `begin` and `end` of `spans`, in the order of `columns`."""
+        spans = [self.spans[i] for i in self._order()]
+        return {"begin": [begin for begin, _ in spans], "end": [end for _, end in spans]}
+
+    def _order(self) -> list[int]:
+        return sorted(range(len(self.rows)), key=self.spans.__getitem__)
 
     def decision_ms(self) -> dict[str, float]:
         """Return the mean and the standard deviation of the decision times [ms]."""
@@ -212,23 +234,20 @@ class Trainer:
         reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))
         self.policy: MLP = decode(reply.weights.file, robot)
 
-    def run(self, log: TrialLog | None = None) -> Iterator[pb.Step]:
-        """Yield the steps of the whole training."""
+    def run(self, begin: Callable[[pb.Episode], object] = lambda message: None) -> Iterator[pb.Step]:
+        """Yield the steps of the whole training. Calls `begin` with the description of each episode."""
         episode = 0
         while not self.learner.done:
             if not self.driver.running:
                 message = self.driver.begin(episode)
                 episode += 1
                 self._random = scripted("random", self.driver.robot, self.driver.rng)
-                if log is not None:
-                    log.put(EPISODE, message)
+                begin(message)
             step = take_step(self.driver, self._explore, self.question, self.policy.version)
             self.learner.insert(step)
             self.learner.work(1 << 30)
             if self.learner.weights_due():
                 self.policy = decode(self.learner.publish().file, self.driver.robot)
-            if log is not None:
-                log.put_step(step)
             yield step
 
     def _explore(self, observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:

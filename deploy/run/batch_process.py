@@ -44,10 +44,13 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
         Unreachable: no router answers.
     """
     robot = robot_with_task(spec.robot)
-    trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
-    model = load(model_in_run(config, folder, robot, trust))
-    if not isinstance(model, ModelSet):
-        raise BadModel(f"the model of {robot.name} is no model set, which --backend batch needs")
+    safety = None
+    if config.filtered:
+        trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
+        model = load(model_in_run(config, folder, robot, trust))
+        if not isinstance(model, ModelSet):
+            raise BadModel(f"the model of {robot.name} is no model set, which --backend batch needs")
+        safety = Filter(model)
     with Process(bus, spec.name) as process:
         learner = Learner(robot, config.learning(), incarnation=process.bus.run)
         if resume:
@@ -67,7 +70,7 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
         output = LearnerOutput(process, learner, folder / spec.name)
         trainer = BatchTrainer(
             learner,
-            Filter(model),
+            safety,
             config.robots_per_actor,
             spec.name,
             publish,

@@ -19,7 +19,7 @@ from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.sim.scripted_policies import RandomPolicy
 from brakeline.sim.sim_conditions import Conditions
 
@@ -40,7 +40,7 @@ class BatchTrainer:
     def __init__(
         self,
         learner: Learner,
-        safety: Filter,
+        safety: BatchMethod | None,
         size: int,
         name: str,
         sink: Sink,
@@ -50,13 +50,16 @@ class BatchTrainer:
         penalty: float = 1.0,
         accept_bound: float | None = None,
         conditions: Conditions | None = None,
+        ends_on_intervention: bool = False,
     ) -> None:
         """Let all robots join the learner, and begin their first episodes.
 
         Args:
+            safety: the filter; without one, each robot executes what it proposes.
             name: of the process, from which `actor_names` makes the robots' names.
             sink: takes all steps and episodes.
             penalty: for a correction by the whole range of an input.
+            ends_on_intervention: see `EpisodeRunner`.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -78,6 +81,7 @@ class BatchTrainer:
             penalty=penalty,
             accept_bound=accept_bound,
             conditions=conditions,
+            ends_on_intervention=ends_on_intervention,
         )
         # A resumed run draws other noise than the interrupted one: it begins with other episodes, too.
         self._rng = np.random.default_rng((seed, EPISODE_STRIDE, learner.steps))

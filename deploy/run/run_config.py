@@ -155,7 +155,7 @@ def _check_batch(config: RunConfig) -> None:
     """Check that a batch can do what the run asks for. Raises ValueError, or NoBatch if the robot can't be batched."""
     refused = {
         "more than one robot kind": len(config.robots) > 1,
-        f"the method {config.method}": config.method != DDPC,
+        f"the method {config.method}": config.method not in (DDPC, "none"),
         "--fleet": config.fleet > 0,
         "--from-logs": bool(config.from_logs),
         "--adapt": config.adapt,

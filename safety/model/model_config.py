@@ -15,8 +15,8 @@ MODES = (DIRECT, RECURSION)  # of predictors that are linear in the inputs
 AUTO = "auto"  # the mode of the model set that was last put to use
 PLAN, FREE = "plan", "free"
 WINDOWS = (PLAN, FREE)
-DDPC, SECAS, SAILR = "ddpc", "secas", "sailr"
-METHODS = (DDPC, SECAS, SAILR)  # of a safety service
+DDPC, SECAS, SAILR, CBF, PSF = "ddpc", "secas", "sailr", "cbf", "psf"
+METHODS = (DDPC, SECAS, SAILR, CBF, PSF)  # of a safety service
 MOST_OUTSIDE = 0.1  # of the windows: sets that more leave promise nothing
 
 

@@ -10,10 +10,7 @@ from scipy.optimize import linprog
 
 from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, ModelTubes, Noise, feature_box
 from benchmarks.model_peers import interval
-from benchmarks.unicycle_barrier import Tuning, UnicycleBarrier
-from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.robot import robot_named
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.one_step import features_for
 
 pytestmark = pytest.mark.fast
@@ -94,20 +91,6 @@ def test_tubes_hold_the_rollouts_of_every_consistent_model(fit):
             p = p + np.column_stack([cos * y[:, 0] - sin * y[:, 1], sin * y[:, 0] + cos * y[:, 1]])
             heading, s = heading + y[:, 2], y[:, 3:]
             assert (np.abs(p - center[:, k - 1]) <= half[:, k - 1] + 1e-12).all()
-
-
-def test_the_barrier_lets_free_driving_pass_and_keeps_its_row_at_an_obstacle():
-    barrier, fast = UnicycleBarrier(DIFF, Tuning(0.05, 1.0, 0.0)), np.array([0.6, 0.0])
-    state, nothing = np.zeros(5), np.zeros((DIFF.horizon, 2))
-
-    def decided(x):
-        obstacles = Shapes.of([Obstacle("cylinder", (x, 0.0), (0.2,))], 2)
-        return barrier.decide(Request(state, fast, np.zeros(2), nothing, obstacles))
-
-    assert decided(3.0).kind == ALLOWED
-    near = decided(0.6)
-    assert near.kind == ADJUSTED and near.plan[0] == pytest.approx([0.15, 0.0], abs=1e-6)  # v <= α h, h = 0.55 − 0.4
-    assert decided(0.3).kind == FAILSAFE  # too near: only backwards would do
 
 
 def test_the_interval_of_a_share_is_exact():

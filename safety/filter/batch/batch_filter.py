@@ -51,7 +51,7 @@ class BatchFilter:
         started = perf_counter_ns()
         xp, device = array_api_compat.array_namespace(requests.state), array_api_compat.device(requests.state)
         _check_arrays(self.safety.robot, requests, xp)
-        answers = _blank(self.safety, requests, xp, device)
+        answers = blank_answers(self.safety.robot, requests, xp, device)
         decided = xp.zeros(len(requests), dtype=xp.bool, device=device)
         if self.covers and len(requests):
             key = xp.__name__, str(device)
@@ -65,7 +65,7 @@ class BatchFilter:
                 singly[row] = self.safety.decide(requests.row(row))
             except BadRequest as error:
                 raise BadRequest(error.field, f"row {row}: {error}") from error
-            _write(answers, row, singly[row], xp, device)
+            write_decision(answers, row, singly[row], xp, device)
         time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
         return DecisionArrays(
             **answers,
@@ -124,9 +124,9 @@ def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Arra
         yield "past.given", past.given, "b", ()
 
 
-def _blank(safety: Filter, requests: RequestArrays, xp: Any, device: Any) -> dict[str, Any]:
+def blank_answers(robot: Robot, requests: RequestArrays, xp: Any, device: Any) -> dict[str, Any]:
     """Return the arrays of a `DecisionArrays` without answers."""
-    robot, B = safety.robot, len(requests)
+    B = len(requests)
     n, m, N, d = robot.state_dim, robot.action_dim, robot.horizon, robot.position_dim
     shapes = {
         "plan": (N, m),
@@ -152,8 +152,8 @@ def _blank(safety: Filter, requests: RequestArrays, xp: Any, device: Any) -> dic
     return arrays
 
 
-def _write(answers: dict[str, Any], row: int, decision: Decision, xp: Any, device: Any) -> None:
-    """Write a decision of the single path into its row."""
+def write_decision(answers: dict[str, Any], row: int, decision: Decision, xp: Any, device: Any) -> None:
+    """Write a decision of the single path into its row. A method that verifies nothing has no tube."""
     predicted = decision.predicted
     values = {
         "plan": decision.plan,
@@ -166,7 +166,8 @@ def _write(answers: dict[str, Any], row: int, decision: Decision, xp: Any, devic
         "score": np.nan if decision.score is None else decision.score,
     }
     for name, value in values.items():
-        answers[name][row] = xp.asarray(np.asarray(value, dtype=float), device=device)
+        if np.size(value):
+            answers[name][row] = xp.asarray(np.asarray(value, dtype=float), device=device)
     for name in ("at_least", "verified", "contained", "compared"):
         answers[name][row] = getattr(decision, name)
     answers["for_clearance"][row] = bool(decision.for_clearance)

@@ -24,10 +24,11 @@ from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionA
 from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS
 
 if TYPE_CHECKING:
-    from brakeline.safety.filter.filter import Filter
+    from brakeline.safety.filter.batch.row_by_row import BatchMethod
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Observations = NDArray[np.float32]
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ class BackupPlanBatch:
         predicted: the sets of the next measured states.
     """
 
-    def __init__(self, safety: Filter, size: int) -> None:
+    def __init__(self, safety: BatchMethod, size: int) -> None:
         """Begin with all robots standing.
 
         Raises:
@@ -98,7 +99,9 @@ class BackupPlanBatch:
         """The factor (B,) on every set of the next decision."""
         return np.asarray(np.clip(RESERVE * self._scores.max(axis=1), 1.0, MOST))
 
-    def request(self, states: Array, actions: Array, obstacles: ObstacleArrays) -> RequestArrays:
+    def request(
+        self, states: Array, actions: Array, obstacles: ObstacleArrays, observations: Observations | None = None
+    ) -> RequestArrays:
         """Return the request about measured states (B, n) and proposals (B, m); all other space is free."""
         N = self.robot.horizon
         names = np.array(["", self.safety.version, UNVERIFIED], dtype=object)
@@ -114,14 +117,20 @@ class BackupPlanBatch:
             model=names[self._status].tolist(),
             predicted=self.predicted if self.predicted.given.any() else None,
             past=past if self._judged and past.given.any() else None,
+            observation=observations,
         )
 
-    def decide(self, states: Array, actions: Array, obstacles: ObstacleArrays) -> BatchOutcome:
-        """Decide on proposals (B, m), and commit to the plans of the decisions."""
+    def decide(
+        self, states: Array, actions: Array, obstacles: ObstacleArrays, observations: Observations | None = None
+    ) -> BatchOutcome:
+        """Decide on proposals (B, m), and commit to the plans of the decisions.
+
+        observations (B, o): what a rival decides by; the filter does not need them.
+        """
         finite = np.asarray(np.isfinite(actions).all(axis=1))
         proposals = np.where(finite[:, None], actions, self.input_in_force)
         try:
-            answers = self.safety.decide_batch(self.request(states, proposals, obstacles))
+            answers = self.safety.decide_batch(self.request(states, proposals, obstacles, observations))
         except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
             log.exception("no decisions, so all robots brake along their committed plans")
             failure = f"{type(error).__name__}: {error}"

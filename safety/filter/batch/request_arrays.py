@@ -83,6 +83,7 @@ class RequestArrays:
         model: version of the model set that verified the plan, for each robot or for all of them.
         predicted: None if no robot has one.
         past: None if no robot has one.
+        observation (B, o): input of a rival's networks, float32; the filter does not need it.
     """
 
     state: Array
@@ -95,6 +96,7 @@ class RequestArrays:
     model: Sequence[str] | str = ""
     predicted: PredictionArrays | None = None
     past: PastArrays | None = None
+    observation: Array | None = None
 
     def __len__(self) -> int:
         return int(self.state.shape[0])
@@ -151,6 +153,7 @@ class RequestArrays:
             known_free=bool(self.known_free[index]),
             widening=1.0 if self.widening is None else float(self.widening[index]),
             past=past,
+            observation=np.zeros(0, np.float32) if self.observation is None else on_host(self.observation[index]),
         )
 
 

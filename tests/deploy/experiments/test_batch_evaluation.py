@@ -46,7 +46,6 @@ def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeyp
     ("change", "said"),
     [
         ({"policy": "astar"}, "driven by a network"),
-        ({"method": "secas"}, "filters by ddpc"),
         ({"fleet": 3}, "robots of a fleet"),
         ({"arena": "walkers"}, "moving obstacles"),
     ],

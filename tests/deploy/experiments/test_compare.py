@@ -8,19 +8,32 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
+from brakeline.deploy.experiments import cell_run
 from brakeline.deploy.experiments.bootstrap import mean, ratio
-from brakeline.deploy.experiments.comparison_cells import METHODS, CellConfig, TrialConfig, cell_configs, quick
+from brakeline.deploy.experiments.comparison_cells import (
+    METHODS,
+    CellConfig,
+    TrialConfig,
+    backend_for,
+    cell_configs,
+    learning,
+    quick,
+)
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
 from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
 from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.trials import EpisodeTable
+from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.figure_tables import analyse
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 
 DEAR = ("decision_ms", "milliseconds")
+IN_A_BATCH = ("ddpc", "sailr")
 
 
 # --- studies -------------------------------------------------------------------------------------------------------
@@ -51,6 +64,19 @@ def cells(rivals, tmp_path_factory) -> dict[str, dict]:
     return {m: replace(TINY, method=m).run(folder / m) | {"folder": folder / m} for m in METHODS}
 
 
+@pytest.fixture(scope="module")
+def batch_cells(rivals, tmp_path_factory) -> dict[str, dict]:
+    """Cells that are trained and evaluated with eight robots at once: by the batch filter, and row by row."""
+    folder, before = tmp_path_factory.mktemp("batch"), cell_run.ROBOTS
+    cell_run.ROBOTS = 8
+    yield {m: in_a_batch(m).run(folder / m) | {"folder": folder / m} for m in IN_A_BATCH}
+    cell_run.ROBOTS = before
+
+
+def in_a_batch(method: str) -> CellConfig:
+    return replace(TINY, method=method, backend="batch")
+
+
 def stripped(value):
     """Without anything that a clock had a part in."""
     if isinstance(value, dict):
@@ -66,28 +92,37 @@ def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, metho
         assert replace(TINY, seed=4).run(tmp_path / "other")["policy"] != again["policy"]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_cell_says_what_its_logs_say(cells, method):
-    cell, figures = cells[method], None
+def test_a_batch_is_repeatable_too(batch_cells, tmp_path):
+    again = in_a_batch("sailr").run(tmp_path)
+    assert stripped(again) == stripped(batch_cells["sailr"])
+
+
+EACH = [*((method, "single") for method in METHODS), *((method, "batch") for method in IN_A_BATCH)]
+
+
+@pytest.mark.parametrize(("method", "backend"), EACH)
+def test_a_cell_says_what_its_logs_say(cells, batch_cells, method, backend):
+    cell, figures = {"single": cells, "batch": batch_cells}[backend][method], None
     for name, evaluation in [("training", cell["training"]), *cell["evaluations"].items()]:
         figures = analyse(cell["folder"] / f"{name}.mcap")
         episodes = evaluation["episodes"]
         assert figures["episodes"] == len(episodes["goal"]) and figures["goals"] == sum(episodes["goal"])
         assert sum(episodes["steps"]) <= figures["steps"]
-        assert figures["mean_reward"] == pytest.approx(np.mean(episodes["reward"]), abs=1e-3)
+        if episodes["reward"]:  # in so short a training, no robot of a batch may have ended its first episode
+            assert figures["mean_reward"] == pytest.approx(np.mean(episodes["reward"]), abs=1e-3)
         assert figures["seed"] == TINY.seed
         assert figures["method"] == (method if name == "training" else name.split("-")[1])
     assert cell["training"]["steps"] == TINY.steps and cell["training"]["updates"] == TINY.steps - TINY.td3.warmup
-    assert json.loads(json.dumps(cell["study"])) == configuration(replace(TINY, method=method))
+    assert json.loads(json.dumps(cell["study"])) == configuration(replace(TINY, method=method, backend=backend))
     assert MLP.load(cell["folder"] / "policy.safetensors", GROUND).sizes == (26, 16, 16, 2)
 
 
-def test_methods_share_the_episodes_that_they_are_evaluated_on(cells):
+def test_methods_and_backends_share_the_episodes_that_they_are_evaluated_on(cells, batch_cells):
     from brakeline.logs.reader import read as records
 
     arenas = []
-    for method in METHODS:
-        log = cells[method]["folder"] / f"trained-{method}-default.mcap"
+    for method, backend in EACH:
+        log = {"single": cells, "batch": batch_cells}[backend][method]["folder"] / f"trained-{method}-default.mcap"
         arenas.append([(r.message.start, r.message.goal) for r in records(log) if r.topic == "episode"])
     assert arenas[0] and all(list(map(str, arena)) == list(map(str, arenas[0])) for arena in arenas)
 
@@ -169,6 +204,35 @@ def test_a_ratio_is_of_sums_and_of_seeds_alike():
     assert (certain.low, certain.value, certain.high) == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="at least one episode"):
         mean([[]])
+
+
+def test_steps_of_several_actors_are_rows_in_the_order_in_which_their_episodes_began():
+    table = EpisodeTable()
+    for actor, ended in (("slow", False), ("fast", False), ("fast", True), ("slow", False), ("fast", True)):
+        table.step(pb.Step(actor=actor, terminated=ended, goal=ended, reward=1.0))
+    assert table.columns()["steps"] == [2, 1] and table.span_columns() == {"begin": [1, 4], "end": [3, 5]}
+    table.step(pb.Step(actor="slow", truncated=True))
+    assert table.columns()["steps"] == [3, 2, 1] and table.columns()["goal"] == [0, 1, 1]
+    assert table.span_columns() == {"begin": [0, 1, 4], "end": [6, 3, 5]}
+    assert table.pop()["steps"] == 3 and table.columns()["steps"] == [2, 1]
+
+
+def test_a_batch_is_not_taken_for_a_fast_learner_because_its_short_episodes_end_first():
+    """Half of the robots reach the goal soon, and the others time out long after."""
+    begins = list(range(100))
+    ends = [100 + n if n % 2 else 3000 + n for n in begins]
+    episodes = {"goal": [n % 2 for n in begins], "steps": [1] * 100, "begin": begins, "end": ends}
+    assert steps_to_learn(episodes, 5000) == 5000
+    later = {"goal": [1] * 50, "steps": [1] * 50, "begin": range(100, 150), "end": [4000 + n for n in range(50)]}
+    assert steps_to_learn({name: [*values, *later[name]] for name, values in episodes.items()}, 5000) == 4038
+
+
+def test_a_batch_has_the_learners_settings_of_its_own_unless_one_is_given():
+    assert backend_for("ground", ("default", "dense")) == "batch"
+    assert backend_for("ground", ("default", "walkers")) == backend_for("quadrotor", ("default",)) == "single"
+    given = replace(TD3Config(), updates_per_step=0.5)
+    assert learning(given, "single") == given and learning(given, "batch").updates_per_step == 0.5
+    assert learning(TD3Config(), "batch").updates_per_step == 0.25 and learning(given, "batch").actor_rate == 1e-3
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():

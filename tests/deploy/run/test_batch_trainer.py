@@ -18,8 +18,11 @@ from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import robot_with_task
+from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.rivals.sailr import Sailr
 from brakeline.sim.scripted_policies import GroundGreedyPolicy
+from tests.safety.rivals.test_sailr import known
 from tests.system.runs import Run
 
 GROUND = robot_with_task("ground")
@@ -106,6 +109,44 @@ def test_consecutive_steps_of_a_robot_continue_each_other_over_the_ends_of_episo
             ended += 1
         last[step.actor] = step
     assert ended >= 1 and all(learner.metrics().limit[actor] >= 70 for actor in trainer.actors)
+
+
+def test_in_sailrs_training_an_intervention_ends_the_robots_episode() -> None:
+    """As with one robot: the step is the last one, and its reward less its penalty is the lowest."""
+    learner, told = Learner(GROUND, CONFIG), Told()
+    rival = RowByRow(Sailr(known(threshold=0.6)))
+    trainer = BatchTrainer(learner, rival, SIZE, "learner", told, ends_on_intervention=True)
+    for _ in range(PERIODS):
+        trainer.period()
+    trainer.close()
+    assert (learner.metrics().duplicates, learner.metrics().missing) == (0, 0)
+    last, begun = dict[str, pb.Step](), {(episode.actor, episode.episode) for episode in told.episodes}
+    for step in told.steps:
+        assert step.cut == (step.decision == pb.FAILSAFE) and (step.actor, step.episode) in begun
+        if step.cut:
+            assert step.truncated and step.reward - step.penalty == pytest.approx(GROUND.task.reward.cut)
+        else:
+            assert step.penalty == 0.0 and step.decision == pb.ALLOWED
+        before = last.get(step.actor)
+        if before is not None:
+            continues = not (before.terminated or before.truncated)
+            assert (step.episode, step.step) == (
+                (before.episode, before.step + 1) if continues else (before.episode + 1, 0)
+            )
+            assert not continues or step.observation == before.next_observation
+        last[step.actor] = step
+    cut = sum(step.cut for step in told.steps)
+    assert 5 < cut < len(told.steps) / 2
+
+
+def test_without_a_filter_each_robot_executes_what_it_proposes() -> None:
+    told = Told()
+    trainer = BatchTrainer(Learner(GROUND, CONFIG), None, SIZE, "learner", told)
+    for _ in range(3):
+        trainer.period()
+    trainer.close()
+    for step in told.steps:
+        assert step.action == pytest.approx(list(step.proposed)) and not step.decision and not step.penalty
 
 
 def infos(trainer: BatchTrainer) -> list[dict[str, Any]]:

@@ -1,0 +1,72 @@
+"""Decide batches by a method that decides one request at a time, such as a rival."""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from brakeline.errors import BadRequest
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.batch.batch_filter import blank_answers, write_decision
+from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
+
+if TYPE_CHECKING:
+    from brakeline.safety.methods import Method
+
+
+class BatchMethod(Protocol):
+    """Turns requests of many robots into decisions, as `Filter` does."""
+
+    @property
+    def robot(self) -> Robot: ...
+
+    @property
+    def version(self) -> str:
+        """The hash of the model."""
+
+    def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
+        """Return the decisions. Raises BadRequest if a value of the requests is not valid."""
+
+
+class RowByRow:
+    """A method as a `BatchMethod`: one decision after the other.
+
+    >>> from brakeline import Filter, Request, RequestArrays, Shapes
+    >>> stand = np.zeros((3, 2))
+    >>> request = Request(np.zeros(5), [0.2, 0.0], stand[0], stand, Shapes.of([], dim=2), known_free=True)
+    >>> answers = RowByRow(Filter.load("ground")).decide_batch(RequestArrays.of([request] * 3))
+    >>> answers.plan[:, 0].tolist()
+    [[0.2, 0.0], [0.2, 0.0], [0.2, 0.0]]
+    """
+
+    def __init__(self, method: Method) -> None:
+        self._method, self.robot, self.version = method, method.robot, method.version
+        self.model = getattr(method, "model", None)
+
+    def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
+        """Decide on NumPy arrays.
+
+        Raises:
+            BadRequest: a value is missing, not finite, or has the wrong size.
+        """
+        started, singly = perf_counter_ns(), {}
+        answers = blank_answers(self.robot, requests, np, "cpu")
+        for row in range(len(requests)):
+            try:
+                singly[row] = self._method.decide(requests.row(row))
+            except BadRequest as error:
+                raise BadRequest(error.field, f"row {row}: {error}") from error
+            write_decision(answers, row, singly[row], np, "cpu")
+        time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
+        return DecisionArrays(
+            **answers,
+            singly=singly,
+            obstacles=requests.obstacles,
+            model=self.version,
+            bound=None,
+            judges=False,
+            time_ms=time_ms,
+        )

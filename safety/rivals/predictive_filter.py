@@ -1,0 +1,140 @@
+"""A predictive safety filter with a unicycle that somebody derived by hand.
+
+Wabersich and Zeilinger, "A predictive safety filter for learning-based control of constrained nonlinear dynamical
+systems", Automatica 2021: execute the first input, closest to the proposal, of a plan that meets all constraints and
+ends in a safe terminal set. Here the set is standstill, the model a unicycle whose speeds follow their inputs by a
+first-order lag of time constant τ, and the horizon that of the filter:
+
+    min ‖u_0 − r‖²  s.t.  d_i(p(t; u)) >= body + margin  at all samples t,  low <= u_k <= high,  u_{N−1} = 0
+    p' = v (cos θ, sin θ),   θ' = ω,   τ v' = u_v − v,   τ ω' = u_ω − ω
+
+Sequential quadratic programming solves it: linearise the predicted positions in the inputs, and each distance at its
+closest point. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the
+margin alone allows for its error; the article's stochastic and robust versions tighten constraints instead.
+"""
+
+from __future__ import annotations
+
+import math
+from time import perf_counter_ns
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.safety.filter.braking import braking_decision, braking_plan
+from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, NOT_FINITE, Decision, Request
+from brakeline.safety.model.model_config import PSF as PSF
+from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.unicycle import UnicycleRival
+
+Array = NDArray[np.float64]
+
+SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
+SAMPLES = 4  # of a period
+ITERATIONS = 5  # quadratic programs from one start
+CONVERGED = 1e-4  # of an input's range
+ACCURACY = 1e-4  # m: a constraint violated by less is met
+LATER = 1e-2  # cost of a change of later inputs, beside that of the first one
+STEP = 1e-4  # of an input's range, for derivatives
+
+
+class PredictiveFilter(UnicycleRival):
+    """The filter as a method."""
+
+    def __init__(self, model: Pretrained) -> None:
+        """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
+        super().__init__(model, PSF, SETTINGS)
+        robot = self.robot
+        self._scale, self._free = robot.high() - robot.low(), robot.horizon - 1
+        self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()
+
+    def decide(self, request: Request) -> Decision:
+        """Return the closest plan of the nominal model that is clear; without one, go on with the last plan.
+
+        Raises:
+            BadRequest: see `UnicycleRival.check`.
+        """
+        started, robot = perf_counter_ns(), self.robot
+        self.check(request)
+        if not request.finite:
+            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
+        proposal = robot.clip_input(request.action, request.input_in_force)
+        wanted = braking_plan(robot, proposal)
+        room = self._room(request, wanted)
+        if room >= -ACCURACY:
+            return self.decision(ALLOWED, wanted, room, started)
+        starts = (wanted, request.plan, np.zeros_like(request.plan))
+        plans = [plan for start in starts if (plan := self._solve(request, proposal, start)) is not None]
+        if not plans:
+            reason = "the nominal model has no clear plan: the last one goes on"
+            return self.decision(FAILSAFE, request.plan, self._room(request, request.plan), started, reason)
+        plan = min(plans, key=lambda plan: float(np.linalg.norm((plan[0] - proposal) / self._scale)))
+        reason = f"the proposal comes {-room:.3g} m too near by the nominal model"
+        return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason)
+
+    def positions(self, state: Array, plans: Array) -> Array:
+        """Return the positions (P, N · SAMPLES, 2) that the nominal model predicts for plans (P, N, 2)."""
+        robot, count = self.robot, len(plans)
+        dt = robot.period / SAMPLES
+        kept = math.exp(-dt / self.settings["lag"])
+        lag = (1.0 - kept) * self.settings["lag"] / dt  # share of the old speed in the mean of a sample
+        speeds = np.tile(state[robot.speed_indices], (count, 1))
+        heading, place = np.full(count, state[robot.heading or 0]), np.tile(state[:2], (count, 1))
+        path = np.empty((count, robot.horizon, SAMPLES, 2))
+        for k in range(robot.horizon):
+            for i in range(SAMPLES):
+                travelled = dt * (plans[:, k] + (speeds - plans[:, k]) * lag)
+                middle = heading + 0.5 * travelled[:, 1]
+                place = place + travelled[:, :1] * np.column_stack([np.cos(middle), np.sin(middle)])
+                heading = heading + travelled[:, 1]
+                speeds = plans[:, k] + (speeds - plans[:, k]) * kept
+                path[:, k, i] = place
+        return path.reshape(count, -1, 2)
+
+    def _room(self, request: Request, plan: Array) -> float:
+        """Return the least distance of a plan to an obstacle, less the margin [m]."""
+        path = self.positions(request.state, plan[None])[0]
+        lengths, _ = self.distances(request, path)
+        return float(lengths.min(initial=math.inf)) - self.settings["margin"]
+
+    def _solve(self, request: Request, proposal: Array, start: Array) -> Array | None:
+        """Return the plan (N, 2) to which the programs converge from a start, if the nominal model is clear on it."""
+        robot, free = self.robot, self._free
+        bounds = np.concatenate([np.tile(robot.high() / self._scale, free), np.tile(-robot.low() / self._scale, free)])
+        wanted = (braking_plan(robot, proposal)[:free] / self._scale).ravel()
+        both = np.vstack([np.eye(len(wanted)), -np.eye(len(wanted))])
+        z = (start[:free] / self._scale).ravel()
+        for _ in range(ITERATIONS):
+            A, b = self._rows(request, z)
+            program = QuadraticProgram(
+                self._cost, -self._cost * wanted, np.vstack([A, both]), np.concatenate([b, bounds]), len(both)
+            )
+            solution = solve(program)
+            if not solution.found or solution.residual > CONVERGED:
+                return None
+            moved, z = float(np.abs(solution.x - z).max()), solution.x
+            if moved < CONVERGED:
+                break
+        plan = self._plan(z)
+        return plan if self._room(request, plan) >= -ACCURACY else None
+
+    def _plan(self, z: Array) -> Array:
+        """Return the plan of scaled free inputs: within the bounds, and zero at the end."""
+        inputs = np.clip(z.reshape(self._free, -1) * self._scale, self.robot.low(), self.robot.high())
+        return np.vstack([inputs, np.zeros((1, self.robot.action_dim))])
+
+    def _rows(self, request: Request, z: Array) -> tuple[Array, Array]:
+        """Return the linearised distances as rows A z <= b of unit length, those that the inputs can change."""
+        steps = np.vstack([np.zeros_like(z), STEP * np.eye(len(z))])
+        path = self.positions(request.state, np.stack([self._unclipped(z + step) for step in steps]))
+        slopes = (path[1:] - path[0]) / STEP  # (free inputs, samples, 2)
+        lengths, normals = self.distances(request, path[0])
+        rows = -np.einsum("isd,fsd->isf", normals, slopes).reshape(-1, len(z))
+        level = (lengths - self.settings["margin"]).ravel() + rows @ z
+        sizes = np.linalg.norm(rows, axis=1)
+        moved = sizes > CONVERGED
+        return rows[moved] / sizes[moved, None], level[moved] / sizes[moved]
+
+    def _unclipped(self, z: Array) -> Array:
+        return np.vstack([z.reshape(self._free, -1) * self._scale, np.zeros((1, self.robot.action_dim))])
