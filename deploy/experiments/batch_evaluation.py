@@ -43,7 +43,7 @@ def drive_batch(
     from brakeline.deploy.experiments.evaluate import FRESH
 
     safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
-    others = {"accept_bound": what.accept_bound, "conditions": what.conditions}
+    others: dict[str, Any] = {"accept_bound": what.accept_bound, "conditions": what.conditions}
     drive_episodes(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take, **others)
 
 

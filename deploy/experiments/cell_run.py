@@ -49,7 +49,8 @@ COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_m
 COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
 LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")
 
-Take, Begin = Callable[[pb.Step], object], Callable[[pb.Episode], object]
+Take = Callable[[pb.Step], object]
+Begin = Callable[[pb.Episode], object]
 
 
 class CellRun:

@@ -166,8 +166,9 @@ def write_decision(answers: dict[str, Any], row: int, decision: Decision, xp: An
         "score": np.nan if decision.score is None else decision.score,
     }
     for name, value in values.items():
-        if np.size(value):
-            answers[name][row] = xp.asarray(np.asarray(value, dtype=float), device=device)
+        array = np.asarray(value, dtype=float)
+        if array.size:
+            answers[name][row] = xp.asarray(array, device=device)
     for name in ("at_least", "verified", "contained", "compared"):
         answers[name][row] = getattr(decision, name)
     answers["for_clearance"][row] = bool(decision.for_clearance)
