@@ -133,6 +133,7 @@ class Task:
     reward: Reward = field(default_factory=Reward)
     trajectories: int = 200  # number to record for a model set, 300 periods each
     steps: int = 60_000  # training steps in a comparison
+    simulator_version: int = 1  # raise it if the motion changes: what an older simulator recorded is recorded again
     symmetry: Literal["none", "turns"] = "none"  # turns: the task is invariant to quarter turns and mirroring
     rivals: Rivals = field(default_factory=Rivals)
     folder: Path = Path()  # folder of the task's file

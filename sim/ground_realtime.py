@@ -62,12 +62,12 @@ class RealtimeGroundRobot(GroundRobot):
     """
 
     def __init__(
-        self, arena: Arena, rng: np.random.Generator, noise: NoiseLevels | None = None, **physics: float
+        self, arena: Arena, rng: np.random.Generator, noise: NoiseLevels | None = None, **physics: Any
     ) -> None:
         """Place the robot at the start of an arena.
 
         Args:
-            physics: `payload_kg` and `floor_friction`, as for `GroundRobot`.
+            physics: `payload_kg`, `floor_friction` and `process_noise`, as for `GroundRobot`.
         """
         super().__init__(arena, rng, noise, **physics)
         noise = noise or NoiseLevels()
@@ -80,11 +80,12 @@ class RealtimeGroundRobot(GroundRobot):
     def drive(self, input: Array) -> None:
         """Drive at an input (2,) from now on, clipped as by `set_input`."""
         self.set_input(input)
-        self._set_wheels(self.input)
 
     def advance(self) -> None:
         """Advance to the next sample, by `SAMPLE_TIME` seconds."""
         before = self._true_pose()
+        self._controls, self._forces = self._disturbed(self.input, 1)
+        self.begin_sample(0)
         touches = self._physics.advance(at_rest=not self.input.any())
         self.collisions += touches and not self._touches
         self._touches = touches

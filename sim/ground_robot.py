@@ -13,9 +13,10 @@ import numpy as np
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
+from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
-from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.sim_conditions import Conditions, ProcessNoise
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
 
@@ -29,11 +30,17 @@ YAW_RATE = 5  # its index among the speeds
 SAMPLES = 10  # of encoders and gyro in a period
 SAMPLE_TIME = GROUND.period / SAMPLES  # s
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of the payload
+ONLY = np.zeros(1, dtype=np.intp)  # the rows of disturbances of a single robot
 
 
 def prefix(number: int) -> str:
     """Return the prefix of the names of a robot's parts in a model of several robots."""
     return f"{number} " if number else ""
+
+
+def weight(model: mujoco.MjModel, base: int) -> float:
+    """Return the weight [N] of the robot, payload included, whose base is this body of a model."""
+    return float(model.body_subtreemass[base]) * -float(model.opt.gravity[2])
 
 
 def wheel_speeds(inputs: Array) -> Array:
@@ -64,6 +71,7 @@ class TurtleBot(SimulatedVehicle):
         self._wheel_geoms = [model.geom(f"{prefix(number)}{side} wheel").id for side in ("left", "right")]
         self._qpos, self._qvel = data.qpos[q : q + COORDINATES], data.qvel[v : v + SPEEDS]  # views of the world's
         self._ctrl = data.ctrl[u : u + GROUND.action_dim]
+        self._force = data.xfrc_applied[self._base, :2]
 
     def setters(self) -> dict[str, Callable[[float], None]]:
         """Return what `alter` can change: a payload, the floor, and the force of the left wheel's motor."""
@@ -88,6 +96,15 @@ class TurtleBot(SimulatedVehicle):
         if coefficient == 0.0:
             raise ValueError("floor_friction is positive, not 0")
         self._model.geom_friction[self._wheel_geoms, 0] = coefficient
+
+    def start_disturbances(self, noise: ProcessNoise | None, rng: np.random.Generator) -> None:
+        """Begin an episode's disturbances, before the robot settles on its wheels.
+
+        They come from a generator spawned from the episode's, which gives the numbers that it gives without them.
+        """
+        self._draws = rng.spawn(1)[0]
+        self._disturbances = DrivingDisturbances(noise or ProcessNoise(), 1, SAMPLE_TIME)
+        self._disturbances.begin(ONLY, self._draws.standard_normal((1, DRAWS_AT_START)))
 
     def start_estimation(self, noise: NoiseLevels | None, rng: np.random.Generator) -> None:
         """Start to measure, once the robot has settled on its wheels."""
@@ -114,11 +131,15 @@ class TurtleBot(SimulatedVehicle):
         self.input = GROUND.clip_input(input, self.input)
 
     def begin_period(self, input: Array) -> None:
-        """Set the wheels, and begin to record samples."""
-        self._set_wheels(input)
+        """Draw the disturbances of the period, and begin to record samples."""
+        self._controls, self._forces = self._disturbed(input, SAMPLES)
         self._positions, self._angles = np.empty((SAMPLES, 2)), np.empty((SAMPLES, 2))
         self._headings = np.empty(SAMPLES + 1)
         self._headings[0] = self._true_heading()
+
+    def begin_sample(self, i: int) -> None:
+        """Set the wheels' speeds, and the force of the floor's tilt, of the i-th sample of the period."""
+        self._ctrl[:], self._force[:] = self._controls[i], self._forces[i]
 
     def record_sample(self, i: int) -> None:
         """Record the i-th sample of the period."""
@@ -132,9 +153,11 @@ class TurtleBot(SimulatedVehicle):
         self.true, self.measured = self._true_state(), reading.measured
         return self._report(collision, self._positions, reading.path, reading.turned, *contacts)
 
-    def _set_wheels(self, input: Array) -> None:
-        """Set the wheels' speeds for an input (speed [m/s], turn rate [rad/s])."""
-        self._ctrl[:] = wheel_speeds(input)
+    def _disturbed(self, input: Array, samples: int) -> tuple[Array, Array]:
+        """Return the wheels' speeds (samples, 2) [rad/s] for an input (2,), and forces (samples, 2) on the base [N]."""
+        draws = self._draws.standard_normal((1, samples, DRAWS_OF_SAMPLE))
+        factors, tilts = self._disturbances.advance(ONLY, np.array([input.any()]), draws)
+        return wheel_speeds(input) * factors[0], weight(self._model, self._base) * tilts[0]
 
     def _wheels(self) -> Array:
         return np.asarray(self._qpos[WHEELS])
@@ -162,11 +185,13 @@ class GroundRobot(TurtleBot):
         noise: NoiseLevels | None = None,
         payload_kg: float = 0.0,
         floor_friction: float = 1.0,
+        process_noise: ProcessNoise | None = None,
     ) -> None:
         """Place the robot at the start of an arena and let it settle on its wheels."""
         self._physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
         super().__init__(arena, self._physics.model, self._physics.data)
         self.alter(payload_kg=payload_kg, floor_friction=floor_friction)
+        self.start_disturbances(process_noise, rng)
         mujoco.mj_forward(self._model, self._physics.data)
         self._run(np.zeros(GROUND.action_dim))
         self.start_estimation(noise, rng)
@@ -181,6 +206,7 @@ class GroundRobot(TurtleBot):
         self._physics.movers.begin_period()
         collision = False
         for i in range(SAMPLES):
+            self.begin_sample(i)
             collision |= self._physics.advance(at_rest=not input.any())
             self.record_sample(i)
         return collision
@@ -189,4 +215,10 @@ class GroundRobot(TurtleBot):
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
     c = conditions
-    return partial(GroundRobot, noise=c.noise, payload_kg=c.payload_kg, floor_friction=c.floor_friction)
+    return partial(
+        GroundRobot,
+        noise=c.noise,
+        payload_kg=c.payload_kg,
+        floor_friction=c.floor_friction,
+        process_noise=c.process_noise,
+    )

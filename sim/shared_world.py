@@ -55,8 +55,9 @@ class GroundWorld:
         self._model = _build(arenas)
         self._data = mujoco.MjData(self._model)
         self.robots = [TurtleBot(arena, self._model, self._data, i) for i, arena in enumerate(arenas)]
-        for robot in self.robots:
+        for robot, rng in zip(self.robots, rngs, strict=True):
             robot.alter(payload_kg=conditions.payload_kg, floor_friction=conditions.floor_friction)
+            robot.start_disturbances(conditions.process_noise, rng)
         self._owner = _owners(self._model, len(arenas))
         self._physics_steps = round(SAMPLE_TIME / self._model.opt.timestep)
         self._touching: set[tuple[int, int]] = set()
@@ -79,6 +80,8 @@ class GroundWorld:
         for robot, input in zip(self.robots, inputs, strict=True):
             robot.begin_period(input)
         for i in range(SAMPLES):
+            for robot in self.robots:
+                robot.begin_sample(i)
             for _ in range(self._physics_steps):
                 # step2 before step1, so that the contacts belong to the new position
                 mujoco.mj_step2(self._model, self._data)

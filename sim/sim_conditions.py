@@ -1,4 +1,4 @@
-"""Simulation conditions that can differ between the recorded data and a run: sensor noise, payload, friction, wind.
+"""Simulation conditions that can differ between the recorded data and a run: noise, payload, friction, wind.
 
 This module imports nothing slow: every command that starts a run reads it.
 """
@@ -27,6 +27,27 @@ class NoiseLevels:
     lidar: float = 0.01  # m, each ray
     drift_position: float = 0.001  # m, odometry's drift in a period as the estimator assumes it
     drift_heading: float = 0.0015  # rad, the same for the heading
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Standard deviations of the disturbances of the ground robot's true motion, cut off at three of them.
+
+    The wheels' speeds and the tilts of the floor fluctuate as first-order Gauss-Markov processes, with a value for each
+    sample of 20 ms. `scale` = 0 switches all of them off.
+
+    Sources: the motors of a TurtleBot3 Burger (XL430-W250) take speeds in units of 0.229 rev/min, which is 0.3 % of the
+    fastest speed of a wheel and 1.6 % of a fifth of it. A finished floor may deviate by 4 mm within 1 m (DIN 18202,
+    table 3, line 3). The ROBOTIS navigation files assume errors of motion of 20 % (alpha1 to alpha4 of AMCL), so these
+    values are small.
+    """
+
+    scale: float = 1.0  # multiplies every standard deviation below
+    motor_gain: float = 0.01  # relative error of each motor's speed, constant over an episode
+    wheel_speed: float = 0.015  # relative fluctuation of each wheel's speed: load, battery, dirt
+    wheel_correlation: float = 0.3  # s
+    floor_tilt: float = 0.004  # rad, about each axis: 4 mm within 1 m
+    floor_correlation: float = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -105,10 +126,12 @@ class Conditions:
     flight_noise: QuadrotorNoise = field(default_factory=QuadrotorNoise)
     wind: Wind = field(default_factory=Wind)
     perception: Perception = field(default_factory=Perception)
+    process_noise: ProcessNoise = field(default_factory=ProcessNoise)
 
     def describe(self) -> dict[str, str]:
         """Return every condition with its value, for metadata and printed results."""
         values = asdict(self.noise) | {"payload_kg": self.payload_kg, "floor_friction": self.floor_friction}
+        values |= {f"process_{name}": value for name, value in asdict(self.process_noise).items()}
         values |= {f"flight_{name}": value for name, value in asdict(self.flight_noise).items()}
         values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}
         texts = {name: "drawn" if value is None else f"{value:g}" for name, value in values.items()}

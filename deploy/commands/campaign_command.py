@@ -33,8 +33,8 @@ class CampaignCommand:
     """Filter with these model sets: auto (the one in use), one-step, residual, set-membership or matrix-zonotope (in
     the mode direct), or none for no filter."""
     perturbations: tuple[str, ...] = ("as-recorded",)
-    """Change the robot like this: as-recorded, noisy, payload, slippery (ground robots), wind (in the air), scan or
-    faulty-scan."""
+    """Change the robot like this: as-recorded, noisy, payload, slippery, uneven (ground robots), wind (in the air),
+    scan or faulty-scan."""
     episodes: int = 1000
     """Drive this many episodes of each cell. A later campaign with more of them goes on after these."""
     search: int = 0

@@ -15,7 +15,15 @@ import tyro
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.safety.model.model_config import ModelConfig
-from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, SensorFaults, Wind
+from brakeline.sim.sim_conditions import (
+    Conditions,
+    NoiseLevels,
+    Perception,
+    ProcessNoise,
+    QuadrotorNoise,
+    SensorFaults,
+    Wind,
+)
 
 if TYPE_CHECKING:
     from brakeline.deploy.run.run_config import RunConfig
@@ -124,6 +132,8 @@ class PhysicsOptions:
     """Set the friction coefficient of the wheels on the floor."""
     noise: float = 1.0
     """Scale all sensor errors by this factor."""
+    process_noise: float = 1.0
+    """Scale the disturbances of the ground robot's motion by this factor: unequal motors, uneven wheels and floor."""
     wind: float = 0.0
     """Blow at the quadrotor with this mean wind speed [m/s]. Each episode draws its direction anew."""
     gust: float = 0.0
@@ -154,6 +164,7 @@ class PhysicsOptions:
             QuadrotorNoise(scale=self.noise),
             Wind(self.wind, gust=self.gust),
             Perception(self.perception, faults, self.tracks),
+            ProcessNoise(scale=self.process_noise),
         )
 
 

@@ -8,15 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from brakeline.deploy.data.excitation import excitation, restless_excitation
+from brakeline.deploy.data.recording_origin import origin
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
-from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.model.dataset import RESTLESS, Dataset, Trajectory
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
 PERIODS, RESTLESS_PERIODS = 300, 60  # per trajectory; the restless ones are short, so there are many starts
-ORIGIN = "collect"
 
 
 def record(
@@ -47,14 +46,9 @@ def record(
 
 
 def dataset(
-    robot: Robot, trajectories: list[Trajectory], seed: int, conditions: Conditions, restless: int = 0
+    robot: RobotWithTask, trajectories: list[Trajectory], seed: int, conditions: Conditions, restless: int = 0
 ) -> Dataset:
     """Return the trajectories as a checked data set, with its origin in `about`."""
-    data = Dataset(robot, tuple(trajectories), origin(seed, conditions, restless))
+    data = Dataset(robot, tuple(trajectories), origin(robot, seed, conditions, restless))
     data.check()
     return data
-
-
-def origin(seed: int, conditions: Conditions, restless: int = 0) -> dict[str, str]:
-    """Return the `about` entries of a recording: conditions, seed, origin, and how many trajectories are restless."""
-    return conditions.describe() | {"seed": str(seed), "origin": ORIGIN, RESTLESS: str(restless)}

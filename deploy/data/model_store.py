@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import method_path, model_path, record_path
+from brakeline.deploy.data.recording_origin import outdated
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData, BadModel
 from brakeline.messaging.robot import Robot
@@ -80,10 +81,12 @@ def _load_or_build(path: Path, load: Callable[[], M], build: Callable[[], M], ac
 
 
 def _load_model_set(path: Path, robot: Robot) -> ModelSet:
-    """Load a model set. Raises BadModel if the file is missing or belongs to another description."""
+    """Load a model set. Raises BadModel if the file is missing, or of another description or simulator."""
     model = ModelSet.load(path)
     if model.robot.layout() != robot.layout():
         raise BadModel(f"the description of {robot.name} has changed")
+    if outdated(robot, model.about):
+        raise BadModel(f"the simulator of {robot.name} has changed since the recording")
     return model
 
 
@@ -131,7 +134,7 @@ def _shipped(robot: Robot) -> ModelSet | None:
     """Return the model set that comes with a robot, or None if there is none for this description."""
     with suppress(BadModel):
         model = ModelSet.load(robot.name)
-        return model if model.robot.layout() == robot.layout() else None
+        return model if model.robot.layout() == robot.layout() and not outdated(robot, model.about) else None
     return None
 
 
@@ -166,19 +169,23 @@ def pretrained(robot: RobotWithTask, method: str, config: RivalConfig, again: bo
     if again:
         with folder_lock(path.parent):
             return build()
-    return _load_or_build(path, partial(_load_rival, path, config), build, f"pre-training {method}")
+    return _load_or_build(path, partial(_load_rival, path, robot, config), build, f"pre-training {method}")
 
 
-def _load_rival(path: Path, config: RivalConfig) -> Pretrained:
-    """Load a rival's model. Raises BadModel if the file is missing, damaged or of another configuration."""
+def _load_rival(path: Path, robot: RobotWithTask, config: RivalConfig) -> Pretrained:
+    """Load a rival's model.
+
+    Raises:
+        BadModel: the file is missing or damaged, or has another configuration or simulator.
+    """
     from brakeline.deploy.data.rival_pretraining import made_by
 
     try:
         model = Pretrained.decode(path.read_bytes())
     except OSError as error:
         raise BadModel(f"{path}: {error}") from error
-    if not made_by(model, config):
-        raise BadModel(f"{path} was trained with another configuration")
+    if not made_by(model, robot, config):
+        raise BadModel(f"{path} was trained with another configuration, or before the simulator changed")
     return model
 
 

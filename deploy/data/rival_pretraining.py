@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from brakeline.deploy.data.recording_origin import VERSION, simulator_changed
 from brakeline.deploy.data.rival_rollouts import Each, SailrConfig, SecasConfig, costs, transitions
 from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
@@ -48,9 +49,9 @@ def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
     return CONFIGS[method](**getattr(robot.task.rivals, method))
 
 
-def made_by(model: Pretrained, config: RivalConfig) -> bool:
-    """Return whether the model was trained with this configuration."""
-    return model.about.get("recipe") == json.dumps(asdict(config))
+def made_by(model: Pretrained, robot: RobotWithTask, config: RivalConfig) -> bool:
+    """Return whether the model was trained with this configuration, in today's simulator of the robot."""
+    return model.about.get("recipe") == json.dumps(asdict(config)) and not simulator_changed(robot, model.about)
 
 
 def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: None) -> Pretrained:
@@ -69,6 +70,7 @@ def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: Non
         return _by_hand(robot, config)
     about |= {"recipe": json.dumps(asdict(config)), "seconds": f"{time.perf_counter() - started:.0f}"}
     about |= {name: str(getattr(config, name)) for name in ("samples", "arena", "seed")}
+    about[VERSION] = str(robot.task.simulator_version)
     return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
 
 
@@ -76,7 +78,7 @@ def _by_hand(robot: RobotWithTask, config: BarrierConfig | PredictiveConfig) -> 
     """Return the model of a rival that knows a unicycle by hand: settings alone."""
     settings = asdict(config)
     about = {"recipe": json.dumps(settings), "samples": "0", "collisions": "0", "seconds": "0"}
-    about["error"] = "nothing was fitted"
+    about |= {"error": "nothing was fitted", VERSION: str(robot.task.simulator_version)}
     return Pretrained(robot, CBF if isinstance(config, BarrierConfig) else PSF, {}, settings, about)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.recording_origin import ORIGIN, origin, outdated
 from brakeline.deploy.progress import console, each
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
@@ -30,7 +31,7 @@ def load_or_record(
     conditions: Conditions | None = None,
     again: bool = False,
 ) -> Dataset:
-    """Load the data set at `path`. Record it first if the file is missing, or if `again`.
+    """Load the data set at `path`. Record it first if the file is missing or outdated, or if `again`.
 
     A recording ends with restless trajectories, half as many as others. The linear forms are not fitted to them, so
     that their model sets stay what they are (`Dataset.steady`).
@@ -39,14 +40,26 @@ def load_or_record(
         BadData: `again` would overwrite data that do not come from the simulator.
     """
     path = path or record_path(robot)
-    if path.exists() and not again:
+    if not again and _usable(path, robot):
         return Dataset.load(path)
     with folder_lock(path.parent):
-        if path.exists() and not again:
+        if not again and _usable(path, robot):
             return Dataset.load(path)
         _check_replaceable(path, robot)
+        if not again and path.exists():
+            aside = path.replace(path.with_suffix(".replaced"))
+            console.print(
+                f"recording again: {path} was recorded before the simulator of {robot.name} changed. The file before "
+                f"is now {aside}",
+                markup=False,
+            )
         count = trajectories or needs_task(robot).task.trajectories
         return _record(needs_task(robot), path, count, seed, conditions or Conditions())
+
+
+def _usable(path: Path, robot: Robot) -> bool:
+    """Return whether there is a data set at `path` that does not come from an older simulator of the robot."""
+    return path.exists() and not outdated(robot, Dataset.about_of(path))
 
 
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
@@ -55,7 +68,7 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     restless = math.ceil(RESTLESS_SHARE * trajectories)
     total = trajectories + restless
-    driven = _load_partial(part, robot, collect.origin(seed, conditions, restless))
+    driven = _load_partial(part, robot, origin(robot, seed, conditions, restless))
     before = f"{len(driven)} of them recorded before" if driven else _duration(PACE * trajectories)
     console.print(
         f"recording {robot.name} once, into {path}: {total} trajectories, {before}. You can interrupt it: the "
@@ -86,14 +99,12 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
 
 def _check_replaceable(path: Path, robot: Robot) -> None:
     """Raise BadData if the data set at `path` does not come from the simulator: a recording must not replace it."""
-    from brakeline.deploy.data import collect
-
     about = Dataset.about_of(path)
-    origin = about.get("origin", collect.ORIGIN)
-    if origin != collect.ORIGIN:
+    kind = about.get("origin", ORIGIN)
+    if kind != ORIGIN:
         source = about.get("sources", about.get("source", ""))
         raise BadData(
-            f"{path} is kept: the data do not come from the simulator ({origin}{f': {source}' if source else ''}). If "
+            f"{path} is kept: the data do not come from the simulator ({kind}{f': {source}' if source else ''}). If "
             f"the description of {robot.name} has changed, import the log again (`brakeline import LOG --robot ...`). "
             f"To record in the simulator, move the file away first, or call `collect` with another --out."
         )

@@ -30,11 +30,12 @@ PERTURBATIONS = {
     "noisy": PhysicsOptions(noise=1.5),
     "payload": PhysicsOptions(payload=1.0),
     "slippery": PhysicsOptions(friction=0.3),
+    "uneven": PhysicsOptions(process_noise=2.0),
     "wind": PhysicsOptions(wind=2.0, gust=0.5),
     "scan": PhysicsOptions(perception="scan"),
     "faulty-scan": PhysicsOptions(perception="scan", dropped=0.1, ghosts=0.01),
 }
-GROUND_ONLY, AIR_ONLY = ("payload", "slippery"), ("wind",)
+GROUND_ONLY, AIR_ONLY = ("payload", "slippery", "uneven"), ("wind",)
 MODEL_SETS = ("auto", "one-step", *KINDS)  # the mode one-step, or an error bound in the mode direct
 
 

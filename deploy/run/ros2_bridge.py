@@ -93,7 +93,8 @@ class Bridge:
         rng = np.random.default_rng((settings.seed, 11))
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
-        self.robot = RealtimeGroundRobot(arena, rng, c.noise, payload_kg=c.payload_kg, floor_friction=c.floor_friction)
+        physics = {"payload_kg": c.payload_kg, "floor_friction": c.floor_friction, "process_noise": c.process_noise}
+        self.robot = RealtimeGroundRobot(arena, rng, c.noise, **physics)
         self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
         self._start_time = 1.0 if settings.sim_time else time.time()  # s, the robot's time at the first sample
         self._samples = 0

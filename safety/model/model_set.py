@@ -251,7 +251,7 @@ class ModelSet:
             BadModel: the file holds no model set, or no shipped robot has that name. The message names the source.
 
         >>> ModelSet.load("ground")
-        ModelSet('ground', residual, direct, version '65e60d68390b', at most 0.43 % of plans outside)
+        ModelSet('ground', residual, direct, version 'ade8bf47fe17', at most 0.43 % of plans outside)
         """
         path = Path(source)
         if isinstance(source, str) and not path.suffix and not path.exists():

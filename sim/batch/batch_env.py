@@ -190,12 +190,12 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
     def _begin(self, rows: NDArray[np.intp], episodes: list[int]) -> tuple[Observations, Infos]:
         """Begin episodes with these seeds; return the observations and infos of the rows."""
         arenas: list[Arena] = []
-        for row, episode in zip(rows.tolist(), episodes, strict=True):
-            generator = np.random.default_rng((self.seed_key, episode))
+        generators = [np.random.default_rng((self.seed_key, episode)) for episode in episodes]
+        for row, episode, generator in zip(rows.tolist(), episodes, generators, strict=True):
             arenas.append(draw_arena(self.arena_name, generator, self.robot))
             self._streams.begin(row, generator)
             self._arenas[row], self._seeds[row], self._goals[row] = arenas[-1], episode, arenas[-1].goal
-        self._robots.begin(rows, arenas)
+        self._robots.begin(rows, arenas, generators)
         self._observations.begin(rows)
         self._steps[rows], self._ended[rows] = 0, False
         self._measure_distance(rows)

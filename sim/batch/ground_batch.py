@@ -21,6 +21,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch
+from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_robot import (
     COORDINATES,
@@ -33,6 +34,7 @@ from brakeline.sim.ground_robot import (
     WHEELS,
     YAW_RATE,
     TurtleBot,
+    weight,
     wheel_speeds,
 )
 from brakeline.sim.sim_conditions import Conditions
@@ -40,6 +42,7 @@ from brakeline.sim.sim_conditions import Conditions
 Rows = NDArray[np.intp]
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+CONTROL = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 BARE = Arena("bare", (), (0.0, 0.0, 0.0), (0.0, 0.0), 0.0, 1, ((-1.0, 1.0), (-1.0, 1.0)))
 SAFE_GAP = 0.01  # m; the wheels turn too slowly to cover it between two samples
 
@@ -102,6 +105,9 @@ class GroundBatch:
         self._clearance = np.zeros(size)
         self._arenas: list[Arena] = [BARE] * size
         self._near: dict[int, FloorPhysics] = {}
+        self._base = model.body("base").id
+        self._draws = NormalStreams(size)
+        self._disturbances = DrivingDisturbances(conditions.process_noise, size, SAMPLE_TIME)
         self._estimator = GroundEstimatorBatch(size, conditions.noise, streams, WHEEL_RADIUS, SAMPLE_TIME)
         self.obstacles = ObstacleBatch(size, kind)
         self.true, self.measured = np.zeros((size, GROUND.state_dim)), np.zeros((size, GROUND.state_dim))
@@ -111,10 +117,14 @@ class GroundBatch:
         """End the threads."""
         self._rollout.close()
 
-    def begin(self, rows: Rows, arenas: list[Arena]) -> None:
-        """Place robots at the starts of their arenas, and let them settle on their wheels."""
+    def begin(self, rows: Rows, arenas: list[Arena], generators: list[np.random.Generator]) -> None:
+        """Place robots at the starts of their arenas, and let them settle on their wheels.
+
+        generators: of the episodes. The disturbances come from generators spawned from them.
+        """
         model, data = self._physics.model, self._physics.data
-        for row, arena in zip(rows.tolist(), arenas, strict=True):
+        for row, arena, generator in zip(rows.tolist(), arenas, generators, strict=True):
+            self._draws.begin(row, generator.spawn(1)[0])
             self._near.pop(row, None)
             self._arenas[row] = arena
             self.obstacles.put(row, arena)
@@ -124,6 +134,7 @@ class GroundBatch:
             mujoco.mj_forward(model, data)
             mujoco.mj_getState(model, data, self._state[row], STATE)
             self._warmstart[row] = data.qacc_warmstart
+        self._disturbances.begin(rows, self._draws.normal(rows, DRAWS_AT_START))
         self.input[rows] = 0.0
         starts = np.array([arena.start[:2] for arena in arenas]).reshape(-1, 1, 2)
         self._clearance[rows] = self.obstacles.clearance(rows, starts)[:, 0] - GROUND.footprint
@@ -147,18 +158,19 @@ class GroundBatch:
         """Simulate a period of the physics. It uses no array but the robots' own motion, so it may run in a thread."""
         reach = GROUND.period * np.maximum(self.input[rows, 0], np.abs(self.true[rows, 3])) + SAFE_GAP
         near = self._clearance[rows] < reach
+        controls, forces = self._disturbed(rows)
         coordinates = np.empty((len(rows), SAMPLES, COORDINATES))
         clearance, collision = np.empty((len(rows), SAMPLES)), np.zeros(len(rows), dtype=bool)
         before = self._state[rows], self._warmstart[rows]
         if not near.all():
             far = rows[~near]
-            coordinates[~near] = self._roll(far)
+            coordinates[~near] = self._roll(far, controls[~near], forces[~near])
             clearance[~near] = self.obstacles.clearance(far, coordinates[~near, :, :2]) - GROUND.footprint
             doubtful = clearance.min(axis=1) < SAFE_GAP
             near |= doubtful & ~near
         for i in np.flatnonzero(near):
             self._state[rows[i]], self._warmstart[rows[i]] = before[0][i], before[1][i]
-            collision[i] = self._advance_in_arena(int(rows[i]), coordinates[i])
+            collision[i] = self._advance_in_arena(int(rows[i]), coordinates[i], controls[i], forces[i])
         if near.any():
             clearance[near] = self.obstacles.clearance(rows[near], coordinates[near, :, :2]) - GROUND.footprint
         self._clearance[rows] = clearance[:, -1]
@@ -183,12 +195,25 @@ class GroundBatch:
         robot.alter(payload_kg=self._conditions.payload_kg, floor_friction=self._conditions.floor_friction)
         return physics
 
-    def _roll(self, rows: Rows) -> Array:
+    def _disturbed(self, rows: Rows) -> tuple[Array, Array]:
+        """Return the wheels' speeds [rad/s] and the forces on the base [N], (rows, S, 2) each: see `TurtleBot`."""
+        draws = self._draws.normal(rows, SAMPLES * DRAWS_OF_SAMPLE).reshape(-1, SAMPLES, DRAWS_OF_SAMPLE)
+        factors, tilts = self._disturbances.advance(rows, np.asarray(self.input[rows].any(axis=1)), draws)
+        return wheel_speeds(self.input[rows])[:, None] * factors, weight(self._physics.model, self._base) * tilts
+
+    def _roll(self, rows: Rows, controls: Array, forces: Array) -> Array:
         """Simulate a period without obstacles; return the coordinates (rows, S, 9) at the samples."""
-        model, steps = self._physics.model, SAMPLES * self._steps
-        control = np.repeat(wheel_speeds(self.input[rows])[:, None], steps, axis=1)
+        model = self._physics.model
+        inputs = np.zeros((len(rows), SAMPLES, mujoco.mj_stateSize(model, CONTROL)))
+        force = model.nu + 6 * self._base  # MuJoCo's order: controls, then a force and a torque on each body
+        inputs[:, :, : model.nu], inputs[:, :, force : force + 2] = controls, forces
         states, _ = self._rollout.rollout(
-            model, self._data, self._state[rows], control, initial_warmstart=self._warmstart[rows]
+            model,
+            self._data,
+            self._state[rows],
+            np.repeat(inputs, self._steps, axis=1),
+            control_spec=CONTROL,
+            initial_warmstart=self._warmstart[rows],
         )
         self._state[rows] = states[:, -1]
         speeds = states[:, -2:, 1 + COORDINATES : 1 + COORDINATES + SPEEDS]
@@ -196,17 +221,18 @@ class GroundBatch:
         self._warmstart[rows] = (speeds[:, 1] - speeds[:, 0]) / model.opt.timestep
         return np.asarray(states[:, self._steps - 1 :: self._steps, 1 : 1 + COORDINATES])
 
-    def _advance_in_arena(self, row: int, coordinates: Array) -> bool:
+    def _advance_in_arena(self, row: int, coordinates: Array, controls: Array, forces: Array) -> bool:
         """Simulate a period of a robot in its arena, and fill in `coordinates` (S, 9). Return whether it collided."""
         if row not in self._near:
             self._near[row] = self._floor_physics(self._arenas[row])
         physics = self._near[row]
         model, data = physics.model, physics.data
         mujoco.mj_setState(model, data, self._state[row], STATE)
-        data.qacc_warmstart[:], data.ctrl[:] = self._warmstart[row], wheel_speeds(self.input[row])
+        data.qacc_warmstart[:] = self._warmstart[row]
         mujoco.mj_step1(model, data)
         collision = False
         for i in range(SAMPLES):
+            data.ctrl[:], data.xfrc_applied[self._base, :2] = controls[i], forces[i]
             collision |= physics.advance(at_rest=False)
             coordinates[i] = data.qpos
         mujoco.mj_getState(model, data, self._state[row], STATE)

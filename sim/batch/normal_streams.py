@@ -1,4 +1,4 @@
-"""The sensor noise of many robots, each from its own random generator."""
+"""The noise of many robots, each from its own random generator."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ class NormalStreams:
         """Use this generator from now on. Nobody else may draw from it."""
         self._generators[row] = generator
         self._next[row] = DRAWN
+
+    def normal(self, rows: Rows, size: int) -> Array:
+        """Draw numbers (rows, size) with a standard deviation of 1."""
+        return self._take(rows, np.ones((len(rows), size), dtype=bool))
 
     def cut_normal(self, rows: Rows, sigma: float, size: int) -> Array:
         """Draw numbers (rows, size) with a standard deviation `sigma`, cut off as `cut_normal` does."""

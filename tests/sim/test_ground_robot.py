@@ -1,4 +1,4 @@
-"""The ground robot's motion and its collisions."""
+"""The ground robot's motion without disturbances, and its collisions."""
 
 import math
 
@@ -12,11 +12,12 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import NoiseLevels
 from brakeline.sim.ground_robot import GroundRobot
 from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.sim_conditions import ProcessNoise
 from brakeline.sim.vehicle import Period
 from tests.arenas import staged_arena as room
 from tests.robots import GROUND
 
-QUIET = NoiseLevels(scale=0.0)
+QUIET, EVEN = NoiseLevels(scale=0.0), ProcessNoise(scale=0.0)
 
 
 def pillar(x: float, y: float, radius: float) -> Obstacle:
@@ -24,7 +25,7 @@ def pillar(x: float, y: float, radius: float) -> Obstacle:
 
 
 def robot(arena: Arena | None = None, **options: float) -> GroundRobot:
-    return GroundRobot(arena or room(), np.random.default_rng(0), QUIET, **options)
+    return GroundRobot(arena or room(), np.random.default_rng(0), QUIET, process_noise=EVEN, **options)
 
 
 def drive(vehicle: GroundRobot, speed: float, turn: float, periods: int = 1) -> Period:

@@ -14,7 +14,7 @@ from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
-from brakeline.errors import BadData
+from brakeline.errors import BadData, BadModel
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import Dataset
@@ -137,6 +137,28 @@ def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     data_paths.record_path(GROUND).write_bytes(b"damaged")
     assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version, "the same seed, the same data"
     assert len(elsewhere) == 2
+
+
+def test_what_an_older_simulator_recorded_is_recorded_again_and_kept_aside(data_folder, tmp_path, monkeypatch, capsys):
+    """So is a model set of such a recording; one of a log stays in use."""
+    older = replace(GROUND, task=replace(GROUND.task, simulator_version=1))
+    data = Dataset.load(data_paths.record_path(GROUND))
+    model = ModelSet.load(data_paths.model_path(GROUND, ModelConfig()))
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    path, model_path = data_paths.record_path(GROUND), data_paths.model_path(GROUND, ModelConfig())
+    replace(data, about={name: value for name, value in data.about.items() if name != "simulator_version"}).save(path)
+    assert simulated_recording.load_or_record(older).digest() == data.digest(), "no version is the first one"
+    fresh = simulated_recording.load_or_record(GROUND, trajectories=1)
+    assert len(fresh.trajectories) == 2 and fresh.about["simulator_version"] == "2"
+    assert Dataset.load(path.with_suffix(".replaced")).digest() == data.digest()
+    assert "before the simulator of ground changed" in " ".join(capsys.readouterr().err.split())
+    replace(model, about=model.about | {"simulator_version": "1"}).save(model_path)
+    assert model_store.model_for(older, ModelConfig()).version == model.version
+    with pytest.raises(BadModel, match="simulator of ground has changed"):
+        model_store.model_for(GROUND, ModelConfig(), build=False)
+    replace(model, about=model.about | {"simulator_version": "1", "origin": "log"}).save(model_path)
+    assert model_store.model_for(GROUND, ModelConfig()).version == model.version
+    assert model_store._shipped(GROUND) and not model_store._shipped(older)
 
 
 def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_path, monkeypatch):

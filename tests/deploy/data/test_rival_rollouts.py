@@ -1,5 +1,7 @@
 """What the rivals are pre-trained on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,5 +40,7 @@ def test_a_pretrained_model_says_what_it_cost(config_class):
     model = pretrain(GROUND, config, lambda: driven.append(1))
     assert len(driven) >= 300 and ready(model).robot is GROUND
     assert model.about["samples"] == "300" and int(model.about["collisions"]) >= 0 and model.about["error"]
-    assert made_by(model, config) and not made_by(model, config_class())
+    assert made_by(model, GROUND, config) and not made_by(model, GROUND, config_class())
+    older = replace(GROUND, task=replace(GROUND.task, simulator_version=1))
+    assert not made_by(model, older, config), "of another simulator"
     assert type(config) is CONFIGS[model.method]

@@ -109,7 +109,7 @@ def test_what_they_cannot_decide_is_refused_or_braked(method):
 def test_their_models_hold_settings_and_cost_no_recording(name):
     config = config_for(name, GROUND)
     model = pretrain(GROUND, config)
-    assert made_by(model, config) and not made_by(model, replace(config, margin=0.5))
+    assert made_by(model, GROUND, config) and not made_by(model, GROUND, replace(config, margin=0.5))
     assert (model.about["samples"], model.about["collisions"], dict(model.networks)) == ("0", "0", {})
     again = decode(model.encode())
     assert again.version == model.version and ready(again).settings == ready(model).settings
