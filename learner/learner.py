@@ -19,6 +19,7 @@ import numpy as np
 from brakeline.errors import BadStep, CheckpointError, DamagedPart
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.n_step import NStepWindows
 from brakeline.learner.rate_limiter import RateLimiter
@@ -72,6 +73,8 @@ class Learner:
         self._windows, self._ledger = NStepWindows(td3.n_step, td3.gamma, td3.stored), StepLedger()
         ahead = 0.0 if config.lockstep else config.ahead
         self._limiter = RateLimiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
+        limited = td3.cost_limit is not None
+        self._multiplier = LagrangeMultiplier(td3.cost_limit or 0.0, td3.multiplier_rate) if limited else None
         self._limits: dict[str, int] = {}
         self._present: set[str] = set()  # actors that joined by themselves, for which no feeder may speak
         self._episode_ended = True  # whether the last step ended its episode
@@ -114,6 +117,9 @@ class Learner:
         for transition in self._windows.push(step.actor, move):
             self._replay.insert(transition)
         self._limiter.insert()
+        if self._multiplier is not None and (step.terminated or step.truncated):
+            self._multiplier.end_episode(step.collision)
+            self._td3.cost_weight = self._multiplier.value
         self._episode_ended = step.terminated or step.truncated
         self._ages.append(self._version - step.weights_version)
         return True
@@ -324,12 +330,14 @@ class Learner:
                 restore(states[name])
             except Exception as error:  # of another version, for instance
                 raise DamagedPart(name, root, f"damaged: {error}") from error
+        self._td3.cost_weight = 0.0 if self._multiplier is None else self._multiplier.value
         self._encode()
         if self._published_updates != self._td3.updates:
             self.publish()
 
     def _parts(self) -> dict[str, Part]:
-        return {
+        limited: dict[str, Part] = {} if self._multiplier is None else {"multiplier": self._multiplier}
+        return limited | {
             "td3": self._td3,
             "replay": self._replay,
             "windows": self._windows,

@@ -41,6 +41,11 @@ class TD3Config:
     """Scale rewards by this factor. 0.1 keeps values near 10 for rewards of ±100."""
     updates_per_step: float = 1.0
     """Update this many times for each step."""
+    cost_limit: float | None = None
+    """Raise a penalty on collisions until at most this share of the episodes collides (a Lagrange multiplier). None:
+    the reward alone counts."""
+    multiplier_rate: float = 10.0
+    """Raise the penalty by this reward for an episode that collides, with a cost limit."""
     stored: Stored = "both"
     """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
     symmetric: bool = True
@@ -56,6 +61,8 @@ class TD3Config:
             raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
         if self.warmup < self.n_step:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
+        if self.multiplier_rate <= 0.0 or not 0.0 <= (self.cost_limit or 0.0) < 1.0:
+            raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
             raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
 

@@ -40,6 +40,7 @@ class ActorStep(NamedTuple):
     terminated: bool
     truncated: bool
     cut: bool = False  # the episode ends for the learner; reward − penalty is the lowest possible
+    collision: bool = False
 
 
 class NStepWindows:
@@ -77,17 +78,18 @@ class NStepWindows:
 
     def _close(self, moves: deque[ActorStep] | list[ActorStep]) -> list[Transition]:
         first, last = moves[0], moves[-1]
-        reward = 0.0
+        reward = cost = 0.0
         for move in reversed(moves):
             reward = move.reward - move.penalty + self.gamma * reward
+            cost = move.collision + self.gamma * cost
         discount = 0.0 if last.terminated or last.cut else self.gamma ** len(moves)
         if first.cut:
             return self._cut(first)
         if self.stored == "executed" or np.array_equal(first.action, first.proposed):
-            return [Transition(first.observation, first.action, reward, discount, last.next_observation)]
+            return [Transition(first.observation, first.action, reward, discount, last.next_observation, cost)]
         return [
-            Transition(first.observation, first.action, reward + first.penalty, discount, last.next_observation),
-            Transition(first.observation, first.proposed, reward, discount, last.next_observation),
+            Transition(first.observation, first.action, reward + first.penalty, discount, last.next_observation, cost),
+            Transition(first.observation, first.proposed, reward, discount, last.next_observation, cost),
         ]
 
     def _cut(self, move: ActorStep) -> list[Transition]:

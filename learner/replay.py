@@ -11,28 +11,29 @@ from numpy.typing import NDArray
 from brakeline.learner.checkpoint_state import PartState
 
 Vector = NDArray[np.float32]
-NAMES = ("observation", "action", "reward", "discount", "next_observation")
+NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost")
 
 
 class Transition(NamedTuple):
-    """k ≥ 1 steps of one episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), s' after the k-th step."""
+    """k ≥ 1 steps of an episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), s' after step k, C = Σ_j γ^j c_j."""
 
     observation: Vector
     action: Vector  # of the first step, normalised to [−1, 1]
     reward: float
     discount: float
     next_observation: Vector
+    cost: float = 0.0  # c_j is 1 at a collision
 
 
 def _widths(observation_dim: int, action_dim: int) -> tuple[int, ...]:
-    return (observation_dim, action_dim, 1, 1, observation_dim)
+    return (observation_dim, action_dim, 1, 1, observation_dim, 1)
 
 
 class Batch:
     """A batch of transitions that `ReplayBuffer.sample` fills. Torch and NumPy share its memory.
 
     Attributes:
-        observation, action, reward, discount, next_observation: tensors (1, batch, width).
+        observation, action, reward, discount, next_observation, cost: tensors (1, batch, width).
         arrays: the same as arrays (batch, width), in the order of `NAMES`.
     """
 
@@ -40,7 +41,7 @@ class Batch:
         # Torch aligns its memory; with NumPy's alignment, the last bits of a product could differ from run to run.
         tensors = [torch.zeros(1, size, width) for width in _widths(observation_dim, action_dim)]
         self.arrays = tuple(tensor[0].numpy() for tensor in tensors)
-        self.observation, self.action, self.reward, self.discount, self.next_observation = tensors
+        self.observation, self.action, self.reward, self.discount, self.next_observation, self.cost = tensors
 
     def __len__(self) -> int:
         return len(self.arrays[0])

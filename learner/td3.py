@@ -2,12 +2,13 @@
 
 Each coordinate of an action is normalised to [−1, 1]. A transition spans k ≤ n steps (`learner/n_step.py`):
 
-    y     = c·R + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
+    y     = c·(R − λ C) + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
     L_Q   = Σ_i mean (Q_i(s, a) − y)²
     L_π   = −mean Q_1(s, π(s))                                     every `policy_delay`-th update, then
     θ̄     ← θ̄ + τ (θ − θ̄)
 
-with R = Σ_j γ^j r_j over the k steps, d = γ^k (0 at a true end), and c the reward scale.
+with R = Σ_j γ^j r_j over the k steps, C the same sum of costs, λ their weight (0 unless a multiplier sets it;
+`learner/lagrange.py`), d = γ^k (0 at a true end), and c the reward scale.
 """
 
 from __future__ import annotations
@@ -36,11 +37,15 @@ class Losses:
 
 
 class TD3:
-    """The networks, their targets and their optimisers."""
+    """The networks, their targets and their optimisers.
+
+    Attributes:
+        cost_weight: λ.
+    """
 
     def __init__(self, observation_dim: int, action_dim: int, config: TD3Config, seed: int) -> None:
         torch.set_num_threads(1)  # more threads than cores make all processes ten times slower
-        self.config, self.updates, self.losses = config, 0, Losses()
+        self.config, self.updates, self.losses, self.cost_weight = config, 0, Losses(), 0.0
         self._generator = torch.Generator().manual_seed(seed)
         batch, joint = config.batch, observation_dim + action_dim
         actor_sizes = (observation_dim, *config.hidden, action_dim)
@@ -79,6 +84,8 @@ class TD3:
         action = self.target_actor.forward(batch.next_observation).tanh_().add_(noise).clamp_(-1.0, 1.0)
         value = self.target_critics.forward(self._pair(batch.next_observation, action)).amin(dim=0, keepdim=True)
         torch.mul(value, batch.discount, out=self._target)
+        if self.cost_weight:
+            self._target.add_(batch.cost, alpha=-config.reward_scale * self.cost_weight)
         return self._target.add_(batch.reward, alpha=config.reward_scale)
 
     def _pair(self, observation: Tensor, action: Tensor) -> Tensor:

@@ -50,9 +50,8 @@ class StepReader:
         observation = self._observed("observation", step.observation)
         after = self._observed("next_observation", step.next_observation)
         values = action, proposed, step.reward, step.penalty
-        return ActorStep(
-            step.episode, step.step, observation, *values, after, step.terminated, step.truncated, step.cut
-        )
+        ends = step.terminated, step.truncated, step.cut, step.collision
+        return ActorStep(step.episode, step.step, observation, *values, after, *ends)
 
     def _normalised(self, name: str, values: Any, most: float) -> Vector:
         """Return an action in [−1, 1], clipped if it is out of bounds by at most `most`."""

@@ -24,7 +24,8 @@ from brakeline.logs.episode_stats import Figures
 Array = NDArray[np.float64]
 
 METHOD_COLORS = {  # a palette for colour-blind readers
-    **{"ddpc": "#0072b2", "sailr": "#e69f00", "secas": "#009e73", "none": "#d55e00"}
+    **{"ddpc": "#0072b2", "sailr": "#e69f00", "secas": "#009e73", "none": "#d55e00"},
+    **{"lagrange": "#cc79a7", "cbf": "#56b4e9", "psf": "#5d6b7c", "sac": "#b39800", "sac-ddpc": "#000000"},
 }
 OTHER_COLORS = ("#56b4e9", "#cc79a7", "#5d6b7c", "#b39800")  # of groups that share their method with another
 RESAMPLES = 2000

@@ -13,15 +13,13 @@ from rich.markdown import Markdown
 from brakeline.deploy import progress
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_cells import (
-    METHODS,
-    NONE,
     RESULTS,
     RUNS,
-    SEEDS,
     CellConfig,
-    backend_for,
     cell_configs,
+    compared_on,
     learning,
     quick,
 )
@@ -38,16 +36,17 @@ class CompareCommand:
 
     robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
     """Compare the methods on these robots."""
-    seeds: tuple[int, ...] = SEEDS
-    """Train each method once from each of these seeds."""
+    seeds: tuple[int, ...] | None = None
+    """Train each method once from each of these seeds. Defaults to 0 to 9 where a batch trains, and to 0, 1 and 2 where
+    robots train one at a time."""
     steps: int | None = None
     """Train for this many steps. Defaults to the number that the comparison uses for each robot."""
     episodes: int | None = None
     """Evaluate on this many episodes for each seed and arena. Defaults to the number that the comparison uses."""
     arenas: tuple[str, ...] = CellConfig.arenas
     """Evaluate in these arenas, and train in the first. Give another --results folder with other arenas."""
-    methods: tuple[str, ...] = METHODS
-    """Compare these methods."""
+    methods: tuple[str, ...] | None = None
+    """Compare these methods. Defaults to all that the robot and the arenas allow."""
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
@@ -83,10 +82,10 @@ class CompareCommand:
         tables: dict[str, Any] = {}
         for name in self.robots:
             robot = address(name)
-            for method in self.methods:  # make the models that several trainings need, before all of them
-                if method != NONE:
-                    method_for(robot_with_task(robot), method, ModelConfig())
             jobs = self._jobs(robot)
+            filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
+            for method in sorted(filters):  # make the models that several trainings need, before all of them
+                method_for(robot_with_task(robot), method, ModelConfig())
             finished = complete(jobs, results, runs, self.engine, self.again or self.quick, self._print_progress)
             cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
@@ -98,15 +97,16 @@ class CompareCommand:
     def _jobs(self, robot: str) -> list[Job]:
         from brakeline.deploy.experiments.conservatism import Conservatism
 
-        seeds = self.seeds[:1] if self.quick else self.seeds
+        methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
+        if unknown := [name for name in methods if name not in METHODS]:
+            raise ValueError(f"no method is called {unknown[0]!r}; there are: {', '.join(METHODS)}")
+        cells = cell_configs(robot, methods, self.seeds, self.arenas, self.backend)
+        cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
         changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
         jobs: list[Job] = []
-        for cell in cell_configs(robot, seeds):
-            if cell.method in self.methods:
-                backend = self.backend or backend_for(robot, self.arenas)
-                own = replace(cell, penalty=self.penalty, arenas=self.arenas, backend=backend)
-                own = replace(own, td3=learning(self.td3, backend))
-                jobs.append(replace(quick(own) if self.quick else own, **changed))
+        for cell in cells:
+            own = replace(cell, penalty=self.penalty, td3=learning(self.td3, cell.method, cell.backend))
+            jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))
         return jobs

@@ -15,9 +15,9 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.batch_evaluation import batch_method, drive_episodes
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import (
     LEARNING,
-    NONE,
     ROBOTS,
     TIMED,
     CellConfig,
@@ -59,7 +59,7 @@ class CellRun:
     def __init__(self, cell: CellConfig, folder: Path, say: Report) -> None:
         self.cell, self.folder, self.say = cell, folder, say
         self.robot = robot_with_task(cell.robot)
-        methods = {cell.method, *(trial.method for trial in cell.trials())} - {NONE}
+        methods = {METHODS[cell.method].filter, *(trial.method for trial in cell.trials())} - {NONE}
         self.models = {method: method_for(self.robot, method, cell.model_config) for method in methods}
 
     def result(self) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class CellRun:
         self.folder.mkdir(parents=True, exist_ok=True)
         training = self._train()
         evaluations = {trial.name: self._evaluate(trial) for trial in self.cell.trials()}
-        model = self.models.get(self.cell.method)
+        model = self.models.get(METHODS[self.cell.method].filter)
         return {
             "study": configuration(self.cell),
             "model": None if model is None else {"version": model.version, **_cost(model, self.robot)},
@@ -79,9 +79,10 @@ class CellRun:
 
     def _train(self) -> dict[str, Any]:
         cell, table = self.cell, EpisodeTable()
-        trial = TrialConfig(LEARNING, cell.method, cell.arenas[0], 0)
-        learner = Learner(self.robot, LearnerConfig(td3=cell.td3, seed=cell.seed, steps=cell.steps))
+        trial = TrialConfig(LEARNING, METHODS[cell.method].filter, cell.arenas[0], 0)
         train = self._train_batch if cell.backend == "batch" else self._train_single
+        if METHODS[cell.method].learner == SAC_LEARNER:
+            train = self._train_sac
         with self._log("training", trial) as log:
 
             def take(step: pb.Step) -> None:
@@ -91,22 +92,26 @@ class CellRun:
                     goals = [row["goal"] for row in table.rows[-50:]] or [0]
                     self.say(f"step {table.decisions}, goals {sum(goals) / len(goals):.0%}")
 
-            policy = train(trial, learner, take, partial(log.put, EPISODE))
+            policy, updates = train(trial, take, partial(log.put, EPISODE))
         policy.save(self.folder / POLICY)
         figures = _checked(table, log.path)
         figures["episodes"] |= table.span_columns()
-        return figures | {"steps": cell.steps, "updates": learner.updates}
+        return figures | {"steps": cell.steps, "updates": updates}
 
-    def _train_single(self, trial: TrialConfig, learner: Learner, take: Take, begin: Begin) -> MLP:
-        """Train with one robot and one learner in lockstep."""
+    def _learner(self) -> Learner:
+        cell = self.cell
+        return Learner(self.robot, LearnerConfig(td3=cell.td3, seed=cell.seed, steps=cell.steps))
+
+    def _train_single(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
+        """Train with one robot and one learner in lockstep. Return the policy and the number of updates."""
         driver, ask = self._driver(trial, self.cell.seed, self.cell.name)
-        trainer = Trainer(driver, ask, learner)
+        trainer = Trainer(driver, ask, self._learner())
         for step in trainer.run(begin):
             take(step)
-        return trainer.policy
+        return trainer.policy, trainer.learner.updates
 
-    def _train_batch(self, trial: TrialConfig, learner: Learner, take: Take, begin: Begin) -> MLP:
-        """Train with many robots at once."""
+    def _train_batch(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
+        """Train with many robots at once, as `_train_single` returns it."""
 
         def publish(number: int, message: pb.Step | pb.Episode) -> None:
             if isinstance(message, pb.Step):
@@ -114,7 +119,7 @@ class CellRun:
             else:
                 begin(message)
 
-        cell, safety = self.cell, self._safety(trial)
+        cell, safety, learner = self.cell, self._safety(trial), self._learner()
         trainer = BatchTrainer(
             learner,
             safety,
@@ -133,7 +138,16 @@ class CellRun:
             trainer.close()
         if learner.weights_due():
             learner.publish()
-        return decode(learner.weights().file, self.robot)
+        return decode(learner.weights().file, self.robot), learner.updates
+
+    def _train_sac(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
+        """Train another learner with many robots at once, as `_train_single` returns it."""
+        from brakeline.deploy.experiments.sac_training import train_sac  # Stable-Baselines3 is an extra
+
+        cell = self.cell
+        settings = cell.name, ROBOTS, cell.td3, cell.steps, cell.seed
+        options = {"arena": trial.arena, "penalty": cell.penalty}
+        return train_sac(self.robot, self._safety(trial), *settings, take, begin, **options)
 
     def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
         self.say(trial.name)
@@ -184,7 +198,8 @@ class CellRun:
         return driver, ask
 
     def _log(self, name: str, trial: TrialConfig) -> TrialLog:
-        about = {"method": trial.method, "policy": trial.policy, "arena": trial.arena, "seed": str(self.cell.seed)}
+        method = self.cell.method if trial.policy == LEARNING else trial.method
+        about = {"method": method, "policy": trial.policy, "arena": trial.arena, "seed": str(self.cell.seed)}
         if trial.method == DDPC:
             about["certificate"] = self.cell.model_config.certificate
         metadata = {"run": about, "configuration": {"json": json.dumps(configuration(self.cell))}}

@@ -10,23 +10,24 @@ runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.deploy.run.run_config import BATCH_TD3
 from brakeline.learner.learner_config import TD3Config
-from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
+from brakeline.safety.model.model_config import DDPC, ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Backend
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
-NONE, LEARNING = "none", "learning"
-METHODS = (DDPC, SAILR, SECAS, NONE)  # in the order of the paper's table
-SEEDS = (0, 1, 2)
+LEARNING = "learning"
+SEEDS: dict[str, int] = {"batch": 10, "single": 3}  # how many, by backend
 EPISODES = 500  # of each evaluation
 TIMED = 10  # episodes that time single decisions, where a batch makes the others
 ROBOTS = 64  # of a batch that trains
@@ -37,7 +38,7 @@ Report = Callable[[str], object]
 
 @dataclass(frozen=True)
 class TrialConfig:
-    """One evaluation: policy, filter method, arena and number of episodes."""
+    """One evaluation: policy, method of the filter, arena and number of episodes."""
 
     policy: str  # trained | untrained | learning
     method: str
@@ -55,7 +56,7 @@ class CellConfig:
     """The configuration of a cell. With the version of the code, it determines the results."""
 
     robot: str  # ROBOT, or ROBOT+TASK for another task than the default: ground+tracks
-    method: str
+    method: str  # of `METHODS`
     seed: int
     steps: int
     episodes: int
@@ -75,7 +76,7 @@ class CellConfig:
     def trials(self) -> list[TrialConfig]:
         """Return the evaluations for the table, then those that add or remove the filter after training."""
         first = self.arenas[0]
-        table = [TrialConfig(TRAINED, self.method, arena, self.episodes) for arena in self.arenas]
+        table = [TrialConfig(TRAINED, METHODS[self.method].filter, arena, self.episodes) for arena in self.arenas]
         if self.method == DDPC:
             table.append(TrialConfig(TRAINED, NONE, first, self.episodes))
             table.append(TrialConfig(UNTRAINED, DDPC, first, self.untrained))
@@ -109,11 +110,18 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, backend: Backend) -> TD3Config:
-    """Return the learner's settings with those of a batch in place of the defaults, if a batch trains."""
-    default = TD3Config()
-    changed = {name: value for name, value in BATCH_TD3.items() if getattr(td3, name) == getattr(default, name)}
-    return replace(td3, **changed) if backend == "batch" else td3
+def learning(td3: TD3Config, method: str, backend: Backend) -> TD3Config:
+    """Return the learner's settings, with those of the method and of a batch that trains in place of the defaults."""
+    default, own = TD3Config(), dict(METHODS[method].td3)
+    if backend == "batch":
+        own |= BATCH_TD3
+    return replace(td3, **{name: value for name, value in own.items() if getattr(td3, name) == getattr(default, name)})
+
+
+def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
+    """Return the methods that are compared on a robot in these arenas."""
+    every = backend_for(robot, arenas) == "batch"
+    return tuple(name for name, method in METHODS.items() if every or not method.unicycles_alone)
 
 
 def quick(cell: CellConfig) -> CellConfig:
@@ -122,9 +130,19 @@ def quick(cell: CellConfig) -> CellConfig:
     return replace(cell, steps=2_000, episodes=10, untrained=5, td3=td3)
 
 
-def cell_configs(robot: str, seeds: Iterable[int] = SEEDS) -> list[CellConfig]:
-    """Return all cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
+def cell_configs(
+    robot: str,
+    methods: Iterable[str],
+    seeds: Iterable[int] | None = None,
+    arenas: tuple[str, ...] = CellConfig.arenas,
+    backend: Backend | None = None,
+) -> list[CellConfig]:
+    """Return the cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
     from brakeline.messaging.task import robot_with_task
 
-    steps = robot_with_task(robot).task.steps
-    return [CellConfig(robot, method, seed, steps, EPISODES) for seed in seeds for method in METHODS]
+    steps, backend = robot_with_task(robot).task.steps, backend or backend_for(robot, arenas)
+    seeds = range(SEEDS[backend]) if seeds is None else seeds
+    return [
+        CellConfig(robot, method, seed, steps, EPISODES, arenas, backend=backend)
+        for seed, method in itertools.product(seeds, methods)
+    ]

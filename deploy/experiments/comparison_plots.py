@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
-from brakeline.deploy.experiments.comparison_cells import METHODS
+from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW, spans
 from brakeline.logs.run_groups import METHOD_COLORS
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, ratio
-from brakeline.deploy.experiments.comparison_cells import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.trials import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.safety.model.model_config import DDPC
@@ -25,7 +25,7 @@ Result = dict[str, Any]
 Row = dict[str, Any]
 Array = NDArray[np.float64]
 
-NAMES = {DDPC: "ours", "sailr": "SAILR", "secas": "SECAS", NONE: "TD3"}
+NAMES = {name: method.label for name, method in METHODS.items()}
 PAPER = Path(__file__).with_name("paper.json")
 WINDOW = 50  # training episodes per goal rate
 LEARNED = 0.9  # the goal rate that counts as learned
@@ -105,7 +105,7 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
     study = cells[0]["study"]
     parts: dict[str, dict[str, Row]] = {"training": {m: training_rows(group) for m, group in groups.items()}}
     for arena in study["arenas"]:
-        parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{m}-{arena}") for m, g in groups.items()}
+        parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{METHODS[m].filter}-{arena}") for m, g in groups.items()}
     parts["deployment"] = _deployment(groups, study["arenas"][0])
     about = {"robot": study["robot"], "seeds": next(iter(seeds.values()))}
     return about | {"steps": study["steps"], "episodes": study["episodes"], "parts": parts}

@@ -1,0 +1,79 @@
+"""THE table of the methods that the comparison trains: a learner, and the filter in front of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
+
+NONE = "none"
+MAP, RAYS, NOTHING = "the arena's map", "the observed rays", "–"
+TD3_LEARNER, SAC_LEARNER = "TD3", "SAC"
+
+
+@dataclass(frozen=True)
+class ComparedMethod:
+    """A method of the comparison.
+
+    Attributes:
+        label: in tables.
+        filter: the method that decides in training and evaluation; `none`: each proposal is executed.
+        obstacles: how the filter gets obstacles.
+        model: what the filter knows of the robot.
+        source: where the method is from.
+        learner: TD3 is our own; SAC is Stable-Baselines3's.
+        td3: settings of the learner that differ from the others'.
+        tuned: the setting that was tuned; empty: none.
+        unicycles_alone: compared on robots alone that batches simulate and whose inputs are speed and turn rate.
+    """
+
+    label: str
+    filter: str
+    obstacles: str
+    model: str
+    source: str
+    learner: str = TD3_LEARNER
+    td3: Mapping[str, Any] = field(default_factory=dict)
+    tuned: str = ""
+    unicycles_alone: bool = True
+
+
+METHODS: dict[str, ComparedMethod] = {
+    DDPC: ComparedMethod(
+        "ours", DDPC, MAP, "sets from recorded driving", "Selim et al. 2022; docs/method.md", unicycles_alone=False
+    ),
+    SAILR: ComparedMethod(
+        *("SAILR", SAILR, RAYS, "critics of braking, from recorded driving", "Wagener et al. 2021"),
+        tuned="threshold η",
+        unicycles_alone=False,
+    ),
+    SECAS: ComparedMethod(
+        *("SECAS", SECAS, RAYS, "linear constraints, from recorded driving", "Dalal et al. 2018"),
+        tuned="margin [m]",
+        unicycles_alone=False,
+    ),
+    NONE: ComparedMethod("TD3", NONE, NOTHING, NOTHING, "Fujimoto et al. 2018", unicycles_alone=False),
+    "lagrange": ComparedMethod(
+        *("TD3-Lagrange", NONE, NOTHING, NOTHING, "Ray et al. 2019; Tessler et al. 2019"),
+        td3={"cost_limit": 0.01},
+        tuned="multiplier_rate",
+    ),
+    CBF: ComparedMethod(
+        *("CBF-QP", CBF, MAP, "a unicycle by hand, without lag", "Ames et al. 2019"), tuned="rate α [1/s]"
+    ),
+    PSF: ComparedMethod(
+        *("PSF", PSF, MAP, "a unicycle by hand, with a lag", "Wabersich and Zeilinger 2021"), tuned="margin [m]"
+    ),
+    "sac": ComparedMethod(
+        *("SAC", NONE, NOTHING, NOTHING, "Haarnoja et al. 2018; Stable-Baselines3"),
+        learner=SAC_LEARNER,
+        tuned="learning rate",
+    ),
+    "sac-ddpc": ComparedMethod(
+        *("SAC, our filter", DDPC, MAP, "sets from recorded driving", "Haarnoja et al. 2018; Stable-Baselines3"),
+        learner=SAC_LEARNER,
+        tuned="learning rate",
+    ),
+}

@@ -1,0 +1,148 @@
+"""Train Stable-Baselines3's SAC (Haarnoja et al. 2018) from many robots at once, with or without a filter.
+
+The learner sees what any user of `BatchSafetyWrapper` has: its own proposal as the action, and the reward less the
+penalty for a correction. Rewards have the scale that our TD3 gives them. The deterministic policy is a network as ours,
+so that the same evaluations drive it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecEnv
+
+from brakeline.actors.episode_runner import ActorIdentity
+from brakeline.deploy.batch_robots import BatchRobots
+from brakeline.deploy.run.batch_trainer import actor_names
+from brakeline.learner.learner_config import TD3Config
+from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.filter.batch.row_by_row import BatchMethod
+from brakeline.sim.navigation_env import OBSERVED_LIMIT
+
+CAPACITY = 200_000  # steps of the replay buffer, as our learner's
+
+Take = Callable[[pb.Step], object]
+Begin = Callable[[pb.Episode], object]
+
+
+class RobotsAsVecEnv(VecEnv):
+    """The robots of a batch as an environment of Stable-Baselines3, which logs what they do."""
+
+    def __init__(
+        self, robot: RobotWithTask, robots: BatchRobots, reward_scale: float, take: Take, begin: Begin
+    ) -> None:
+        limit = np.full(robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
+        bounds = robot.low().astype(np.float32), robot.high().astype(np.float32)
+        self.render_mode = None
+        super().__init__(len(robots.names), Box(-limit, limit), Box(*bounds))
+        self._robots, self._reward_scale, self._take, self._begin = robots, reward_scale, take, begin
+
+    def reset(self) -> NDArray[np.float32]:
+        self._announce(list(range(self.num_envs)))
+        return self._robots.observations
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        self._robots.begin_period(np.asarray(actions, dtype=float))
+
+    def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        steps, begun = self._robots.end_period()
+        for step in steps:
+            self._take(step)
+        self._announce(begun)
+        rewards = np.array([step.reward - step.penalty for step in steps], np.float32) * np.float32(self._reward_scale)
+        ended = np.array([step.terminated or step.truncated for step in steps])
+        infos = [_info(step) if step.terminated or step.truncated else {} for step in steps]
+        return self._robots.observations, rewards, ended, infos
+
+    def close(self) -> None:
+        self._robots.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError("the robots of a batch have no attributes of their own")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        raise NotImplementedError("the robots of a batch have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+    def _announce(self, begun: list[int]) -> None:
+        for number in begun:
+            self._begin(self._robots.episode_message(number))
+
+
+def _info(step: pb.Step) -> dict[str, Any]:
+    """Return what Stable-Baselines3 needs of the last step of an episode."""
+    after = np.array(step.next_observation, np.float32)
+    return {"terminal_observation": after, "TimeLimit.truncated": step.truncated and not step.terminated}
+
+
+def train_sac(
+    robot: RobotWithTask,
+    safety: BatchMethod | None,
+    names: str,
+    size: int,
+    config: TD3Config,
+    steps: int,
+    seed: int,
+    take: Take,
+    begin: Begin,
+    **options: Any,
+) -> tuple[MLP, int]:
+    """Train a policy, and return it with the number of updates.
+
+    Args:
+        safety: decides; None: each robot executes what it proposes.
+        names: of the process, from which `actor_names` makes the names of `size` robots.
+        config: the settings that SAC shares with TD3; its learning rate is the actor's.
+        take, begin: called with each step, and with the description of each episode.
+        options: arena, penalty: see `BatchRobots`.
+    """
+    torch.set_num_threads(1)
+    actors, episodes = actor_names(names, size), [0] * size
+
+    def next_episode(number: int) -> tuple[int, int]:
+        episodes[number] += 1
+        episode = episodes[number] - 1
+        return episode, ActorIdentity(actors[number], number, seed).episode_seed(episode)
+
+    robots = BatchRobots(robot, actors, safety, next_episode, seed_key=seed, **options)
+    env = RobotsAsVecEnv(robot, robots, config.reward_scale, take, begin)
+    try:
+        model = SAC(
+            "MlpPolicy",
+            env,
+            learning_rate=config.actor_rate,
+            buffer_size=CAPACITY,
+            learning_starts=config.warmup,
+            batch_size=config.batch,
+            tau=config.tau,
+            gamma=config.gamma,
+            n_steps=config.n_step,
+            gradient_steps=max(1, round(config.updates_per_step * size)),  # for one step of each robot
+            policy_kwargs={"net_arch": list(config.hidden)},
+            seed=seed,
+            device="cpu",
+        )
+        model.learn(total_timesteps=steps)
+    finally:
+        env.close()
+    return MLP(robot, _layers(model)), int(model._n_updates)
+
+
+def _layers(model: SAC) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Return the layers of the deterministic policy: tanh of the mean."""
+    linear = [layer for layer in model.actor.latent_pi if isinstance(layer, torch.nn.Linear)]
+    parts = [(layer.weight, layer.bias) for layer in (*linear, model.actor.mu)]
+    return [(weight.detach().numpy().copy(), bias.detach().numpy().copy()) for weight, bias in parts]
