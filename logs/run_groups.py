@@ -151,8 +151,8 @@ def _group(robot: str, name: str, runs: list[GroupedRun]) -> Figures:
         "runs": [run.label for run in runs],
         "seeds": [run.setup.get("seed") for run in runs],
         "steps": [sum(row["steps"] for row in run.training["bins"]) for run in runs],
-        "scores": {name: _aggregate(values) for name, values in scores.items()},
-        "profile": _profile(scores["goals"]),
+        "scores": {name: aggregate(values) for name, values in scores.items()},
+        "profile": performance_profile(scores["goals"]),
         "curves": _curves([run.training["bins"] for run in runs]),
     }
 
@@ -163,15 +163,18 @@ def _score(run: GroupedRun, name: str) -> float:
     return float("nan") if value is None or not last["episodes"] else float(value)
 
 
-def _aggregate(values: Array) -> Figures:
-    """Return mean and interquartile mean of the runs' scores, with intervals; NaN scores are left out."""
-    values = values[np.isfinite(values)]
-    if not len(values):
+def aggregate(values: Array) -> Figures:
+    """Return mean and interquartile mean of the runs' scores, with intervals; NaN scores are left out.
+
+    values (runs,), or (tasks, runs): the bootstrap is stratified, it draws runs anew for each task.
+    """
+    values = values if values.ndim > 1 else values[np.isfinite(values)]
+    if not values.size:
         return {"values": [], "mean": None, "iqm": None, "mean_interval": None, "iqm_interval": None}
     return {
         "values": values.tolist(),
         "mean": float(values.mean()),
-        "iqm": float(interquartile_mean(values)),
+        "iqm": float(interquartile_mean(values.ravel())),
         "mean_interval": _interval(values, mean),
         "iqm_interval": _interval(values, interquartile_mean),
     }
@@ -179,14 +182,20 @@ def _aggregate(values: Array) -> Figures:
 
 def _interval(values: Array, statistic: Callable[[Array], Array]) -> list[float] | None:
     """Return the percentile bootstrap interval of a statistic over runs. A mean of shares stays within 0 and 1."""
-    if len(values) < 2:
+    if values.shape[-1] < 2:
         return None
-    return _percentiles(statistic(values[_resampled(len(values))]))
+    return _percentiles(statistic(_drawn(values)))
 
 
-def _resampled(count: int) -> NDArray[np.intp]:
+def _drawn(values: Array) -> Array:
+    """Return resamples (RESAMPLES, tasks · runs) of scores (runs,) or (tasks, runs)."""
+    tasks = np.atleast_2d(values)
+    return np.concatenate([row[_resampled(len(row), task)] for task, row in enumerate(tasks)], axis=1)
+
+
+def _resampled(count: int, task: int = 0) -> NDArray[np.intp]:
     """Return the runs (RESAMPLES, count) of each resample; the same for each call."""
-    return np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    return np.random.default_rng(task).integers(count, size=(RESAMPLES, count))
 
 
 def _percentiles(drawn: Array) -> list[float]:
@@ -195,13 +204,13 @@ def _percentiles(drawn: Array) -> list[float]:
     return [float(low), float(high)]
 
 
-def _profile(values: Array) -> Figures:
-    """Return the share of runs whose score is above each level, with its interval."""
-    values = values[np.isfinite(values)]
-    above = (values[:, None] > LEVELS).astype(float) if len(values) else np.zeros((0, len(LEVELS)))
-    profile: Figures = {"level": LEVELS.tolist(), "share": above.mean(axis=0).tolist() if len(values) else []}
-    if len(values) > 1:
-        drawn = above[_resampled(len(values))].mean(axis=1)
+def performance_profile(values: Array) -> Figures:
+    """Return the share of scores, (runs,) or (tasks, runs), that are above each level, with its interval."""
+    values = np.atleast_2d(values if values.ndim > 1 else values[np.isfinite(values)])
+    above = (values[..., None] > LEVELS).astype(float)
+    profile: Figures = {"level": LEVELS.tolist(), "share": above.mean(axis=(0, 1)).tolist() if values.size else []}
+    if values.shape[1] > 1:
+        drawn = np.mean([part[_resampled(len(part), task)].mean(axis=1) for task, part in enumerate(above)], axis=0)
         tail = 50.0 * (1.0 - CONFIDENCE)
         profile["low"], profile["high"] = np.percentile(drawn, (tail, 100.0 - tail), axis=0).tolist()
     return profile
@@ -210,16 +219,26 @@ def _profile(values: Array) -> Figures:
 def _improvement(a: Figures, b: Figures) -> Figures:
     """Return the probability that a run of group `a` scores better than one of group `b`."""
     first, second = (np.array(group["scores"]["goals"]["values"]) for group in (a, b))
-    row: Figures = {"robot": a["robot"], "of": a["name"], "over": b["name"], "probability": None, "interval": None}
-    if not len(first) or not len(second):
+    return {"robot": a["robot"], "of": a["name"], "over": b["name"], **probability_of_improvement(first, second)}
+
+
+def probability_of_improvement(first: Array, second: Array) -> Figures:
+    """Return the probability that a run of the first group scores better than one of the second; ties count half.
+
+    Scores are (runs,), or (tasks, runs): the mean over the tasks.
+    """
+    firsts, seconds = np.atleast_2d(first), np.atleast_2d(second)
+    row: Figures = {"probability": None, "interval": None}
+    if not firsts.size or not seconds.size:
         return row
-    better = (first[:, None] > second) + 0.5 * (first[:, None] == second)
+    better = (firsts[:, :, None] > seconds[:, None]) + 0.5 * (firsts[:, :, None] == seconds[:, None])
     row["probability"] = float(better.mean())
-    if min(len(first), len(second)) > 1:
-        generator = np.random.default_rng(0)
-        rows = generator.integers(len(first), size=(RESAMPLES, len(first)))
-        columns = generator.integers(len(second), size=(RESAMPLES, len(second)))
-        row["interval"] = _percentiles(better[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
+    if min(firsts.shape[1], seconds.shape[1]) > 1:
+        generator, drawn = np.random.default_rng(0), []
+        for task in better:
+            rows, columns = (generator.integers(size, size=(RESAMPLES, size)) for size in task.shape)
+            drawn.append(task[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
+        row["interval"] = _percentiles(np.mean(drawn, axis=0))
     return row
 
 

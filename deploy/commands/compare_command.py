@@ -54,6 +54,10 @@ class CompareCommand:
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
     engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
+    tune: bool = False
+    """Try four values of one setting of each rival instead, and write what came of them for the results page."""
+    table: bool = False
+    """Run nothing: write tables, figures and the results page (README.md) from the stored cells."""
     again: bool = False
     """Run again what has results already."""
     conservatism: bool = True
@@ -72,6 +76,7 @@ class CompareCommand:
     def run(self) -> int:
         """Train, evaluate and write the tables. Returns the exit status."""
         from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.results_page import page, stored_cells
         from brakeline.messaging.task import address, robot_with_task
         from brakeline.safety.model.model_config import ModelConfig
 
@@ -80,8 +85,13 @@ class CompareCommand:
             results = QUICK / "results" if results == RESULTS else results
             runs = QUICK / "runs" if runs == RUNS else runs
         tables: dict[str, Any] = {}
-        for name in self.robots:
-            robot = address(name)
+        for robot in map(address, self.robots):
+            if self.table:
+                tables[robot] = self._write(stored_cells(results, robot), [], results / robot)
+                continue
+            if self.tune:
+                complete(self._tuning(robot), results, runs, self.engine, self.again, self._print_progress)
+                continue
             jobs = self._jobs(robot)
             filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
             for method in sorted(filters):  # make the models that several trainings need, before all of them
@@ -90,17 +100,27 @@ class CompareCommand:
             cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
             tables[robot] = self._write(cells, others, results / robot)
+        if not self.quick:
+            (results / "README.md").write_text(page(results, [p.name for p in sorted(results.iterdir()) if p.is_dir()]))
         if self.json:
             print_json(tables)
         return 0
 
-    def _jobs(self, robot: str) -> list[Job]:
-        from brakeline.deploy.experiments.conservatism import Conservatism
+    def _tuning(self, robot: str) -> list[Job]:
+        from brakeline.deploy.experiments.tuning_trials import tuning_jobs
 
+        return list(tuning_jobs(robot, self._methods(robot), self.arenas))
+
+    def _methods(self, robot: str) -> tuple[str, ...]:
         methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
         if unknown := [name for name in methods if name not in METHODS]:
             raise ValueError(f"no method is called {unknown[0]!r}; there are: {', '.join(METHODS)}")
-        cells = cell_configs(robot, methods, self.seeds, self.arenas, self.backend)
+        return methods
+
+    def _jobs(self, robot: str) -> list[Job]:
+        from brakeline.deploy.experiments.conservatism import Conservatism
+
+        cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
         changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
         jobs: list[Job] = []
@@ -117,8 +137,9 @@ class CompareCommand:
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
         """Write the tables and figures of a robot, and return its figures."""
         from brakeline.deploy.experiments import conservatism
-        from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
+        from brakeline.deploy.experiments.comparison_plots import learning_curves, profiles, seeds_as_points
         from brakeline.deploy.experiments.comparison_table import markdown, plain, table
+        from brakeline.deploy.experiments.results_page import RobotResults
 
         figures = table(cells)
         text = markdown(figures)
@@ -126,11 +147,13 @@ class CompareCommand:
         (folder / "table.json").write_text(json.dumps(plain(figures), indent=1) + "\n")
         learning_curves(cells, folder / "curves.png")
         seeds_as_points(figures, folder / "seeds.png")
+        found = RobotResults(folder.name, cells)
+        profiles({method: found.goals(method) for method in found.cells}, folder / "profiles.png")
         for result in others:
             rows = conservatism.markdown(result)
             (folder / "conservatism.md").write_text(rows + "\n")
             text += "\n" + rows
         if not self.json:
             console.print(Markdown(text))
-            console.print(f"[dim]{folder}: table.md, table.json, curves.png, seeds.png[/]")
+            console.print(f"[dim]{folder}: table.md, table.json, curves.png, seeds.png, profiles.png[/]")
         return plain(figures) | {"conservatism": others[0]["rows"] if others else None}

@@ -58,9 +58,9 @@ class PretrainCommand:
         return 0
 
     def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
-        from brakeline.deploy.experiments.rival_tuning import best_threshold, tune_threshold, values_for
+        from brakeline.deploy.experiments.rival_tuning import best_threshold, tune_threshold, values_of
 
-        rows = tune_threshold(model, robot, values_for(model, robot), self.episodes, self._print_row)
+        rows = tune_threshold(model, robot, values_of(self.method, robot), self.episodes, self._print_row)
         chosen = best_threshold(rows)
         best = f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"
         print_result(self.json, {"tried": [row.figures() for row in rows], "best": chosen.value}, best)

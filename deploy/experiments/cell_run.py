@@ -145,9 +145,19 @@ class CellRun:
         from brakeline.deploy.experiments.sac_training import train_sac  # Stable-Baselines3 is an extra
 
         cell = self.cell
-        settings = cell.name, ROBOTS, cell.td3, cell.steps, cell.seed
-        options = {"arena": trial.arena, "penalty": cell.penalty}
-        return train_sac(self.robot, self._safety(trial), *settings, take, begin, **options)
+        return train_sac(
+            self.robot,
+            self._safety(trial),
+            cell.name,
+            ROBOTS,
+            cell.td3,
+            cell.steps,
+            cell.seed,
+            take,
+            begin,
+            arena=trial.arena,
+            penalty=cell.penalty,
+        )
 
     def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
         self.say(trial.name)
@@ -211,10 +221,11 @@ def _cuts(trial: TrialConfig) -> bool:
     return trial.method == SAILR and trial.policy == LEARNING
 
 
-def _cost(model: Model, robot: RobotWithTask) -> dict[str, str]:
-    """Return the cost of pre-training. Our data are recorded in an empty yard, where no collision is possible."""
+def _cost(model: Model, robot: RobotWithTask) -> dict[str, Any]:
+    """Return the cost of pre-training, and a rival's settings. Our data come from a yard without obstacles."""
     if isinstance(model, Pretrained):
-        return {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
+        about = {name: model.about[name] for name in ("samples", "collisions", "seconds", "error")}
+        return about | {"settings": dict(model.settings)}
     return {"samples": str(load_or_record(robot).steady().periods), "collisions": "0"}
 
 

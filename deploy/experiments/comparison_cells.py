@@ -31,7 +31,6 @@ SEEDS: dict[str, int] = {"batch": 10, "single": 3}  # how many, by backend
 EPISODES = 500  # of each evaluation
 TIMED = 10  # episodes that time single decisions, where a batch makes the others
 ROBOTS = 64  # of a batch that trains
-PHYSICS = 2  # of the simulators; raise it with a change after which older results are not comparable
 
 Report = Callable[[str], object]
 
@@ -65,7 +64,7 @@ class CellConfig:
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     backend: Backend = "single"  # batch: trains and evaluates many robots at once
-    physics: int = PHYSICS
+    physics: int = 1  # version of the simulator (`Task.simulator_version`); results of different ones do not compare
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
 
     @property
@@ -140,9 +139,10 @@ def cell_configs(
     """Return the cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
     from brakeline.messaging.task import robot_with_task
 
-    steps, backend = robot_with_task(robot).task.steps, backend or backend_for(robot, arenas)
+    task, backend = robot_with_task(robot).task, backend or backend_for(robot, arenas)
+    others: dict[str, Any] = {"backend": backend, "physics": task.simulator_version}
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     return [
-        CellConfig(robot, method, seed, steps, EPISODES, arenas, backend=backend)
+        CellConfig(robot, method, seed, task.steps, EPISODES, arenas, **others)
         for seed, method in itertools.product(seeds, methods)
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW, spans
-from brakeline.logs.run_groups import METHOD_COLORS
+from brakeline.logs.run_groups import METHOD_COLORS, performance_profile
 
 Array = NDArray[np.float64]
 
@@ -72,6 +72,27 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
     panels[0].legend(loc="best", frameon=False)
     for axes in panels[2:]:
         axes.set_xlabel(f"steps (means over the last {WINDOW} episodes that began)")
+    png.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(png, dpi=120, metadata={"Software": None})
+
+
+def profiles(goals: Mapping[str, Array], png: Path) -> None:
+    """Plot performance profiles: the share of runs that reach the goal more often than a level, with 95 % bands.
+
+    goals: shares of goals (arenas, runs) by method.
+    """
+    picture = Figure(figsize=(7.0, 4.5), layout="constrained")
+    axes: Axes = picture.subplots()
+    for method, scores in goals.items():
+        profile, color = performance_profile(scores), METHOD_COLORS[method]
+        axes.plot(profile["level"], profile["share"], color=color, label=NAMES[method])
+        if "low" in profile:
+            axes.fill_between(profile["level"], profile["low"], profile["high"], color=color, alpha=0.15, linewidth=0.0)
+    axes.set_xlabel("share of goals in an evaluation")
+    axes.set_ylabel("share of runs above it")
+    axes.set_xlim(max(0.0, min(float(scores.min()) for scores in goals.values()) - 0.05), 1.0)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower left", frameon=False)
     png.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(png, dpi=120, metadata={"Software": None})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -41,13 +41,29 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     if not path.exists():
         return None
     result: dict[str, Any] = parse_json(path.read_text())
-    stored, current = result.get("study", {}), configuration(job)
+    stored, current = _completed(result.get("study", {}), job), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
         raise ResultError(
             f"{path} was made with another {', '.join(differing)}: move it away, or run again with --again"
         )
     return result
+
+
+def _completed(stored: dict[str, Any], job: Any) -> dict[str, Any]:
+    """Return a stored configuration with the defaults of the fields that its version did not have yet."""
+    values = dict(stored)
+    for field in fields(job):
+        value = getattr(job, field.name)
+        if is_dataclass(value) and isinstance(values.get(field.name), dict):
+            values[field.name] = _completed(values[field.name], value)
+        elif field.name not in values and (default := _default(field)) is not MISSING:
+            values[field.name] = json.loads(json.dumps(asdict(default) if is_dataclass(default) else default))
+    return values
+
+
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
 def write(results: Path, job: Job, result: dict[str, Any]) -> Path:

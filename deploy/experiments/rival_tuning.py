@@ -40,9 +40,9 @@ class ThresholdTrial:
         return asdict(self)
 
 
-def values_for(model: Pretrained, robot: RobotWithTask) -> tuple[float, ...]:
-    """Return the thresholds to try."""
-    return robot.task.rivals.margins if model.method == SECAS else VALUES[model.method]
+def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
+    """Return the values of a method's setting to try."""
+    return robot.task.rivals.margins if method == SECAS else VALUES[method]
 
 
 def try_threshold(

@@ -143,6 +143,6 @@ def train_sac(
 
 def _layers(model: SAC) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Return the layers of the deterministic policy: tanh of the mean."""
-    linear = [layer for layer in model.actor.latent_pi if isinstance(layer, torch.nn.Linear)]
-    parts = [(layer.weight, layer.bias) for layer in (*linear, model.actor.mu)]
-    return [(weight.detach().numpy().copy(), bias.detach().numpy().copy()) for weight, bias in parts]
+    modules = list(model.actor.latent_pi.modules())
+    linear = [layer for layer in (*modules, model.actor.mu) if isinstance(layer, torch.nn.Linear)]
+    return [(layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()) for layer in linear]

@@ -147,7 +147,7 @@ def test_learns_a_bandit(precision):
     agent, batch, generator = TD3(2, 2, config, seed=0), Batch(64, 2, 2), np.random.default_rng(0)
     for _ in range(1500):
         s, a = generator.uniform(-0.8, 0.8, (64, 2)), generator.uniform(-1, 1, (64, 2))
-        for array, value in zip(batch.arrays, (s, a, -((a - s) ** 2).sum(1, keepdims=True), 0.0, s), strict=True):
+        for array, value in zip(batch.arrays, (s, a, -((a - s) ** 2).sum(1, keepdims=True), 0.0, s, 0.0), strict=True):
             array[:] = value
         agent.update(batch)
     action = agent.actor.forward(batch.observation).tanh()

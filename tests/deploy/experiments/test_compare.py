@@ -124,9 +124,8 @@ def test_methods_and_backends_share_the_episodes_that_they_are_evaluated_on(cell
 
     arenas = []
     for method, backend in EACH:
-        log = {"single": cells, "batch": batch_cells}[backend][method][
-            "folder"
-        ] / f"trained-{method.removeprefix('sac-')}-default.mcap"
+        log = {"single": cells, "batch": batch_cells}[backend][method]["folder"]
+        log /= f"trained-{method.removeprefix('sac-')}-default.mcap"
         arenas.append([(r.message.start, r.message.goal) for r in records(log) if r.topic == "episode"])
     assert arenas[0] and all(list(map(str, arena)) == list(map(str, arenas[0])) for arena in arenas)
 
@@ -164,7 +163,14 @@ def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cel
 def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
     rows = table(cells.values())
     text = markdown(rows)
-    for name in ("| ours | SAILR | SECAS | TD3 |", "*paper*", "## training", "## default", "## deployment", "*80.4*"):
+    for name in (
+        "| ours, n = 1 | SAILR, n = 1 | SECAS, n = 1 | TD3, n = 1 |",
+        "*paper*",
+        "## training",
+        "## default",
+        "## deployment",
+        "*80.4*",
+    ):
         assert name in text
     json.dumps(plain(rows))
     once = without_times(plain(rows))
@@ -172,8 +178,10 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
     learning_curves(list(cells.values()), tmp_path / "curves.png")
     seeds_as_points(rows, tmp_path / "seeds.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000 < (tmp_path / "seeds.png").stat().st_size
-    with pytest.raises(ValueError, match="not the same seeds"):
-        table([*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"seed": 9}}])
+    more = [*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"seed": 9}}]
+    assert "| SECAS, n = 1 | TD3, n = 2 |" in markdown(table(more))
+    with pytest.raises(ValueError, match="one robot"):
+        table([*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"robot": "quadrotor"}}])
 
 
 def test_the_studies_of_a_comparison():

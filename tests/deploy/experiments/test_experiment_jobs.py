@@ -18,11 +18,19 @@ from tests.waiting import until
 
 
 @dataclass(frozen=True)
+class Details:
+    """Settings within settings."""
+
+    depth: int = 1
+
+
+@dataclass(frozen=True)
 class Errand:
     """A job that leaves a mark where it was done."""
 
     number: int
     setting: int = 0
+    details: Details = Details()
     robot: str = "ground"
 
     @property
@@ -47,6 +55,18 @@ def test_what_is_there_is_not_run_again(tmp_path):
     assert complete(jobs, tmp_path / "results", tmp_path / "elsewhere", engine=Engine(2)) == results
     assert not (tmp_path / "elsewhere").exists(), "the results alone suffice, on any machine"
     assert read(tmp_path / "results", Errand(4)) is None
+
+
+def test_a_result_from_before_a_setting_had_its_default(tmp_path):
+    study = {"number": 1, "details": {}, "robot": "ground"}
+    write(tmp_path, Errand(1), {"study": study})
+    assert read(tmp_path, Errand(1)) is not None
+    for changed in (Errand(1, setting=2), Errand(1, details=Details(2))):
+        with pytest.raises(ResultError, match="another"):
+            read(tmp_path, changed)
+    write(tmp_path, Errand(1), {"study": study | {"former": 3}})
+    with pytest.raises(ResultError, match="another former"):
+        read(tmp_path, Errand(1))
 
 
 def test_side_by_side_they_give_the_same(tmp_path):
@@ -104,5 +124,7 @@ def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_
         complete([Errand(2), Errand(1, setting=5)], tmp_path / "results", tmp_path / "other", engine=Engine(1))
     assert "errand-1.json" in str(refused.value)
     assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"
+    with pytest.raises(ResultError, match="another details"):
+        read(tmp_path / "results", Errand(1, details=Details(2)))
     complete([Errand(1, setting=5)], tmp_path / "results", tmp_path / "again", engine=Engine(1), again=True)
     assert read(tmp_path / "results", Errand(1, setting=5)) is not None

@@ -1,7 +1,7 @@
 """How a rival's threshold is chosen: by what came of it in closed loop, not by what the model was stored with."""
 
-from brakeline.deploy.data.rival_pretraining import SailrConfig, SecasConfig, config_for, pretrain
-from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_for
+from brakeline.deploy.data.rival_pretraining import SailrConfig, config_for, pretrain
+from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
 from tests.robots import GROUND, QUADROTOR
 
@@ -28,8 +28,7 @@ def test_a_threshold_that_never_steps_in_and_one_that_always_does():
 
 
 def test_each_robot_has_values_of_its_own():
-    model = pretrain(GROUND, SecasConfig(**LITTLE))
-    assert max(values_for(model, GROUND)) <= GROUND.footprint
+    assert max(values_of("secas", GROUND)) <= GROUND.footprint
     for method in ("secas", "sailr"):
         for robot in (GROUND, QUADROTOR):
             assert config_for(method, robot).samples > 1000

@@ -1,0 +1,340 @@
+"""Write results/README.md from the stored cells of all comparisons, as the experiments section of an article.
+
+Every figure comes from the files of the cells and of the tunings, and every statistic from `logs/run_groups.py`: the
+score of a run is its share of goals in an evaluation; its task is the arena.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
+from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold
+from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, value_in_use
+from brakeline.deploy.policy_loading import TRAINED
+from brakeline.errors import ResultError
+from brakeline.logs.proportion_intervals import clopper_pearson
+from brakeline.logs.run_groups import aggregate, probability_of_improvement
+from brakeline.messaging.structured_text import parse_json
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.model.model_config import DDPC
+
+Array = NDArray[np.float64]
+Result = dict[str, Any]
+SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend")  # in all cells of a robot
+CELL = re.compile(r"-s\d+\.json$")
+FIELDS = tuple(ThresholdTrial.__dataclass_fields__)
+
+
+def stored_cells(results: Path, robot: str) -> list[Result]:
+    """Return the stored cells of a robot, by method and seed.
+
+    Raises:
+        ResultError: cells differ in more than the method and its settings.
+    """
+    paths = sorted((results / robot).glob("*-s*.json"))
+    cells = [parse_json(path.read_text()) for path in paths if CELL.search(path.name)]
+    order = list(METHODS)
+    cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
+    for name in SAME:
+        values = {str(cell["study"].get(name)) for cell in cells}
+        if len(values) > 1:
+            raise ResultError(
+                f"{results / robot}: the cells have more than one {name} ({', '.join(sorted(values))}): move the older "
+                "ones away"
+            )
+    return cells
+
+
+class RobotResults:
+    """The cells of one robot, as scores and counts.
+
+    Attributes:
+        cells: by method.
+        arenas: of the evaluations; training used the first.
+    """
+
+    def __init__(self, robot: str, cells: Sequence[Result]) -> None:
+        self.name, self.study = robot, cells[0]["study"]
+        self.arenas: list[str] = self.study["arenas"]
+        self.cells: dict[str, list[Result]] = {}
+        for cell in cells:
+            self.cells.setdefault(cell["study"]["method"], []).append(cell)
+
+    def evaluations(self, method: str, arena: str) -> list[Result]:
+        """Return the evaluation of each run of a method in an arena."""
+        name = f"{TRAINED}-{METHODS[method].filter}-{arena}"
+        return [cell["evaluations"][name] for cell in self.cells[method]]
+
+    def goals(self, method: str, arenas: Sequence[str] | None = None) -> Array:
+        """Return the share of goals (arenas, runs)."""
+        shares = [
+            [np.mean(evaluation["episodes"]["goal"]) for evaluation in self.evaluations(method, arena)]
+            for arena in arenas or self.arenas
+        ]
+        return np.array(shares, float)
+
+    def collisions(self, method: str, arena: str) -> tuple[int, int]:
+        """Return the episodes with a collision, and all episodes, of all runs."""
+        episodes = [evaluation["episodes"]["collision"] for evaluation in self.evaluations(method, arena)]
+        return sum(map(sum, episodes)), sum(map(len, episodes))
+
+    def interventions(self, method: str, arena: str) -> float:
+        """Return the share of steps with an intervention."""
+        columns = [evaluation["episodes"] for evaluation in self.evaluations(method, arena)]
+        return sum(sum(c["interventions"]) for c in columns) / sum(sum(c["steps"]) for c in columns)
+
+    def decision_ms(self, method: str, arena: str) -> float:
+        """Return the mean time of a single decision [ms], policy included."""
+        return float(np.mean([evaluation["decision_ms"]["mean"] for evaluation in self.evaluations(method, arena)]))
+
+    def learned(self, method: str) -> Array:
+        """Return the steps to 90 % of goals (runs,); the steps of the training for a run that never got there."""
+        trainings = [cell["training"] for cell in self.cells[method]]
+        return np.array([steps_to_learn(training["episodes"], training["steps"]) for training in trainings])
+
+    def training_collisions(self, method: str) -> list[int]:
+        """Return the collisions in the training of each run."""
+        return [sum(cell["training"]["episodes"]["collision"]) for cell in self.cells[method]]
+
+
+def page(results: Path, robots: Sequence[str]) -> str:
+    """Return the page about the robots that have stored cells."""
+    stored = {name: cells for name in robots if (cells := stored_cells(results, name))}
+    sections = [_section(results, RobotResults(name, cells)) for name, cells in stored.items()]
+    return "\n".join([HEAD, *sections, THREATS, COMMANDS])
+
+
+def _section(results: Path, found: RobotResults) -> str:
+    robot = robot_with_task(found.name)
+    parts = [
+        f"## {found.name}\n\n### Setup\n",
+        _setup(robot, found),
+        "### Methods\n",
+        _methods(found),
+        "### Main table\n",
+        MAIN.format(episodes=found.study["episodes"], steps=f"{found.study['steps']:,}"),
+        *_main(found),
+        "### Probability of improvement\n",
+        IMPROVEMENT,
+        *_improvements(found),
+        "### Performance profiles and learning curves\n",
+        f"![performance profiles]({found.name}/profiles.png)\n",
+        f"![learning curves]({found.name}/curves.png)\n",
+        "### Tuning\n",
+        *_tuning(results, robot, found),
+    ]
+    return "\n".join(parts)
+
+
+def _setup(robot: RobotWithTask, found: RobotResults) -> str:
+    study, task = found.study, robot.task
+    td3, first = study["td3"], found.arenas[0]
+    batch, rays = study.get("backend") == "batch", f"{len(task.rays.directions)} rays up to {task.rays.range:g} m"
+    low_high = ", ".join(
+        f"{name}: {low:g} to {high:g}"
+        for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
+    )
+    errors = ", ".join(f"{name}: {most:g}" for name, most in zip(robot.state, robot.measurement_bound, strict=True))
+    arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in found.arenas)
+    rows = [
+        ("inputs", low_high),
+        ("period, horizon", f"{robot.period:g} s, {robot.horizon} periods"),
+        ("measured state, largest error", errors),
+        ("observation", f"{rays}, {len(task.observation)} others"),
+        ("arenas", arenas),
+        ("reward", ", ".join(f"{name} {value:g}" for name, value in asdict(task.reward).items())),
+        ("simulator", f"MuJoCo, version {study.get('physics', 1)} of the robot's simulator"),
+        ("training", f"{study['steps']:,} steps in `{first}`, " + ("64 robots at once" if batch else "one robot")),
+        ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
+        ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
+    ]
+    return "\n".join([*markdown_table(["", ""], rows), ""])
+
+
+LEARNER = ("hidden", "batch", "gamma", "n_step", "tau", "actor_rate", "critic_rate", "updates_per_step", "warmup")
+
+
+def _arena(kind: Any) -> str:
+    counts = f"{kind.cylinders[0]} to {kind.cylinders[1]} cylinders, {kind.boxes[0]} to {kind.boxes[1]} boxes"
+    return f"{2.0 * kind.half_width:g} m wide, {counts}, gaps of {kind.gap:g} m and more"
+
+
+def _methods(found: RobotResults) -> str:
+    heads = ["method", "n", "learner", "obstacles for the filter", "the filter's model", "recorded periods", "source"]
+    rows = []
+    for name, cells in found.cells.items():
+        method, model = METHODS[name], cells[0]["model"]
+        samples = "0" if model is None else f"{int(model['samples']):,}"
+        if model is not None and int(model["collisions"]):
+            samples += f", with {int(model['collisions']):,} collisions"
+        learner = method.learner + (" with a multiplier" if method.td3 else "")
+        rows.append([method.label, str(len(cells)), learner, method.obstacles, method.model, samples, method.source])
+    return "\n".join([*markdown_table(heads, rows), ""])
+
+
+def _main(found: RobotResults) -> list[str]:
+    lines = []
+    heads = ["method", "n", *(f"goals, `{arena}`" for arena in found.arenas), "goals, all arenas"]
+    rows = []
+    for method, cells in found.cells.items():
+        scores = [_iqm(aggregate(found.goals(method, [arena])[0])) for arena in found.arenas]
+        rows.append([METHODS[method].label, str(len(cells)), *scores, _iqm(aggregate(found.goals(method)))])
+    lines += [*markdown_table(heads, rows), ""]
+    heads = ["method", *(f"collisions, `{arena}`" for arena in found.arenas), "collisions in a training"]
+    rows = []
+    for method in found.cells:
+        counts = [_share(*found.collisions(method, arena)) for arena in found.arenas]
+        rows.append([METHODS[method].label, *counts, _range(found.training_collisions(method))])
+    lines += [*markdown_table(heads, rows), ""]
+    heads = ["method", "steps to 90 % of goals", "runs that got there"]
+    heads += [f"interventions, `{arena}`" for arena in found.arenas]
+    heads += [f"decision [ms], `{arena}`" for arena in found.arenas]
+    rows = []
+    for method, cells in found.cells.items():
+        learned = found.learned(method)
+        got = int((learned < found.study["steps"]).sum())
+        shares = [_percent(found.interventions(method, arena)) for arena in found.arenas]
+        times = [f"{found.decision_ms(method, arena):.2f}" for arena in found.arenas]
+        speed = _steps(aggregate(learned))
+        rows.append([METHODS[method].label, speed, f"{got} of {len(cells)}", *shares, *times])
+    return [*lines, *markdown_table(heads, rows), ""]
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %"
+
+
+def _iqm(figures: Result) -> str:
+    """Format the interquartile mean of shares with its interval."""
+    interval = figures["iqm_interval"]
+    shown = "" if interval is None else f" [{100.0 * interval[0]:.1f}, {100.0 * interval[1]:.1f}]"
+    return _percent(figures["iqm"]) + shown
+
+
+def _steps(figures: Result) -> str:
+    """Format the interquartile mean of steps with its interval."""
+    interval = figures["iqm_interval"]
+    return f"{figures['iqm']:,.0f}" + ("" if interval is None else f" [{interval[0]:,.0f}, {interval[1]:,.0f}]")
+
+
+def _share(count: int, episodes: int) -> str:
+    low, high = clopper_pearson(count, episodes) or (0.0, 1.0)
+    return f"{count} of {episodes:,}: {100.0 * count / episodes:.2f} % [{100.0 * low:.2f}, {100.0 * high:.2f}]"
+
+
+def _range(counts: Sequence[int]) -> str:
+    return f"{np.mean(counts):.1f} ({min(counts)} to {max(counts)})"
+
+
+def _improvements(found: RobotResults) -> list[str]:
+    if DDPC not in found.cells:
+        return []
+    rows = []
+    for method in found.cells:
+        if method != DDPC:
+            row = probability_of_improvement(found.goals(DDPC), found.goals(method))
+            interval = row["interval"]
+            shown = "" if interval is None else f" [{interval[0]:.2f}, {interval[1]:.2f}]"
+            rows.append([f"ours over {METHODS[method].label}", f"{row['probability']:.2f}{shown}"])
+    return [*markdown_table(["", "probability"], rows), ""]
+
+
+def _tuning(results: Path, robot: RobotWithTask, found: RobotResults) -> list[str]:
+    """Return the table of all tried values; nothing is tried for our filter and TD3."""
+    tried: dict[str, list[Result]] = {}
+    for path in sorted((results / found.name).glob("tuning-*.json")):
+        result = parse_json(path.read_text())
+        tried.setdefault(result["study"]["method"], []).append(result)
+    if not tried:
+        return [f"No tuning is stored: `brakeline compare {found.name} --tune` runs it.\n"]
+    rows = []
+    for method, values in tried.items():
+        values.sort(key=lambda row: row["value"])
+        best = _best(method, values)
+        users = [name for name in found.cells if name == method]
+        used = value_in_use(found.cells[users[0]][0], robot.footprint) if users else None
+        figures = [_tried(row) for row in values]
+        chosen = f"{best:g}", "–" if used is None else f"{used:g}"
+        rows.append([METHODS[method].label, METHODS[method].tuned, *figures, *chosen])
+    most = max(map(len, tried.values()))
+    heads = ["method", "setting", *(f"value {i + 1}" for i in range(most)), "best", "in use"]
+    padded = [[*row[:-2], *[""] * (len(heads) - len(row)), *row[-2:]] for row in rows]
+    return [TUNING, *markdown_table(heads, padded), ""]
+
+
+def _best(method: str, rows: Sequence[Result]) -> float:
+    if method in SETTINGS:
+        return float(best_learner(rows)["value"])
+    return best_threshold([ThresholdTrial(**{name: row[name] for name in FIELDS}) for row in rows]).value
+
+
+def _tried(row: Result) -> str:
+    if "oracle_goals" in row:
+        return (
+            f"**{row['value']:g}**: A* {row['oracle_goals']} goals; greedy {row['greedy_goals']}, "
+            f"{row['greedy_collisions']} collisions"
+        )
+    return (
+        f"**{row['value']:g}**: {row['goals']} goals, {row['collisions']} collisions; {row['training_collisions']} in "
+        "training"
+    )
+
+
+HEAD = """# Experiments
+
+`brakeline compare --table` writes this page from the files in this folder. Do not edit it. Each cell is one method,
+trained from one seed. A second reader counted every cell's figures again from its logs (`brakeline analyse`) before
+the cell was stored.
+"""
+MAIN = """\
+After {steps} training steps; {episodes} fresh episodes for each run and arena. n: number of runs, each from a seed of
+its own. Goals: interquartile mean over runs, with the 95 % interval of the stratified bootstrap (by arena).
+Collisions: episodes of all runs, with the exact 95 % interval of Clopper and Pearson, which takes episodes as
+independent. Steps to 90 %: the training steps until 45 of some 50 episodes, begun one after the other, had reached
+the goal; a run that never got there counts with all its steps. Decision: mean time of a single decision of policy and
+filter, on a machine that other work shared.
+"""
+IMPROVEMENT = """\
+The probability that a run of ours reaches more goals than a run of the other method, over all arenas; ties count half
+(Agarwal et al. 2021). 0.5: no difference.
+"""
+TUNING = """\
+Every rival tries as many values of one setting, with the same number of episodes. A filter: 60 with A*, 60 with a
+greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy policy. A learner:
+one training from a seed of its own and 120 episodes. Of the values within 5 % of the most goals, the best has the
+fewest collisions. Ours and TD3 have no such setting: all learners share TD3's settings.
+"""
+THREATS = """## Threats to validity
+
+- **Simulation.** No physical robot drove. The simulators' version is in the setup: motion has noise from version 2 of
+  the ground robot on.
+- **Our own task.** The arenas, the reward and the observation are ours. So is the learner, except SAC, whose
+  implementation is Stable-Baselines3's.
+- **Own implementations of rivals.** They differ from their authors' versions as `docs/rivals.md` says.
+- **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
+  data and in models by hand: see *Methods*. The models by hand are of a robot that a unicycle describes well.
+- **Tuning.** Each rival tuned one setting over four values. More tuning may help every method, also ours.
+- **Learners in a batch** make an update for every fourth step. More updates may lead to 90 % of goals in fewer steps.
+- **Episodes are not independent**: those of one run share a policy. The intervals of goals resample runs; those of
+  collisions do not.
+- **Evaluation without exploration, training with it.** Collisions in training include those of random warm-up steps.
+"""
+COMMANDS = """## Commands
+
+| to make | run |
+|---|---|
+| the tuning of a robot's rivals; it goes on where it ended | `brakeline compare ground --tune` |
+| all cells of a robot, likewise | `brakeline compare ground` |
+| some cells | `brakeline compare ground --methods ddpc none --seeds 0 1` |
+| this page, the tables and the figures, from the stored cells | `brakeline compare ground quadrotor --table` |
+| the check of one cell by its logs | `brakeline analyse runs/compare/ground/ddpc-s0/training.mcap` |
+"""

@@ -1,0 +1,131 @@
+"""Tune one setting of every rival with the same budget, as jobs whose results the results page lists.
+
+Each rival tries four values. A filter is tried as in `rival_tuning.py`. A learner trains once with each value, from a
+seed that no comparison uses, and drives 120 fresh episodes in the first arena. Among the values whose goals come within
+`NEARLY` of the most, its best one has the fewest collisions, then the most goals.
+
+results/<robot>/tuning-<method>-<value>.json
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
+from brakeline.deploy.experiments.comparison_cells import CellConfig, cell_configs, learning
+from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.learner.learner_config import TD3Config
+from brakeline.safety.model.model_config import DDPC, ModelConfig
+
+SEED = 1000  # of the trainings
+EPISODES = 60  # for each of the two policies that try a filter
+NEARLY = 0.05  # of the episodes
+SETTINGS: dict[str, tuple[str, tuple[float, ...]]] = {  # of learners: field of `TD3Config`, values
+    "lagrange": ("multiplier_rate", (1.0, 3.0, 10.0, 30.0)),
+    "sac": ("actor_rate", (3e-4, 1e-3, 2e-3, 4e-3)),
+}
+
+
+@dataclass(frozen=True)
+class FilterTuning:
+    """A value of a filter's setting."""
+
+    robot: str
+    method: str
+    value: float
+    physics: int
+    episodes: int = EPISODES
+
+    @property
+    def name(self) -> str:
+        """The name of its file."""
+        return f"tuning-{self.method}-{self.value:g}"
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        """Drive the episodes, and return the figures."""
+        from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.rival_tuning import try_threshold
+        from brakeline.messaging.task import robot_with_task
+        from brakeline.safety.rivals.pretrained import Pretrained
+
+        robot = robot_with_task(self.robot)
+        model = method_for(robot, self.method, ModelConfig())
+        assert isinstance(model, Pretrained)
+        return {
+            "study": configuration(self),
+            **try_threshold(model, robot, self.value, self.episodes).figures(),
+        }
+
+
+@dataclass(frozen=True)
+class LearnerTuning:
+    """A value of a learner's setting."""
+
+    robot: str
+    method: str
+    value: float
+    cell: CellConfig
+
+    @property
+    def name(self) -> str:
+        """The name of its file."""
+        return f"tuning-{self.method}-{self.value:g}"
+
+    def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
+        """Train and evaluate, and return the figures."""
+        from brakeline.deploy.experiments.cell_run import CellRun
+
+        result = CellRun(self.cell, folder, say).result()
+        episodes = next(iter(result["evaluations"].values()))["episodes"]
+        return {
+            "study": configuration(self),
+            "value": self.value,
+            "episodes": len(episodes["goal"]),
+            "goals": sum(episodes["goal"]),
+            "collisions": sum(episodes["collision"]),
+            "training_collisions": sum(result["training"]["episodes"]["collision"]),
+        }
+
+
+def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
+    """Return the value of the tuned setting with which a cell was made; None if its file does not say."""
+    from brakeline.deploy.experiments.rival_tuning import SETTING
+    from brakeline.safety.model.model_config import SECAS
+
+    method = cell["study"]["method"]
+    if method in SETTINGS:
+        return float(cell["study"]["td3"][SETTINGS[method][0]])
+    value = ((cell["model"] or {}).get("settings") or {}).get(SETTING.get(method, ""))
+    return None if value is None else round(value - (footprint if method == SECAS else 0.0), 9)
+
+
+def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> list[FilterTuning | LearnerTuning]:
+    """Return the jobs that tune the rivals among some methods."""
+    from brakeline.deploy.experiments.rival_tuning import values_of
+    from brakeline.messaging.task import robot_with_task
+
+    jobs: list[FilterTuning | LearnerTuning] = []
+    task = robot_with_task(robot).task
+    for method in methods:
+        rival = METHODS[method].filter
+        if method in SETTINGS:
+            name, values = SETTINGS[method]
+            (cell,) = cell_configs(robot, (method,), (SEED,), arenas[:1])
+            used = learning(TD3Config(), method, cell.backend)
+            for value in values:
+                own = replace(cell, td3=replace(used, **{name: value}), episodes=2 * EPISODES)
+                jobs.append(LearnerTuning(robot, method, value, own))
+        elif rival not in (NONE, DDPC) and METHODS[method].learner != SAC_LEARNER:
+            values = values_of(rival, robot_with_task(robot))
+            jobs += [FilterTuning(robot, method, value, task.simulator_version) for value in values]
+    return jobs
+
+
+def best_learner(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the best row of a learner by the rule of this module."""
+    most = max(row["goals"] / row["episodes"] for row in rows)
+    near = [row for row in rows if row["goals"] / row["episodes"] >= most - NEARLY - 1e-9]
+    return min(near, key=lambda row: (row["collisions"] / row["episodes"], -row["goals"]))

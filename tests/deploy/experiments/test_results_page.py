@@ -1,0 +1,98 @@
+"""The results page: every figure follows from the stored cells, and cells of different conditions are not mixed."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brakeline.deploy.commands.compare_command import CompareCommand
+from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
+from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.results_page import RobotResults, page, stored_cells
+from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuning, best_learner, tuning_jobs
+from brakeline.errors import ResultError
+from brakeline.learner.learner_config import TD3Config
+
+GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80)}  # of 100 episodes, by run; in `dense` 10 fewer
+
+
+def evaluation(goals: int, collisions: int) -> dict:
+    episodes = {"goal": [1] * goals + [0] * (100 - goals), "collision": [1] * collisions + [0] * (100 - collisions)}
+    columns = {name: [value] * 100 for name, value in {"steps": 50, "interventions": 5, "reward": 1.0}.items()}
+    columns |= {"speed": [5.0] * 100, "fastest": [0.2] * 100}
+    return {"episodes": episodes | columns, "decision_ms": {"mean": 0.5, "std": 0.1}}
+
+
+def store(folder, physics: int = 2) -> None:
+    """Store cells with known figures."""
+    folder.mkdir(exist_ok=True, parents=True)
+    for method, runs in GOALS.items():
+        for cell, goals in zip(cell_configs("ground", (method,), range(len(runs))), runs, strict=True):
+            own = replace(cell, physics=physics, td3=learning(TD3Config(), method, "batch"))
+            hit = 0 if method == "ddpc" else 2
+            training = evaluation(90, 3 * hit) | {"steps": 60_000}
+            trials = {f"trained-{method}-default": evaluation(goals, hit)}
+            trials[f"trained-{method}-dense"] = evaluation(goals - 10, hit)
+            for name in ("trained-none-default", "trained-ddpc-default", "untrained-ddpc-default"):
+                trials.setdefault(name, evaluation(50, 0))
+            model = {"version": "1", "samples": "60000", "collisions": "0"} if method == "ddpc" else None
+            result = {"study": configuration(own), "model": model, "training": training, "evaluations": trials}
+            (folder / f"{own.name}.json").write_text(json.dumps(result))
+
+
+def test_every_figure_follows_from_the_cells(tmp_path):
+    store(tmp_path / "ground")
+    text = page(tmp_path, ["ground", "quadrotor"])
+    assert "| ours | 4 | 97.0 % [" in text and "| TD3 | 3 | 90.0 % [" in text, "middle half, all of three"
+    assert "0 of 400: 0.00 % [0.00, 0.92]" in text and "6 of 300: 2.00 % [0.74, 4.30]" in text
+    assert "| 6.0 (6 to 6) |" in text and "| ours over TD3 | 0.83 [" in text, "10 of 12 pairs"
+    assert (
+        "| 10.0 % | 10.0 % | 0.50 | 0.50 |" in text and "60,000 training steps" in text and "## quadrotor" not in text
+    )
+    found = RobotResults("ground", stored_cells(tmp_path, "ground"))
+    assert found.goals("none").shape == (2, 3) and np.allclose(found.goals("none")[1], [0.87, 0.83, 0.7])
+
+
+def test_cells_of_two_simulators_are_not_mixed(tmp_path):
+    store(tmp_path / "ground")
+    old = json.loads((tmp_path / "ground" / "none-s0.json").read_text())
+    del old["study"]["physics"]
+    (tmp_path / "ground" / "none-s0.json").write_text(json.dumps(old))
+    with pytest.raises(ResultError, match="more than one physics"):
+        page(tmp_path, ["ground"])
+
+
+def test_the_command_writes_the_page_and_the_figures_without_a_run(tmp_path, capsys):
+    store(tmp_path / "ground")
+    assert CompareCommand(("ground",), table=True, results=tmp_path, quiet=True).run() == 0
+    assert (tmp_path / "README.md").read_text() == page(tmp_path, ["ground"])
+    written = {path.name for path in (tmp_path / "ground").iterdir()}
+    assert written > {"profiles.png", "curves.png", "seeds.png", "table.md", "table.json"}
+
+
+def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(tmp_path):
+    jobs = tuning_jobs("ground", tuple(METHODS), ("default", "dense"))
+    counts = {job.method: sum(other.method == job.method for other in jobs) for job in jobs}
+    assert counts == dict.fromkeys(("sailr", "secas", "lagrange", "cbf", "psf", "sac"), 4)
+    assert len({job.name for job in jobs}) == len(jobs)
+    assert {job.cell.td3.multiplier_rate for job in jobs if job.method == "lagrange"} == {1.0, 3.0, 10.0, 30.0}
+    store(tmp_path / "ground")
+    for job in jobs:
+        if isinstance(job, FilterTuning):
+            row = {"oracle_goals": 60, "oracle_interventions": 0.1, "greedy_goals": 20, "episodes": 60}
+            row |= {"greedy_collisions": 1 + (job.value > 1.5), "value": job.value}
+        else:
+            assert isinstance(job, LearnerTuning) and job.cell.seed == 1000
+            row = {"goals": 118, "collisions": int(job.value), "training_collisions": 7, "episodes": 120}
+            row |= {"value": job.value}
+        (tmp_path / "ground" / f"{job.name}.json").write_text(json.dumps({"study": configuration(job), **row}))
+    text = page(tmp_path, ["ground"])
+    assert "| CBF-QP | rate α [1/s] | **0.5**: A* 60 goals; greedy 20, 1 collisions |" in text
+    assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | – |" in text
+
+
+def test_the_best_learner_has_the_fewest_collisions_of_those_that_reach_the_goal():
+    rows = [{"goals": g, "collisions": c, "episodes": 120} for g, c in ((110, 4), (108, 1), (90, 0), (112, 1))]
+    assert best_learner(rows) is rows[3]
