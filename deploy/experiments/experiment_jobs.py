@@ -58,12 +58,17 @@ def _completed(stored: dict[str, Any], job: Any) -> dict[str, Any]:
         if is_dataclass(value) and isinstance(values.get(field.name), dict):
             values[field.name] = _completed(values[field.name], value)
         elif field.name not in values and (default := _default(field)) is not MISSING:
-            values[field.name] = json.loads(json.dumps(asdict(default) if is_dataclass(default) else default))
+            values[field.name] = default
     return values
 
 
 def _default(field: Field[Any]) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory()
+    """Return the default of a field as a JSON value; `MISSING` if it has none."""
+    default = field.default if field.default_factory is MISSING else field.default_factory()
+    if default is MISSING:
+        return default
+    plain = asdict(default) if is_dataclass(default) and not isinstance(default, type) else default
+    return json.loads(json.dumps(plain))
 
 
 def write(results: Path, job: Job, result: dict[str, Any]) -> Path:

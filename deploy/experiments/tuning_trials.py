@@ -116,7 +116,8 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
             (cell,) = cell_configs(robot, (method,), (SEED,), arenas[:1])
             used = learning(TD3Config(), method, cell.backend)
             for value in values:
-                own = replace(cell, td3=replace(used, **{name: value}), episodes=2 * EPISODES)
+                changed: dict[str, Any] = {name: value}
+                own = replace(cell, td3=replace(used, **changed), episodes=2 * EPISODES)
                 jobs.append(LearnerTuning(robot, method, value, own))
         elif rival not in (NONE, DDPC) and METHODS[method].learner != SAC_LEARNER:
             values = values_of(rival, robot_with_task(robot))
