@@ -15,6 +15,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
         *("pyarrow", "zstandard"),
     ),
     "ray": ("ray",),
+    "rivals": ("stable_baselines3",),
 }
 
 

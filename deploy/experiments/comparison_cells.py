@@ -4,7 +4,9 @@ One cell of the comparison is one method with one seed. `brakeline compare` make
 
 results/<robot>/<method>-s<seed>.json      one cell: configuration, figures, and one row per episode
 results/<robot>/conservatism.json          every error bound and mode, with the stored policy and A*
-results/<robot>/table.md table.json curves.png seeds.png
+results/<robot>/tuning-<method>-<value>.json   what came of a value of a rival's setting
+results/<robot>/table.md table.json curves.png seeds.png profiles.png
+results/README.md                          the page about all robots
 runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git)
 """
 
