@@ -125,7 +125,7 @@ class CompareCommand:
         changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
         jobs: list[Job] = []
         for cell in cells:
-            own = replace(cell, penalty=self.penalty, td3=learning(self.td3, cell.method, cell.backend))
+            own = replace(cell, penalty=self.penalty, td3=learning(self.td3, cell.method))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))

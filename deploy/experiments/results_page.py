@@ -323,7 +323,7 @@ THREATS = """## Threats to validity
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
   data and in models by hand: see *Methods*. The models by hand are of a robot that a unicycle describes well.
 - **Tuning.** Each rival tuned one setting over four values. More tuning may help every method, also ours.
-- **Learners in a batch** make an update for every fourth step. More updates may lead to 90 % of goals in fewer steps.
+- **Learners** make an update for each step. More updates may lead to 90 % of goals in fewer steps.
 - **Episodes are not independent**: those of one run share a policy. The intervals of goals resample runs; those of
   collisions do not.
 - **Evaluation without exploration, training with it.** Collisions in training include those of random warm-up steps.

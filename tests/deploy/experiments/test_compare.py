@@ -242,14 +242,12 @@ def test_a_batch_is_not_taken_for_a_fast_learner_because_its_short_episodes_end_
     assert steps_to_learn({name: [*values, *later[name]] for name, values in episodes.items()}, 5000) == 4038
 
 
-def test_a_batch_has_the_learners_settings_of_its_own_unless_one_is_given():
+def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_none():
     assert backend_for("ground", ("default", "dense")) == "batch"
     assert backend_for("ground", ("default", "walkers")) == backend_for("quadrotor", ("default",)) == "single"
     given = replace(TD3Config(), updates_per_step=0.5)
-    assert learning(given, "none", "single") == given and learning(given, "none", "batch").updates_per_step == 0.5
-    assert learning(TD3Config(), "none", "batch").updates_per_step == 0.25
-    assert learning(given, "lagrange", "batch").actor_rate == 1e-3 and given.cost_limit is None
-    assert learning(given, "lagrange", "single").cost_limit is not None
+    assert learning(given, "none") == given and learning(TD3Config(), "none").updates_per_step == 1.0
+    assert given.cost_limit is None and learning(given, "lagrange").cost_limit is not None
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():

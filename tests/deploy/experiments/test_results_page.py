@@ -30,7 +30,7 @@ def store(folder, physics: int = 2) -> None:
     folder.mkdir(exist_ok=True, parents=True)
     for method, runs in GOALS.items():
         for cell, goals in zip(cell_configs("ground", (method,), range(len(runs))), runs, strict=True):
-            own = replace(cell, physics=physics, td3=learning(TD3Config(), method, "batch"))
+            own = replace(cell, physics=physics, td3=learning(TD3Config(), method))
             hit = 0 if method == "ddpc" else 2
             training = evaluation(90, 3 * hit) | {"steps": 60_000}
             trials = {f"trained-{method}-default": evaluation(goals, hit)}
