@@ -9,8 +9,9 @@ first-order lag of time constant τ, and the horizon that of the filter:
     p' = v (cos θ, sin θ),   θ' = ω,   τ v' = u_v − v,   τ ω' = u_ω − ω
 
 Sequential quadratic programming solves it: linearise the predicted positions in the inputs, and each distance at its
-closest point. Without a solution, the robot follows its last plan, as in the article. The model is nominal, so the
-margin alone allows for its error; the article's stochastic and robust versions tighten constraints instead.
+closest point; begin at the proposal, else at the last plan, else at standing. Without a solution, the robot follows its
+last plan, as in the article. The model is nominal, so the margin alone allows for its error; the article's stochastic
+and robust versions tighten constraints instead.
 """
 
 from __future__ import annotations
@@ -65,11 +66,10 @@ class PredictiveFilter(UnicycleRival):
         if room >= -ACCURACY:
             return self.decision(ALLOWED, wanted, room, started)
         starts = (wanted, request.plan, np.zeros_like(request.plan))
-        plans = [plan for start in starts if (plan := self._solve(request, proposal, start)) is not None]
-        if not plans:
+        plan = next((plan for start in starts if (plan := self._solve(request, proposal, start)) is not None), None)
+        if plan is None:
             reason = "the nominal model has no clear plan: the last one goes on"
             return self.decision(FAILSAFE, request.plan, self._room(request, request.plan), started, reason)
-        plan = min(plans, key=lambda plan: float(np.linalg.norm((plan[0] - proposal) / self._scale)))
         reason = f"the proposal comes {-room:.3g} m too near by the nominal model"
         return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason)
 
