@@ -18,7 +18,6 @@ from brakeline.deploy.experiments.batch_evaluation import batch_method, drive_ep
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import (
     LEARNING,
-    ROBOTS,
     TIMED,
     CellConfig,
     Report,
@@ -123,7 +122,7 @@ class CellRun:
         trainer = BatchTrainer(
             learner,
             safety,
-            ROBOTS,
+            cell.robots,
             cell.name,
             publish,
             arena=trial.arena,
@@ -149,7 +148,7 @@ class CellRun:
             self.robot,
             self._safety(trial),
             cell.name,
-            ROBOTS,
+            cell.robots,
             cell.td3,
             cell.steps,
             cell.seed,

@@ -31,7 +31,6 @@ LEARNING = "learning"
 SEEDS: dict[str, int] = {"batch": 10, "single": 3}  # how many, by backend
 EPISODES = 500  # of each evaluation
 TIMED = 10  # episodes that time single decisions, where a batch makes the others
-ROBOTS = 64  # of a batch that trains
 
 Report = Callable[[str], object]
 
@@ -65,6 +64,7 @@ class CellConfig:
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     backend: Backend = "single"  # batch: trains and evaluates many robots at once
+    robots: int = 64  # of a batch that trains
     physics: int = 1  # version of the simulator (`Task.simulator_version`); results of different ones do not compare
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
 
@@ -127,9 +127,9 @@ def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
 
 
 def quick(cell: CellConfig) -> CellConfig:
-    """Return a cell that runs in a minute: enough to test the code, too short to learn."""
+    """Return a cell that runs in a minute: enough to test the code and end an episode, too short to learn."""
     td3 = replace(cell.td3, hidden=(64, 64), batch=64, warmup=500)
-    return replace(cell, steps=2_000, episodes=10, untrained=5, td3=td3)
+    return replace(cell, steps=4_000, robots=8, episodes=10, untrained=5, td3=td3)
 
 
 def cell_configs(

@@ -25,7 +25,7 @@ EPISODES = 60  # for each of the two policies that try a filter
 NEARLY = 0.05  # of the episodes
 SETTINGS: dict[str, tuple[str, tuple[float, ...]]] = {  # of learners: field of `TD3Config`, values
     "lagrange": ("multiplier_rate", (1.0, 3.0, 10.0, 30.0)),
-    "sac": ("actor_rate", (3e-4, 1e-3, 2e-3, 4e-3)),
+    "sac": ("actor_rate", (1e-4, 3e-4, 1e-3, 3e-3)),
 }
 
 

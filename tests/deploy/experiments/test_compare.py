@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
-from brakeline.deploy.experiments import cell_run
 from brakeline.deploy.experiments.bootstrap import mean, ratio
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
@@ -34,6 +33,7 @@ from tests.robots import GROUND
 
 DEAR = ("decision_ms", "milliseconds")
 METHODS = ("ddpc", "sailr", "secas", "none")
+BATCH = {"backend": "batch", "robots": 8}
 IN_A_BATCH = ("ddpc", "sailr", "sac-ddpc")
 
 
@@ -68,14 +68,12 @@ def cells(rivals, tmp_path_factory) -> dict[str, dict]:
 @pytest.fixture(scope="module")
 def batch_cells(rivals, tmp_path_factory) -> dict[str, dict]:
     """Cells that are trained and evaluated with eight robots at once: by the batch filter, and row by row."""
-    folder, before = tmp_path_factory.mktemp("batch"), cell_run.ROBOTS
-    cell_run.ROBOTS = 8
-    yield {m: in_a_batch(m).run(folder / m) | {"folder": folder / m} for m in IN_A_BATCH}
-    cell_run.ROBOTS = before
+    folder = tmp_path_factory.mktemp("batch")
+    return {m: in_a_batch(m).run(folder / m) | {"folder": folder / m} for m in IN_A_BATCH}
 
 
 def in_a_batch(method: str) -> CellConfig:
-    return replace(TINY, method=method, backend="batch")
+    return replace(TINY, method=method, **BATCH)
 
 
 def stripped(value):
@@ -115,7 +113,9 @@ def test_a_cell_says_what_its_logs_say(cells, batch_cells, method, backend):
         assert figures["method"] == (method if name == "training" else name.split("-")[1])
     assert cell["training"]["steps"] == TINY.steps
     assert 0.9 * (TINY.steps - TINY.td3.warmup) <= cell["training"]["updates"] <= TINY.steps
-    assert json.loads(json.dumps(cell["study"])) == configuration(replace(TINY, method=method, backend=backend))
+    assert json.loads(json.dumps(cell["study"])) == configuration(
+        replace(TINY, method=method, **(BATCH if backend == "batch" else {}))
+    )
     assert MLP.load(cell["folder"] / "policy.safetensors", GROUND).sizes == (26, 16, 16, 2)
 
 
@@ -192,7 +192,9 @@ def test_the_studies_of_a_comparison():
     assert len(cell_configs("ground", METHODS)) == 40 and every[0].backend == "batch"
     assert len(cell_configs("quadrotor", METHODS)) == 12
     assert compared_on("quadrotor", ("default",)) == METHODS and set(compared_on("ground", ("default",))) > {"psf"}
-    assert quick(every[0]).steps < 5000 and every[0].name == "ddpc-s0"
+    brief = quick(every[0])
+    assert robot_with_task("ground").task.arenas["dense"].step_limit < brief.steps / brief.robots, "episodes end"
+    assert brief.steps < 5000 and every[0].name == "ddpc-s0"
 
 
 # --- figures -------------------------------------------------------------------------------------------------------
