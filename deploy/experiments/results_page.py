@@ -309,9 +309,10 @@ The probability that a run of ours reaches more goals than a run of the other me
 """
 TUNING = """\
 Every rival tries as many values of one setting, with the same number of episodes. A filter: 60 with A*, 60 with a
-greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy policy. A learner:
-one training from a seed of its own and 120 episodes. Of the values within 5 % of the most goals, the best has the
-fewest collisions. Ours and TD3 have no such setting: all learners share TD3's settings.
+greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy policy, then the
+most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own and 120
+episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. Ours and TD3 have no such
+setting: all learners share TD3's settings.
 """
 THREATS = """## Threats to validity
 

@@ -1,7 +1,8 @@
 """Tune one setting of each rival in closed loop; the results are the `rivals` of the task files.
 
 The rule is the same for all rivals. Among the values with which A* loses no goal, choose the one with the fewest
-collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy.
+collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then by
+the interventions on A*.
 """
 
 from __future__ import annotations
@@ -82,4 +83,4 @@ def best_threshold(rows: Sequence[ThresholdTrial]) -> ThresholdTrial:
     """Return the best row by the rule of this module."""
     most = max(row.oracle_goals for row in rows)
     without_loss = [row for row in rows if row.oracle_goals == most]
-    return min(without_loss, key=lambda row: (row.greedy_collisions, -row.greedy_goals))
+    return min(without_loss, key=lambda row: (row.greedy_collisions, -row.greedy_goals, row.oracle_interventions))

@@ -1,5 +1,7 @@
 """How a rival's threshold is chosen: by what came of it in closed loop, not by what the model was stored with."""
 
+from dataclasses import replace
+
 from brakeline.deploy.data.rival_pretraining import SailrConfig, config_for, pretrain
 from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
@@ -15,6 +17,8 @@ def row(value, oracle, collisions, goals):
 def test_safety_counts_among_those_that_cost_the_oracle_nothing():
     rows = [row(1.0, 10, 3, 5), row(2.0, 10, 1, 4), row(3.0, 10, 1, 6), row(4.0, 9, 0, 9)]
     assert best_threshold(rows).value == 3.0
+    often = replace(row(0.5, 10, 1, 6), oracle_interventions=0.2)
+    assert best_threshold([often, *rows]).value == 3.0, "of two alike, the one that leaves A* alone"
     assert best_threshold([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)]).value == 2.0, "the least that any value costs"
 
 
