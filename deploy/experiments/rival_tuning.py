@@ -1,8 +1,8 @@
 """Tune one setting of each rival in closed loop; the results are the `rivals` of the task files.
 
 The rule is the same for all rivals. Among the values with which A* loses no goal, choose the one with the fewest
-collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then by
-the interventions on A*.
+collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then
+by the interventions on A*.
 """
 
 from __future__ import annotations
