@@ -32,19 +32,22 @@ def _smooth(values: Array) -> Array:
 def _lines(results: Sequence[dict[str, Any]], name: str, grid: Array) -> Array:
     """Return curves (seeds, POINTS) of a training figure over steps.
 
-    Collisions are summed at the ends of the episodes. Other figures are means over episodes that began before a step.
+    Collisions are summed at the ends of the episodes. Other figures are means over `WINDOW` episodes that began one
+    after the other, at the mean of their ends: in a batch, the policy changes many times within a long episode.
     """
     lines = []
     for result in results:
         episodes = result["training"]["episodes"]
-        (begins, ends), values = spans(episodes), np.array(episodes[name], float)
+        ends, values = spans(episodes)[1], np.array(episodes[name], float)
         if name == "collision":
             order = np.argsort(ends, kind="stable")
             lines.append(np.interp(grid, ends[order], np.cumsum(values[order]), left=0.0))
             continue
         if name == "interventions":
             values = values / np.array(episodes["steps"], float)
-        lines.append(np.interp(grid, begins, _smooth(values)))
+        at, rates = _smooth(ends), _smooth(values)
+        order = np.argsort(at, kind="stable")
+        lines.append(np.interp(grid, at[order], rates[order], left=np.nan))
     return np.array(lines)
 
 
@@ -71,7 +74,7 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
             axes.set_ylim(-0.02, 1.02)
     panels[0].legend(loc="best", frameon=False)
     for axes in panels[2:]:
-        axes.set_xlabel(f"steps (means over the last {WINDOW} episodes that began)")
+        axes.set_xlabel(f"steps (means over {WINDOW} episodes, at the mean of their ends)")
     png.parent.mkdir(parents=True, exist_ok=True)
     picture.savefig(png, dpi=120, metadata={"Software": None})
 
