@@ -64,6 +64,17 @@ def test_cells_of_two_simulators_are_not_mixed(tmp_path):
         page(tmp_path, ["ground"])
 
 
+def test_cells_of_two_settings_of_a_rival_are_not_mixed(tmp_path):
+    store(tmp_path / "ground")
+    for number, margin in enumerate((0.0, 0.02)):
+        path = tmp_path / "ground" / f"ddpc-s{number}.json"
+        cell = json.loads(path.read_text())
+        cell["model"]["settings"] = {"margin": margin}
+        path.write_text(json.dumps(cell))
+    with pytest.raises(ResultError, match="ddpc has cells of several settings"):
+        stored_cells(tmp_path, "ground")
+
+
 def test_the_command_writes_the_page_and_the_figures_without_a_run(tmp_path, capsys):
     store(tmp_path / "ground")
     assert CompareCommand(("ground",), table=True, results=tmp_path, quiet=True).run() == 0
