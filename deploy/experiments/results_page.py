@@ -54,9 +54,7 @@ def stored_cells(results: Path, robot: str) -> list[Result]:
     for method in METHODS:
         models = [cell["model"] for cell in cells if cell["study"]["method"] == method and cell["model"]]
         if len({str(model["settings"]) for model in models if "settings" in model}) > 1:
-            raise ResultError(
-                f"{results / robot}: {method} has cells of several settings: run the older again"
-            )
+            raise ResultError(f"{results / robot}: {method} has cells of several settings: run the older again")
     return cells
 
 
