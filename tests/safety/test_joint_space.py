@@ -254,7 +254,8 @@ def test_a_service_decides_as_the_filter_does_in_process():
     client = ServiceClient(certified()[0])
     answer = client.decide([0.85, 0.0, 0.0, 0.0], [1.0, 0.0])
     alone = safety().decide([0.85, 0.0, 0.0, 0.0], [1.0, 0.0])
-    assert (answer.kind, answer.blocked_by.by) == (ADJUSTED, "q0 up") and (answer.plan == alone.plan).all()
+    assert (answer.kind, answer.blocked_by.by) == (ADJUSTED, "q0 up")
+    assert answer.plan == pytest.approx(alone.plan, abs=1e-12)  # memory may be aligned otherwise
     assert answer.tube_center.shape == (0, 0)
     fleet = request_message(client.backup_plan, np.zeros(4), np.zeros(2), actor="a", fleet=["a"])
     assert "reserves no space" in client.service.error(fleet).message

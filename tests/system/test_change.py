@@ -35,8 +35,8 @@ def test_a_set_from_a_run_is_published_into_the_run_by_hand(data_folder, tmp_pat
     records = list(open_log(run.folder))
     assert [r.message.version for r in records if r.topic == "model"][-1] == version
     decided = [r.message.reply.decision.model for r in records if isinstance(r.message, pb.Exchange)]
-    first = decided.index(version)
-    assert set(decided[first:]) == {version} and len(decided) - first > 70, "from then on, all are decided on by it"
+    anew = decided[decided.index(version) + 20 :]  # an answer of before may be recorded after one of the other actor
+    assert set(anew) == {version} and len(anew) > 50, "from then on, all are decided on by it"
 
 
 def beyond(exchanges):
