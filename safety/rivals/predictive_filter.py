@@ -17,14 +17,13 @@ and robust versions tighten constraints instead.
 from __future__ import annotations
 
 import math
-from time import perf_counter_ns
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.filter.braking import braking_decision, braking_plan
+from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, NOT_FINITE, Decision, Request
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request
 from brakeline.safety.model.model_config import PSF as PSF
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle import UnicycleRival
@@ -50,18 +49,9 @@ class PredictiveFilter(UnicycleRival):
         self._scale, self._free = robot.high() - robot.low(), robot.horizon - 1
         self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()
 
-    def decide(self, request: Request) -> Decision:
-        """Return the closest plan of the nominal model that is clear; without one, go on with the last plan.
-
-        Raises:
-            BadRequest: see `UnicycleRival.check`.
-        """
-        started, robot = perf_counter_ns(), self.robot
-        self.check(request)
-        if not request.finite:
-            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = robot.clip_input(request.action, request.input_in_force)
-        wanted = braking_plan(robot, proposal)
+    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
+        """Return the closest plan of the nominal model that is clear; without one, go on with the last plan."""
+        wanted = braking_plan(self.robot, proposal)
         room = self._room(request, wanted)
         if room >= -ACCURACY:
             return self.decision(ALLOWED, wanted, room, started)

@@ -7,6 +7,7 @@ obstacles of a map, as the filter does.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from time import perf_counter_ns
 
 import numpy as np
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, BadRequest
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.request import Decision, Request, check_for_filter
+from brakeline.safety.filter.braking import braking_decision
+from brakeline.safety.filter.request import NOT_FINITE, Decision, Request, check_for_filter
 from brakeline.safety.rivals.pretrained import Pretrained
 
 Array = NDArray[np.float64]
@@ -22,7 +24,7 @@ Array = NDArray[np.float64]
 OUTSIDE = 1e-9  # m; nearer to an obstacle, no direction leads away from it
 
 
-class UnicycleRival:
+class UnicycleRival(ABC):
     """A method with a unicycle by hand: a robot with the inputs [speed; turn rate], and the method's settings."""
 
     observed = 0
@@ -38,6 +40,23 @@ class UnicycleRival:
             raise BadModel(f"{method} knows robots with the inputs speed and turn rate, in lockstep: not {robot.name}")
         self.model, self.robot, self.version = model, robot, model.version
         self.settings = {name: model.settings[name] for name in settings}
+
+    def decide(self, request: Request) -> Decision:
+        """Return the method's decision; brake if the proposal is not finite.
+
+        Raises:
+            BadRequest: see `check`.
+        """
+        started = perf_counter_ns()
+        self.check(request)
+        if not request.finite:
+            time_ms = (perf_counter_ns() - started) * 1e-6
+            return braking_decision(self.robot, request, self.version, NOT_FINITE, time_ms)
+        return self.correct(request, self.robot.clip_input(request.action, request.input_in_force), started)
+
+    @abstractmethod
+    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
+        """Return the decision on a clipped proposal (2,). started [ns]: time of the request."""
 
     def check(self, request: Request) -> None:
         """Check a request.

@@ -17,10 +17,10 @@ import numpy as np
 
 from brakeline.safety.filter.braking import braking_decision, braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import CBF as CBF
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.unicycle import UnicycleRival
+from brakeline.safety.rivals.unicycle import Array, UnicycleRival
 
 TOLERANCE = 1e-6  # of a scaled row: violated by less, it is met
 SETTINGS = ("ahead", "rate", "margin")  # ℓ [m], α [1/s], margin around obstacles [m]
@@ -33,18 +33,10 @@ class UnicycleBarrier(UnicycleRival):
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
         super().__init__(model, CBF, SETTINGS)
 
-    def decide(self, request: Request) -> Decision:
-        """Return the input that is closest to the proposal and meets the barrier's rows; brake if there is none.
-
-        Raises:
-            BadRequest: see `UnicycleRival.check`.
-        """
-        started, robot = perf_counter_ns(), self.robot
-        self.check(request)
-        if not request.finite:
-            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
+    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
+        """Return the input that is closest to the proposal and meets the barrier's rows; brake if there is none."""
+        robot = self.robot
         ahead, rate, margin = (self.settings[name] for name in SETTINGS)
-        proposal = robot.clip_input(request.action, request.input_in_force)
         heading = float(request.state[robot.heading or 0])
         along = np.array([math.cos(heading), math.sin(heading)])
         across = np.array([-along[1], along[0]])
