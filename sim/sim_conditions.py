@@ -49,6 +49,13 @@ class ProcessNoise:
     floor_tilt: float = 0.004  # rad, about each axis: 4 mm within 1 m
     floor_correlation: float = 0.5  # s
 
+    def __post_init__(self) -> None:
+        levels = (self.scale, self.motor_gain, self.wheel_speed, self.floor_tilt)
+        if not all(0.0 <= level < math.inf for level in levels):
+            raise ValueError("process noise: the scale and all standard deviations are finite, and 0 or more")
+        if not (self.wheel_correlation > 0.0 and self.floor_correlation > 0.0):
+            raise ValueError("process noise: a correlation time is more than 0 s")
+
 
 @dataclass(frozen=True)
 class QuadrotorNoise:
