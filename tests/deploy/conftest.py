@@ -1,9 +1,10 @@
-"""One short log, for the tests that read it."""
+"""One short log, and the command line within this process."""
 
 from pathlib import Path
 
 import pytest
 
+from brakeline.deploy.cli import main
 from tests.deploy.drive import drive
 
 
@@ -13,3 +14,18 @@ def log(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("drive") / "run.mcap"
     drive(path)
     return path
+
+
+@pytest.fixture
+def command(capsys):
+    """`command("evaluate", "ground")`: exit status, stdout, stderr."""
+
+    def run(*words):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:
+            status = end.code
+        printed = capsys.readouterr()
+        return status, printed.out, printed.err
+
+    return run
