@@ -15,7 +15,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-PERIODS, RESTLESS_PERIODS = 300, 60  # per trajectory; the restless ones are short, so there are many starts
+PERIODS, RESTLESS_PERIODS = 300, 120  # per trajectory; the restless ones are short, so there are many starts
 
 
 def record(

@@ -1,6 +1,7 @@
 """Generate inputs for recording: random driving that covers all states, then plans like the filter's, then standing.
 
-Restless driving also jumps between bounds, as exploring and adversarial policies do.
+Restless driving also jumps between bounds, as exploring and adversarial policies do, and cruises at a bound, as trained
+policies do.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ LONG_STOPS = 0.1  # share of long stops
 RESTLESS = 0.3  # share of lead-ins that jump between bounds every period, as exploring and adversarial policies do
 JUMPS = 2.0 / 3.0  # probability of a jump in each period of restless inputs
 HASTE = 0.5  # share of targets that the robot leaves before it reaches them, as learning policies do
+CRUISES, LONGEST_CRUISE = 0.5, 30  # share of restless manoeuvres that begin with a cruise; its most periods at speed
 EXTREMES = 0.45  # share of inputs at a bound or zero: a uniform draw would have too few
 
 
@@ -62,13 +64,17 @@ def excitation(
 
 
 def restless_excitation(robot: Robot, rng: np.random.Generator) -> Generator[Array, Array | None, None]:
-    """Yield inputs (m,) without end, as `excitation` does; each manoeuvre begins with restless inputs.
+    """Yield inputs (m,) without end, as `excitation` does; each manoeuvre begins with restless inputs or a cruise.
 
-    Some of them start at full speed: all inputs at a bound together, such as turning or climbing at speed.
+    Some restless inputs start at full speed: all inputs at a bound together, such as turning or climbing at speed.
     """
     before, lead = np.zeros(robot.action_dim), MOST_HELD + _across(robot)
     while True:
-        state: Array | None = None
+        if rng.random() < CRUISES:
+            before, state = yield from _cruise(robot, rng, before)
+            before = yield from manoeuvre(robot, rng, before, state=state)
+            continue
+        state = None
         first = int(rng.integers(lead + 1))
         target = _bounds(robot, rng)
         for period in range(first + int(rng.integers(2 * robot.horizon + 1))):
@@ -77,6 +83,23 @@ def restless_excitation(robot: Robot, rng: np.random.Generator) -> Generator[Arr
             before = limit_slew(robot, before, target)
             state = yield before
         before = yield from manoeuvre(robot, rng, before, state=state)
+
+
+def _cruise(
+    robot: Robot, rng: np.random.Generator, before: Array
+) -> Generator[Array, Array | None, tuple[Array, Array | None]]:
+    """Yield inputs with one coordinate at a bound and new targets for the others; return the last input and state."""
+    held, bound = rng.integers(robot.action_dim), _bounds(robot, rng)
+    low, high = robot.low(), robot.high()
+    bound = np.where(-low > high, low, np.where(high > -low, high, bound))  # a speed forward is cruised at, not zero
+    state: Array | None = None
+    for period in range(_across(robot) + int(rng.integers(LONGEST_CRUISE)) + 1):
+        if period % MOST_HELD == 0 or rng.random() < HASTE:
+            target = random_target(robot, rng)
+            target[held] = bound[held]
+        before = limit_slew(robot, before, target)
+        state = yield before
+    return before, state
 
 
 def _bounds(robot: Robot, rng: np.random.Generator) -> Array:

@@ -12,11 +12,14 @@ Array = NDArray[np.float64]
 
 START, RESTLESS, JUMPING = "start of an episode", "restless inputs", "jumping inputs"
 JUMP = 0.5  # share of the largest change that range and slew allow; a change that differs by more is a jump
+HELD = 0.95  # share of its largest value above which an input is at its bound
 RESTLESS_SHARE, JUMPING_SHARE = 0.3, 0.5  # of a plan's periods with a jump
 
 
 def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
     """Return which windows (T,) belong to each kind of driving; a window may belong to several kinds.
+
+    A trained policy often holds an input at its bound. A random one seldom does, and "fast" is half the bound and more.
 
     Args:
         robot: the robot.
@@ -31,4 +34,6 @@ def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str,
     kinds = {START: start[:, 1] < robot.horizon, JUMPING: jumps > JUMPING_SHARE}
     kinds |= {RESTLESS: (jumps > RESTLESS_SHARE) & ~kinds[JUMPING]}
     driving = regimes(robot, z)
-    return kinds | {name: driving == name for name in REGIMES}
+    kinds |= {name: driving == name for name in REGIMES}
+    held = np.abs(inputs).min(1) > HELD * np.maximum(np.abs(robot.low()), np.abs(robot.high()))
+    return kinds | {f"{label.rpartition(' [')[0]} at its bound": held[:, i] for i, label in enumerate(robot.action)}

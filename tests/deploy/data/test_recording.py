@@ -73,12 +73,14 @@ def test_restless_driving_jumps_in_its_plans_at_speed_and_with_all_inputs_togeth
     slew = np.asarray(robot.action_slew)
     assert ((inputs >= robot.low()) & (inputs <= robot.high())).all() and (steps <= slew + 1e-12).all()
     N = robot.horizon
-    at = np.arange(0, len(inputs) - N, N)[:, None] + np.arange(N)
-    z = np.hstack([np.zeros((len(at), robot.regressor_dim)), inputs[at].reshape(len(at), -1)])
+    at = np.arange(0, len(inputs) - N, N)[:, None] + np.arange(N + 1)  # with the input in force before
+    z = np.hstack([np.zeros((len(at), len(robot.regressor))), inputs[at].reshape(len(at), -1)])
     kinds = driving_kinds(robot, z, np.ones((len(at), 2), dtype=int))
     restless = kinds[RESTLESS] | kinds[JUMPING]
     assert restless.mean() > 0.2
-    assert (np.abs(inputs) == robot.high()).all(1).mean() > 0.05, "all inputs at a bound together"
+    assert (np.abs(inputs) == robot.high()).all(1).mean() > 0.04, "all inputs at a bound together"
+    at_bound = np.array([kind.mean() for name, kind in kinds.items() if name.endswith("at its bound")])
+    assert len(at_bound) == robot.action_dim and (at_bound > 0.03).all(), "trained policies cruise"
 
 
 def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_was(data_folder):
@@ -86,7 +88,7 @@ def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_
     steady = data.steady()
     restless = data.trajectories[len(steady.trajectories) :]
     assert len(restless) == (len(steady.trajectories) + 1) // 2 == int(data.about["restless"])
-    assert {len(t.inputs) for t in restless} == {60}
+    assert {len(t.inputs) for t in restless} == {120}
     first = next(collect.record(GROUND, 1, simulated_recording.SEED, Conditions()))
     assert (first.states == steady.trajectories[0].states).all()
     assert "restless" not in steady.about
