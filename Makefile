@@ -9,7 +9,7 @@ $(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter
 	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()' && wait $$!
 endef
 
-.PHONY: demo setup test test-fast check style types compiled unit bench messages docs three safety-gymnasium bullet-safety-gym clean
+.PHONY: demo setup test test-fast check style types compiled unit bench messages docs three safety-gymnasium bullet-safety-gym safe-control-gym clean
 
 demo: setup
 	$(BIN)/brakeline demo
@@ -84,6 +84,12 @@ examples/safety_gymnasium/.venv/.installed: examples/safety_gymnasium/requiremen
 bullet-safety-gym: examples/bullet_safety_gym/.venv/.installed
 examples/bullet_safety_gym/.venv/.installed: examples/bullet_safety_gym/requirements.txt examples/foreign/setup.sh
 	PYTHON=$(PYTHON) sh examples/foreign/setup.sh bullet_safety_gym bullet-safety-gym==1.4.0
+
+# Editable, so that the authors' trained policies come with it.
+SAFE_CONTROL_GYM = git+https://github.com/utiasDSL/safe-control-gym@e39a5692a2989567b922f3033e50b49242896864
+safe-control-gym: examples/safe_control_gym/.venv/.installed
+examples/safe_control_gym/.venv/.installed: examples/safe_control_gym/requirements.txt examples/foreign/setup.sh
+	PYTHON=$(PYTHON) sh examples/foreign/setup.sh safe_control_gym "--editable=$(SAFE_CONTROL_GYM)#egg=safe-control-gym"
 
 clean:
 	rm -rf .venv build site *.egg-info
