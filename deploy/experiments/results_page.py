@@ -180,7 +180,7 @@ def _methods(found: RobotResults) -> str:
         samples = "0" if model is None else f"{int(model['samples']):,}"
         if model is not None and int(model["collisions"]):
             samples += f", with {int(model['collisions']):,} collisions"
-        learner = method.learner + (" with a multiplier" if method.td3 else "")
+        learner = method.learner + (" with a multiplier" if "cost_limit" in method.td3 else "")
         rows.append([method.label, str(len(cells)), learner, method.obstacles, method.model, samples, method.source])
     return "\n".join([*markdown_table(heads, rows), ""])
 

@@ -15,7 +15,12 @@ from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuni
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 
-GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80)}  # of 100 episodes, by run; in `dense` 10 fewer
+GOALS = {
+    "ddpc": (100, 98, 96, 94),
+    "none": (97, 93, 80),
+    "sac": (90,),
+    "lagrange": (90,),
+}  # of 100 episodes, by run; in `dense` 10 fewer
 
 
 def evaluation(goals: int, collisions: int) -> dict:
@@ -34,7 +39,8 @@ def store(folder, physics: int = 2) -> None:
             hit = 0 if method == "ddpc" else 2
             training = evaluation(90, 3 * hit) | {"steps": 60_000}
             trials = {f"trained-{method}-default": evaluation(goals, hit)}
-            trials[f"trained-{method}-dense"] = evaluation(goals - 10, hit)
+            for name in (method, METHODS[method].filter):
+                trials[f"trained-{name}-dense"] = evaluation(goals - 10, hit)
             for name in ("trained-none-default", "trained-ddpc-default", "untrained-ddpc-default"):
                 trials.setdefault(name, evaluation(50, 0))
             model = {"version": "1", "samples": "60000", "collisions": "0"} if method == "ddpc" else None
@@ -47,6 +53,7 @@ def test_every_figure_follows_from_the_cells(tmp_path):
     text = page(tmp_path, ["ground", "quadrotor"])
     assert "| ours | 4 | 97.0 % [" in text and "| TD3 | 3 | 90.0 % [" in text, "middle half, all of three"
     assert "0 of 400: 0.00 % [0.00, 0.92]" in text and "6 of 300: 2.00 % [0.74, 4.30]" in text
+    assert "| SAC | 1 | SAC | – |" in text and "| TD3-Lagrange | 1 | TD3 with a multiplier | – |" in text
     assert "| 6.0 (6 to 6) |" in text and "| ours over TD3 | 0.83 [" in text, "10 of 12 pairs"
     assert (
         "| 10.0 % | 10.0 % | 0.50 | 0.50 |" in text and "60,000 training steps" in text and "## quadrotor" not in text
@@ -101,7 +108,7 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(tmp_path):
         (tmp_path / "ground" / f"{job.name}.json").write_text(json.dumps({"study": configuration(job), **row}))
     text = page(tmp_path, ["ground"])
     assert "| CBF-QP | rate α [1/s] | **0.5**: A* 60 goals; greedy 20, 1 collisions |" in text
-    assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | – |" in text
+    assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | 10 |" in text
 
 
 def test_the_best_learner_has_the_fewest_collisions_of_those_that_reach_the_goal():
