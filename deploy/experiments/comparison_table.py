@@ -206,6 +206,6 @@ def markdown(figures: dict[str, Any]) -> str:
             rows.append([row, *(written(row, values[row]) for values in methods.values())])
             beside = [_paper(robot, row, method) for method in methods]
             if part not in ("training", "deployment") and any(beside):
-                rows.append(["*paper*", *(f"*{text}*" for text in beside)])
+                rows.append(["*paper*", *(f"*{text}*" if text else "" for text in beside)])
         lines += [f"## {part}", "", *markdown_table(["", *(_head(m, counts) for m in methods)], rows), ""]
     return "\n".join(lines)

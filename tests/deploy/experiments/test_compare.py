@@ -180,6 +180,8 @@ def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 10_000 < (tmp_path / "seeds.png").stat().st_size
     more = [*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"seed": 9}}]
     assert "| SECAS, n = 1 | TD3, n = 2 |" in markdown(table(more))
+    newer = cells["none"] | {"study": cells["none"]["study"] | {"method": "lagrange"}}
+    assert "**" not in markdown(table([*cells.values(), newer])), "the paper has no figure of TD3-Lagrange"
     with pytest.raises(ValueError, match="one robot"):
         table([*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"robot": "quadrotor"}}])
 
