@@ -14,6 +14,7 @@ import pytest
 import brakeline
 from brakeline import ModelSet
 from brakeline.deploy.cli import parse
+from brakeline.deploy.experiments.compared_methods import METHODS
 
 pytestmark = pytest.mark.fast
 
@@ -21,7 +22,6 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 PARTS = ("actors", "brakeline", "deploy", "learner", "logs", "messaging", "safety", "sim")
-METHODS = ("ddpc", "sailr", "secas", "none")  # in the order of the tables
 
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -84,23 +84,19 @@ def test_the_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 150
 
 
-def cells(text: str, row: str) -> list[str]:
-    """Return the cells of the first row of a table that begins with `row`."""
-    line = next(line for line in text.splitlines() if line.startswith(f"| {row} |"))
-    return [cell.split("*")[0].strip() for cell in line.strip("| ").split(" | ")[1:]]
-
-
+@pytest.mark.parametrize("name", ["README.md", "docs/results.md"])
 @pytest.mark.parametrize("robot", ["ground", "quadrotor"])
-def test_the_readme_has_the_figures_of_the_comparison(robot: str) -> None:
+def test_the_pages_have_the_figures_of_the_comparison(name: str, robot: str) -> None:
     table = json.loads((ROOT / "results" / robot / "table.json").read_text())
-    default, training = table["parts"]["default"], table["parts"]["training"]
-    text = README.read_text()
-    goals = [f"{100 * default[method]['goal rate']['value']:.1f} %" for method in METHODS]
-    collisions = [f"{100 * default[method]['collision rate']['value']:.1f} %" for method in METHODS]
-    periods = [f"{training[method]['pre-training samples']:,}" for method in METHODS]
-    assert cells(text, f"{robot}, after {table['steps']:,} steps: goals") == goals
-    assert cells(text, f"{robot}: collisions") == collisions
-    assert cells(text, f"{robot}: recorded periods before training") == periods
+    default, dense, training = (table["parts"][part] for part in ("default", "dense", "training"))
+    lines = (ROOT / name).read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith(f"| {robot}, after {table['steps']:,} steps |"))
+    for line, method in zip(lines[head + 2 :], default, strict=False):
+        shares = [part[method][f"{what} rate"] for part in (default, dense) for what in ("goal", "collision")]
+        figures = [f"{100 * share['value']:.1f} %" for share in shares] + [f"{training[method]['collisions']:.0f}"]
+        steps, periods = training[method]["steps to 90 % goals"]["value"], training[method]["pre-training samples"]
+        label, *row = (re.split(r" [*(]", cell)[0].strip() for cell in line.strip("| ").split(" | "))
+        assert label == METHODS[method].label and row == [*figures, f"{steps:,.0f}", f"{periods:,}"]
 
 
 @pytest.mark.parametrize("name", ["README.md", "docs/faq.md", "docs/index.md"])
