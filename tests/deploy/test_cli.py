@@ -173,7 +173,7 @@ def test_collect_is_reproducible_by_its_seed(figures, tmp_path):
     printed = [figures(*words, tmp_path / f"{i}", "--seed", seed) for i, seed in enumerate("556")]
     assert printed[0]["digest"] == printed[1]["digest"] != printed[2]["digest"]
     assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
-    assert (printed[0]["trajectories"], printed[0]["periods"]) == (2, 360) and printed[0]["about"]["seed"] == "5"
+    assert (printed[0]["trajectories"], printed[0]["periods"]) == (2, 420) and printed[0]["about"]["seed"] == "5"
 
 
 def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_path):
