@@ -91,7 +91,7 @@ def _cruise(
     """Yield inputs with one coordinate at a bound and new targets for the others; return the last input and state."""
     held, bound = rng.integers(robot.action_dim), _bounds(robot, rng)
     low, high = robot.low(), robot.high()
-    bound = np.where(-low > high, low, np.where(high > -low, high, bound))  # a speed forward is cruised at, not zero
+    bound = np.where(-low > high, low, np.where(high > -low, high, bound))  # the larger one: zero speed is no cruise
     state: Array | None = None
     for period in range(_across(robot) + int(rng.integers(LONGEST_CRUISE)) + 1):
         if period % MOST_HELD == 0 or rng.random() < HASTE:
