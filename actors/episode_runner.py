@@ -106,7 +106,7 @@ class EpisodeRunner:
         """
         self.robot, self.env, self.identity, self.penalty, self.filtered = robot, env, identity, penalty, filtered
         self.ends_on_intervention, self._continuous = ends_on_intervention, continuous
-        self.backup_plan = BackupPlan(robot)
+        self.backup_plan = BackupPlan(robot, robot.task.turn_aside)
         self.slow_down = SlowDown(robot, identity.actor)
         self._memory = memory_of(robot)
         self.index = 0  # steps recorded so far, over all episodes

@@ -70,7 +70,10 @@ class BatchRobots:
         self._env = BatchNavigationEnv(
             robot, size, arena, conditions=conditions, seed_key=seed_key, episode_seeds=self._draw_episode
         )
-        self._filtered = None if safety is None else BatchSafetyWrapper(self._env, safety, penalty, accept_bound)
+        self._filtered: BatchSafetyWrapper | None = None
+        if safety is not None:
+            aside = robot.task.turn_aside
+            self._filtered = BatchSafetyWrapper(self._env, safety, penalty, accept_bound, turn_aside=aside)
         self.observations: NDArray[np.float32]
         self.observations, self._infos = self._env.reset() if self._filtered is None else self._filtered.reset()
 

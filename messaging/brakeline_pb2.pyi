@@ -441,6 +441,7 @@ class Request(_message.Message):
     SCAN_FIELD_NUMBER: _builtins.int
     IMAGE_FIELD_NUMBER: _builtins.int
     KNOWN_FREE_FIELD_NUMBER: _builtins.int
+    TURN_ASIDE_FIELD_NUMBER: _builtins.int
     WIDENING_FIELD_NUMBER: _builtins.int
     PAST_STATES_FIELD_NUMBER: _builtins.int
     PAST_INPUTS_FIELD_NUMBER: _builtins.int
@@ -460,6 +461,8 @@ class Request(_message.Message):
     """signature by which the service recognises `plan` as verified by `model` (safety/service/plan_token.py)"""
     known_free: _builtins.bool
     """Nothing but `obstacles` is near: all other space within reach is free. Needed without obstacles, scan and image."""
+    turn_aside: _builtins.bool
+    """turn a blocked robot towards the nearest direction in which it can drive on"""
     widening: _builtins.float
     """factor on every set of the tube, at least 1; 0: not given, so 1"""
     past_from_start: _builtins.bool
@@ -546,6 +549,7 @@ class Request(_message.Message):
         scan: Global___Scan | None = ...,
         image: Global___RangeImage | None = ...,
         known_free: _builtins.bool = ...,
+        turn_aside: _builtins.bool = ...,
         widening: _builtins.float = ...,
         past_states: _abc.Iterable[_builtins.float] | None = ...,
         past_inputs: _abc.Iterable[_builtins.float] | None = ...,
@@ -554,7 +558,7 @@ class Request(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "widening", b"widening"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -134,6 +134,7 @@ class Task:
     trajectories: int = 200  # number to record for a model set, 300 periods each
     steps: int = 60_000  # training steps in a comparison
     simulator_version: int = 1  # raise it if the motion changes: what an older simulator recorded is recorded again
+    turn_aside: bool = False  # the filter turns blocked robots aside (docs/method.md §4)
     symmetry: Literal["none", "turns"] = "none"  # turns: the task is invariant to quarter turns and mirroring
     rivals: Rivals = field(default_factory=Rivals)
     folder: Path = Path()  # folder of the task's file

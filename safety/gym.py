@@ -63,6 +63,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         obstacles: View = OBSTACLES,
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
+        turn_aside: bool = False,
     ) -> None:
         """Wrap an environment.
 
@@ -77,6 +78,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description.
+            turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
@@ -85,6 +87,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
+        self.backup_plan.turn_aside = turn_aside
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.action_space, self.client.robot, actions)
         self._now: tuple[Any, dict[str, Any]] | None = None

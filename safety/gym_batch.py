@@ -35,6 +35,7 @@ class BatchSafetyWrapper(VectorWrapper):
         filter: BatchMethod,
         penalty: float = 0.0,
         accept_bound: float | None = None,
+        turn_aside: bool = False,
     ) -> None:
         """Wrap an environment; see `SafetyWrapper` for the arguments. `RowByRow` makes a filter of a rival.
 
@@ -46,7 +47,7 @@ class BatchSafetyWrapper(VectorWrapper):
 
         super().__init__(env)
         check_bound(getattr(filter, "model", None), filter.robot, accept_bound)
-        self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs), penalty
+        self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs, turn_aside), penalty
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._infos: dict[str, Any] | None = None
         self._observations: Any = None

@@ -43,6 +43,7 @@ class VectorSafetyWrapper(VectorWrapper):
         obstacles: View = OBSTACLES,
         actions: ActionMapping | None = None,
         accept_bound: float | None = None,
+        turn_aside: bool = False,
     ) -> None:
         """Wrap a vector environment; see `SafetyWrapper` for the arguments.
 
@@ -52,7 +53,7 @@ class VectorSafetyWrapper(VectorWrapper):
         """
         super().__init__(env)
         self.client, self.penalty = InProcess(filter, accept_bound), penalty
-        self.backup_plans = [BackupPlan(filter.robot) for _ in range(env.num_envs)]
+        self.backup_plans = [BackupPlan(filter.robot, turn_aside) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.single_action_space, filter.robot, actions)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))

@@ -73,10 +73,11 @@ class BackupPlan:
         reservation: what is left of the robot's reservation, in a world with other robots.
         seen (n,): last measured state.
         widening: the last states and inputs, and the factor on the sets of the next decision.
+        turn_aside: its requests let the filter turn a blocked robot aside (`Request.turn_aside`).
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
+    def __init__(self, robot: Robot, turn_aside: bool = False) -> None:
+        self.robot, self.turn_aside = robot, turn_aside
         self.widening = Widening(robot)
         self._scored_by = ""
         self.reset()

@@ -96,13 +96,14 @@ class PlanSearch:
     Attributes:
         safety: the filter. record: what the search learns.
         local_map: the surroundings. z_0 (known,): regressors that are known. proposal (m,): the proposed input.
+        before (m,): the input in force.
     """
 
     def __init__(
         self, safety: Filter, local_map: LocalMap, z_0: Array, proposal: Array, record: DecisionRecord
     ) -> None:
         self.safety, self.local_map, self.z_0, self.proposal, self.record = safety, local_map, z_0, proposal, record
-        self._before = z_0[-len(proposal) :]
+        self.before = z_0[-len(proposal) :]
 
     def candidate(self, committed: Array) -> PlanCandidate | None:
         """Return the first verified plan. committed: free inputs of the committed plan."""
@@ -158,8 +159,13 @@ class PlanSearch:
         if not isinstance(self.safety.tube, RolloutTube):
             return
         inputs = self.safety.inputs
-        yield self._around(np.concatenate([self.z_0, inputs.within(committed, self._before)]))
+        yield self._around(np.concatenate([self.z_0, inputs.within(committed, self.before)]))
         yield self._around(inputs.regressors(self.z_0, inputs.nothing))
+
+    @property
+    def standing(self) -> Linearized:
+        """Turning in place, or standing where turns have their own tube, linearised."""
+        return self._around(self._staying[0])
 
     def _around(self, z: Array) -> Linearized:
         """Linearise around the plan with regressors z."""
@@ -205,7 +211,7 @@ class PlanSearch:
             return None
         (box, constraints), m = safety.in_place, len(self.proposal)
         turn = np.where(safety.standing, np.clip(self.proposal, *box[:, -m:]), safety.inputs.nothing)
-        z = safety.inputs.regressors(self.z_0, safety.inputs.limited(turn, self._before))
+        z = safety.inputs.regressors(self.z_0, safety.inputs.limited(turn, self.before))
         if not tube_kernels.within(z, box) or (adjusted is not None and self._off(adjusted.z) <= self._off(z)):
             return None
         constraints = constraints.at(z, local_map.widening)
@@ -230,7 +236,7 @@ class PlanSearch:
         record.solver, record.iterations = solution.status, record.iterations + solution.iterations
         if not solution.found:
             return None
-        free = self.safety.inputs.within(builder.inputs(solution.x), self._before)
+        free = self.safety.inputs.within(builder.inputs(solution.x), self.before)
         return np.concatenate([self.z_0, free])
 
     @cached_property
@@ -238,9 +244,9 @@ class PlanSearch:
         """The regressors of turning in place, or of standing where turns have their own tube; and the constraints."""
         safety = self.safety
         in_place = np.where(safety.standing, self.proposal, safety.inputs.nothing)
-        stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(in_place, self._before))
+        stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(in_place, self.before))
         if safety.turns_in_place(stay):  # turns have their own tube: room to stand is enough
-            stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(safety.inputs.nothing, self._before))
+            stay = safety.inputs.regressors(self.z_0, safety.inputs.limited(safety.inputs.nothing, self.before))
         return stay, safety.constraints.at(stay, self.local_map.widening)
 
     def _too_near_to_turn(self, at: Linearized) -> NDArray[np.bool_]:

@@ -65,6 +65,8 @@ class Request:
         past: the last periods of a plan's length, whose score the decision tells.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it. In joint space there is no space to describe: no request needs it.
+        turn_aside: the filter turns a blocked robot towards the nearest direction in which it can drive on
+            (docs/method.md §4). Robots without a heading and a turn rate ignore it, as the rivals do.
     """
 
     state: Array
@@ -80,6 +82,7 @@ class Request:
     other_reservations: OtherReservations | None = None
     observation: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     known_free: bool = False
+    turn_aside: bool = False
     widening: float = 1.0
     past: PastWindow | None = None
 

@@ -65,6 +65,7 @@ def request_message(
         obstacles=obstacle_messages(obstacles_in(obstacles)),
         observation=observation_in(observation).tolist(),
         known_free=known_free_in(known_free),
+        turn_aside=backup_plan.turn_aside,
         actor=actor,
         episode=episode,
         step=step,

@@ -126,6 +126,7 @@ class InProcess:
             predicted=backup_plan.predicted,
             observation=observation_in(observation),
             known_free=known_free_in(known_free),
+            turn_aside=backup_plan.turn_aside,
             widening=backup_plan.widening.factor,
             past=backup_plan.past,
         )

@@ -133,6 +133,7 @@ def request_of(
         other_reservations=other_reservations,
         observation=np.fromiter(message.observation, np.float32, len(message.observation)),
         known_free=message.known_free,
+        turn_aside=message.turn_aside,
         widening=message.widening or 1.0,
         past=_past_of(message, robot),
     )

@@ -75,6 +75,7 @@ def scene(rng, ready, crowd=0.5):
         model=rng.choice([ready.version, UNVERIFIED, "other"]) if share else "",
         predicted=predicted,
         widening=float(rng.choice([1.0, 1.0, 1.3])),
+        turn_aside=len(near) % 2 == 0,
     )
 
 

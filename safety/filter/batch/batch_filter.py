@@ -5,7 +5,8 @@
 
 The batch decides what it can verify as the single path does: proposals and inputs of a QP among obstacles that stand
 still. It leaves every other row to `Filter.decide`: a state outside the recorded domain, a proposal that is not finite,
-a plan that turns in place, a failsafe, a recovery, and every comparison that rounding could turn.
+a plan that turns in place, a blocked robot that is to turn aside, a failsafe, a recovery, and every comparison that
+rounding could turn.
 """
 
 from __future__ import annotations
@@ -103,6 +104,8 @@ def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Arra
     yield "input_in_force", requests.input_in_force, "f", (m,)
     yield "plan", requests.plan, "f", (N, m)
     yield "known_free", requests.known_free, "b", ()
+    if not isinstance(requests.turn_aside, bool):
+        yield "turn_aside", requests.turn_aside, "b", ()
     yield "obstacles", obstacles.center, "f", (K, d)
     yield "obstacles.axes", obstacles.axes, "f", (K, d, d)
     yield "obstacles.half", obstacles.half, "f", (K, d)

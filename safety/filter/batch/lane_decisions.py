@@ -17,6 +17,7 @@ from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
 from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
+from brakeline.safety.filter.turning_aside import BLOCKED, SLOWEST, may_turn_aside
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -28,6 +29,7 @@ FEWEST = 32  # lanes at once, whatever the number of obstacles
 MANY = 8  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
 LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 16, 1 << 26
 HUGE = 1e100  # a larger number is left to the single path
+NEARLY = 1e-5  # of an input: as blocked as this may be, the single path decides
 
 
 class LaneDecisions:
@@ -41,6 +43,7 @@ class LaneDecisions:
         self._constraints = self._search.constraints
         self._clearance, self._reach = safety.clearance_margin, base.reach
         self._start = safety.start
+        self._speed = robot.translates.index(True) if may_turn_aside(robot) else None
         self._furthest = max(robot.sight, base.reach)
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
@@ -175,7 +178,8 @@ class LaneDecisions:
         proposed = self._search.propose(lanes)
         found = self._search.adjust(lanes, proposed)
         goes_on = found.hopeless & self._goes_on(requests, rows)
-        done = xp.nonzero(found.allowed | found.adjusted | goes_on)[0]
+        adjusted = found.adjusted & ~self._turns_aside(requests, rows, lanes.proposal, found.z)
+        done = xp.nonzero(found.allowed | adjusted | goes_on)[0]
         if not done.shape[0]:
             return done
         to, scene = xp.take(rows, done, axis=0), lanes.scene.take(xp, done)
@@ -197,6 +201,16 @@ class LaneDecisions:
         answers["for_clearance"][to] = xp.take(found.for_clearance & ~goes_on, done, axis=0)
         answers["steps"][to] = xp.astype(xp.take(found.steps, done, axis=0), xp.int64)
         return done
+
+    def _turns_aside(self, requests: RequestArrays, rows: Array, proposal: Array, z: Array) -> Array:
+        """Return which lanes (B,) with adjusted plans are blocked and may turn aside: `turning_aside.turned_aside`."""
+        xp, aside, speed = self._xp, requests.turn_aside, self._speed
+        if aside is False or speed is None:
+            return xp.zeros_like(rows, dtype=xp.bool)
+        span = self._robot.action_high[speed] - self._robot.action_low[speed]
+        wanted, given = (xp.abs(part[speed]) for part in (proposal, z[self._search.known :]))
+        blocked = (wanted >= SLOWEST * span - NEARLY) & (given <= BLOCKED * wanted + NEARLY)
+        return blocked if aside is True else blocked & xp.take(aside, rows, axis=0)
 
     def _goes_on(self, requests: RequestArrays, rows: Array) -> Array:
         """Return whether the committed plans of some rows still count as verified (B,): see `Filter.decide`.

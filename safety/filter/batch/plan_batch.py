@@ -64,8 +64,8 @@ class BackupPlanBatch:
         predicted: the sets of the next measured states.
     """
 
-    def __init__(self, safety: BatchMethod, size: int) -> None:
-        """Begin with all robots standing.
+    def __init__(self, safety: BatchMethod, size: int, turn_aside: bool = False) -> None:
+        """Begin with all robots standing. turn_aside: the filter turns blocked robots aside (`Request.turn_aside`).
 
         Raises:
             ValueError: batches do not decide for this kind of robot.
@@ -74,7 +74,7 @@ class BackupPlanBatch:
         if robot.late or robot.feedback or not robot.position_dim:
             raise ValueError(f"{robot.name} keeps no plans in batches: decide with BackupPlan, one robot at a time")
         N, n, m = robot.horizon, robot.state_dim, robot.action_dim
-        self.safety, self.robot, self._size = safety, robot, size
+        self.safety, self.robot, self._size, self._turn_aside = safety, robot, size, turn_aside
         self.plan, self.input_in_force = np.zeros((size, N, m)), np.zeros((size, m))
         self.predicted = PredictionArrays(
             np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
@@ -113,6 +113,7 @@ class BackupPlanBatch:
             self.plan,
             obstacles=obstacles,
             known_free=np.ones(self._size, dtype=bool),
+            turn_aside=self._turn_aside,
             widening=self.widening,
             model=names[self._status].tolist(),
             predicted=self.predicted if self.predicted.given.any() else None,

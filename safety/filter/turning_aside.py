@@ -1,0 +1,107 @@
+"""Turn a blocked robot aside instead of stopping it before an obstacle (docs/method.md §4).
+
+The input closest to a proposal that drives at an obstacle stops the robot and turns it as proposed. A policy without
+memory then sees nothing new and proposes the same again, or turns to and fro: the robot is safe, and stuck. If a
+request says `turn_aside`, the filter turns such a robot towards the nearest direction in which it can drive on, and
+searches for the input that is closest to the proposed speed with that turn. The plan is verified as any other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.messaging.robot import Robot
+from brakeline.safety.filter.halfspaces import rows_per_obstacle
+from brakeline.safety.filter.plan_search import DecisionRecord, PlanCandidate, PlanSearch
+from brakeline.safety.filter.request import ADJUSTED
+
+Array = NDArray[np.float64]
+
+BLOCKED = 0.3  # of the proposed speed: a robot that may drive at least as fast is not blocked
+SLOWEST = 0.08  # of the speed's range: a robot that is proposed to drive slower means to stand
+PERIODS = 2  # at the highest speed, for which the new direction must be free
+PASSED = 1e-6  # rad beyond a sector's edge
+
+
+def may_turn_aside(robot: Robot) -> bool:
+    """Return whether a robot has a speed that moves it along its heading, and a turn rate that does not move it."""
+    return robot.heading is not None and sorted(robot.translates) == [False, True]
+
+
+def turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) -> PlanCandidate:
+    """Return a verified plan that turns a blocked robot aside; `stopped` if it is not blocked, or there is none.
+
+    Args:
+        search: that found the adjusted plan `stopped`.
+        committed: free inputs of the committed plan.
+    """
+    robot, first = search.safety.robot, len(search.z_0)
+    speed = robot.translates.index(True)
+    executed = stopped.z[first : first + robot.action_dim]
+    if stopped.kind != ADJUSTED or not is_blocked(robot, search.proposal[speed], executed[speed]):
+        return stopped
+    turn = free_turn(*blocked_sectors(search, backwards=bool(search.proposal[speed] < 0.0)))
+    if turn == 0.0 or not math.isfinite(turn):
+        return stopped
+    wanted = np.where(robot.translates, search.proposal, turn / robot.period)
+    proposal, record = search.safety.inputs.limited(wanted, search.before), DecisionRecord(search.record.started)
+    aside = PlanSearch(search.safety, search.local_map, search.z_0, proposal, record).candidate(committed)
+    search.record.solve_ns += record.solve_ns
+    search.record.iterations += record.iterations
+    if aside is None:
+        return stopped
+    search.record.reason += f"; the robot turns aside to the {'left' if turn > 0.0 else 'right'}"
+    return replace(aside, kind=ADJUSTED, for_clearance=stopped.for_clearance)
+
+
+def is_blocked(robot: Robot, proposed: float, executed: float) -> bool:
+    """Return whether a robot is blocked that drives with the speed `executed` instead of `proposed`."""
+    speed = robot.translates.index(True)
+    span = robot.action_high[speed] - robot.action_low[speed]
+    return abs(proposed) >= SLOWEST * span and abs(executed) <= BLOCKED * abs(proposed)
+
+
+def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array, Array]:
+    """Return the sectors in which a standing robot cannot drive on: their middles (n,) and half-angles (n,) [rad].
+
+    The middles are relative to the direction of motion. An obstacle at the distance r, beyond all margins, blocks the
+    directions in which the robot would come nearer by more than r on its next `PERIODS`.
+    """
+    safety, at = search.safety, search.standing
+    speed = safety.robot.translates.index(True)
+    way = PERIODS * safety.robot.period * max(abs(bound[speed]) for bound in safety.robot.bounds)
+    each, row, rooms = rows_per_obstacle(safety.robot.horizon), 0, []
+    for planes in at.planes:
+        rows = each * len(planes.normals)
+        rooms.append(at.slack[row : row + rows].reshape(-1, each).min(axis=1, initial=math.inf))
+        row += rows
+    room = np.concatenate(rooms) - safety.clearance_margin
+    normals = np.concatenate([planes.normals[:, 0] for planes in at.planes])
+    ahead = search.local_map.heading + (math.pi if backwards else 0.0)
+    return np.arctan2(normals[:, 1], normals[:, 0]) - ahead, np.arccos(np.clip(room / way, 0.0, 1.0))
+
+
+def free_turn(middles: Array, half_angles: Array) -> float:
+    """Return the smallest turn [rad] to a direction outside all sectors, positive to the left; infinite without one.
+
+    >>> free_turn(np.array([0.5]), np.array([0.75])), free_turn(np.array([]), np.array([]))
+    (-0.25..., 0.0)
+    """
+    left, right = _edge(middles, half_angles), _edge(-middles, half_angles)
+    return left if left <= right + PASSED else -right
+
+
+def _edge(middles: Array, half_angles: Array) -> float:
+    """Return the smallest angle >= 0 [rad] outside all sectors; infinite if they cover the whole circle."""
+    angle = 0.0
+    while angle < math.tau:
+        off = np.remainder(middles - angle + math.pi, math.tau) - math.pi
+        beyond = (off + half_angles)[np.abs(off) < half_angles]
+        if not beyond.size:
+            return angle
+        angle += float(beyond.max()) + PASSED
+    return math.inf
