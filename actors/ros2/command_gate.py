@@ -69,10 +69,10 @@ class GateStats:
 class CommandGate:
     """The committed plan of one robot, and the decision about its next input."""
 
-    def __init__(self, robot: Robot, ask: Ask, name: str = "ros2") -> None:
-        """robot: in real time (`Robot.late`); name: of the robot, in the requests."""
+    def __init__(self, robot: Robot, ask: Ask, name: str = "ros2", turn_aside: bool = False) -> None:
+        """robot: in real time (`Robot.late`); name: of the robot, in the requests; turn_aside: see `Request`."""
         assert robot.late, "in real time a decision is about the next period"
-        self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot), GateStats()
+        self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot, turn_aside), GateStats()
         self.input = np.zeros(robot.action_dim)  # in force
         self.kind, self.reason = BLIND, "not begun"  # the decision about it, and why it is not the command
         self.outcome: DecisionOutcome | None = None  # of this period's question

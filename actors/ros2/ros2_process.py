@@ -86,6 +86,7 @@ class Ros2Settings:
     lead: float = 0.04  # s before a period, at which the filter decides about its input
     sensors: SensorSettings = field(default_factory=SensorSettings)
     age_limits: AgeLimits = field(default_factory=AgeLimits)
+    turn_aside: bool = False  # whether the filter turns a blocked robot aside
     seconds: float = 0.0  # s by the robot's clock until the end; 0: until the process is asked to stop
 
 
@@ -114,7 +115,7 @@ class FilterNode:
         """
         self.settings, self.robot, self._stop = settings, driven(settings.robot), stop
         self.inputs = RosInputs(self.robot, settings.sensors, settings.age_limits)
-        self.gate = CommandGate(self.robot, ask, settings.name)
+        self.gate = CommandGate(self.robot, ask, settings.name, settings.turn_aside)
         self.clock = RosSimulatedClock() if settings.sim_time else SystemClock()
         self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
         self._ending = False

@@ -65,6 +65,8 @@ class Ros2Command:
     """Expect the odometry in this frame."""
     base_frame: str = "base_footprint"
     """With --tf, take this as the frame of the robot. The robot turns about its origin."""
+    turn_aside: bool = False
+    """Turn the robot towards the nearest free direction if an obstacle blocks its way, instead of stopping it."""
     fresh: options.Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     connect: tuple[str, ...] = ()

@@ -14,6 +14,7 @@ from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.driving_kinds import at_bound
 from brakeline.safety.model.error_causes import AFTER, BOTH, FAST, PATH, STANDING, TURNING
 from brakeline.safety.model.fitting import FEWEST_STOPS
 from brakeline.safety.model.model_set import DIRECT, ModelConfig
@@ -23,6 +24,7 @@ from brakeline.safety.model.validation import ValidationReport, upper_bound
 from brakeline.safety.model.windows import FREE, PLAN, resting_periods_at_end, stopping_distances, windows
 
 NEAR = 0.05  # share of an input's range: values this close to a bound count as at the bound
+CRUISES = plans_needed(0.1)  # plans of a kind that, without a violation, bound its share outside by 10 %
 MOST_SHOWN = 3  # groups of violations in a message
 MOST_PLANS = 10**6  # largest number of plans that advice asks for
 
@@ -146,11 +148,12 @@ def _windows_missing(plans: int, free: int) -> list[str]:
 
 
 def recording_advice(report: ValidationReport, data: Dataset) -> list[str]:
-    """Return advice, in sentences, on how to bring the bound within the robot's limit and to bound turns on the spot.
+    """Return advice, in sentences, on what to record.
 
-    The list is empty if the bound is within the limit.
+    With these data, the bound is within the robot's limit, turns on the spot have bounds of their own, and much is
+    known of a policy that keeps an input at its bound. The list is empty if all this is so already.
     """
-    return _turns_missing(report, data.robot) + _too_loose(report, data)
+    return _turns_missing(report, data.robot) + _cruises_missing(report, data.robot) + _too_loose(report, data)
 
 
 def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:
@@ -159,6 +162,19 @@ def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:
     return [
         "too few turns on the spot to bound them separately, so the filter keeps far away from obstacles: let the "
         f"robot stand, then turn at various rates, each for {robot.horizon * robot.period:.1f} s or more"
+    ]
+
+
+def _cruises_missing(report: ValidationReport, robot: Robot) -> list[str]:
+    """Return advice on inputs that few plans of the data hold at their bounds, as trained policies do."""
+    plans = {group.name: group.plans for group in report.groups}
+    rare = [(name, plans.get(name, 0)) for name in at_bound(robot) if plans.get(name, 0) < CRUISES]
+    if not report.groups or not rare:
+        return []
+    seen = " and ".join(f"{number} plans with {name}" for name, number in rare)
+    return [
+        f"only {seen} (of {report.windows} plans), so little is known of a policy that drives like that, as trained "
+        f"ones do: hold the input there for some seconds, until there are {CRUISES} such plans, or lower its bound"
     ]
 
 

@@ -36,4 +36,9 @@ def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str,
     driving = regimes(robot, z)
     kinds |= {name: driving == name for name in REGIMES}
     held = np.abs(inputs).min(1) > HELD * np.maximum(np.abs(robot.low()), np.abs(robot.high()))
-    return kinds | {f"{label.rpartition(' [')[0]} at its bound": held[:, i] for i, label in enumerate(robot.action)}
+    return kinds | {name: held[:, i] for i, name in enumerate(at_bound(robot))}
+
+
+def at_bound(robot: Robot) -> list[str]:
+    """Return the names of the kinds of driving in which an input is at its bound, for each input (m,)."""
+    return [f"{label.rpartition(' [')[0]} at its bound" for label in robot.action]

@@ -88,6 +88,18 @@ def test_without_a_command_the_proposal_is_to_stand():
     assert gate.stats.commands == 0
 
 
+@pytest.mark.parametrize("aside", [True, False])
+def test_the_requests_say_whether_a_blocked_robot_turns_aside(aside):
+    asked = []
+
+    def ask(requests):
+        asked.extend(requests)
+        return allow(requests)
+
+    CommandGate(ROBOT, ask, turn_aside=aside).decide(STATE, (), command(0.2), 0.0, 0)
+    assert [request.turn_aside for request in asked] == [aside]
+
+
 def test_a_robot_that_a_twist_cannot_drive_is_refused():
     assert driven("ground") == driven("ground-late") == ROBOT
     with pytest.raises(Mismatch, match="quadrotor"):

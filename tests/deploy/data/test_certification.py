@@ -10,7 +10,7 @@ from brakeline.deploy.data.coverage import recording_advice
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.safety.model.validation import most_violations, upper_bound, validate
+from brakeline.safety.model.validation import GroupStatement, most_violations, upper_bound, validate
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.unicycle import record
 
@@ -88,6 +88,17 @@ def test_with_few_violations_more_of_the_same_helps_on_a_condition(held, data):
 def test_a_statement_within_the_robots_own_limit_asks_for_nothing(held, data):
     limit = 1.01 * held.bound_plan
     assert not recording_advice(held, replace(data, robot=replace(GROUND, accept_bound=limit)))
+
+
+def test_few_cruises_are_missing_from_the_data_of_a_policy_that_will_cruise(held, data):
+    groups = tuple(
+        GroupStatement(name, 9 * n, n, 0, 0.0, 1.0, 1.0) for name, n in (("speed at its bound", 44), ("fast", 90))
+    )
+    loose = replace(data, robot=replace(GROUND, accept_bound=0.9))
+    (line,) = recording_advice(replace(held, mode="one-step", groups=groups), loose)
+    assert line.startswith("only 0 plans with turn rate at its bound (of") and "speed at" not in line
+    enough = (*groups, replace(groups[0], name="turn rate at its bound"))
+    assert not recording_advice(replace(held, mode="one-step", groups=enough), loose)
 
 
 def test_how_it_drove_is_told_by_inputs_and_speeds():
