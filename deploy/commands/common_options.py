@@ -36,7 +36,7 @@ T = TypeVar("T")
 Unprefixed = Annotated[T, tyro.conf.OmitArgPrefixes]
 Certificate = Literal["residual", "set-membership", "matrix-zonotope"]
 Mode = Literal["auto", "one-step", "direct", "recursion"]
-Method = Literal["ddpc", "secas", "sailr", "none"]
+Method = Literal["ddpc", "secas", "sailr", "cbf", "psf", "none"]
 
 Robot = Annotated[
     str,
@@ -98,7 +98,7 @@ class FilterOptions:
     """Choose the filter that checks what the policy proposes."""
 
     method: Method = "ddpc"
-    """Filter with this method: ddpc (this project's own), secas or sailr (the rivals), or none for no filter."""
+    """Filter with this method: ddpc (this project's own), a rival (see docs/rivals.md), or none for no filter."""
     certificate: Certificate = "residual"
     """Use a model set with this error bound (see docs/certificates.md)."""
     mode: Mode = "auto"

@@ -7,10 +7,12 @@ With few seeds the interval is rough, so the table states the number of seeds an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from brakeline.logs.proportion_intervals import clopper_pearson
 
 Array = NDArray[np.float64]
 
@@ -57,6 +59,19 @@ def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0)
 def mean(values: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
     """Estimate the mean over seeds and episodes of `values`, one array (episodes,) per seed."""
     return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed)
+
+
+def rate(happened: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
+    """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed.
+
+    If it never or always happened, all resamples are alike: then the interval is the exact one of Clopper and Pearson,
+    which takes all episodes as independent.
+    """
+    estimate, episodes = mean(happened, seed), sum(len(np.asarray(each)) for each in happened)
+    if 0.0 < estimate.value < 1.0:
+        return estimate
+    low, high = clopper_pearson(round(estimate.value * episodes), episodes) or (0.0, 1.0)
+    return replace(estimate, low=low, high=high)
 
 
 def _resampled(above: Array, below: Array, rng: np.random.Generator) -> Array:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, ratio
+from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.trials import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
@@ -56,9 +56,9 @@ def evaluation_rows(results: Sequence[Result], trial: str) -> Row:
     values, times = _by_column(evaluations), [evaluation["decision_ms"] for evaluation in evaluations]
     contacts = zip(TOUCHED, CONTACTS, strict=True) if values.keys() >= set(CONTACTS) else ()  # old results lack them
     return {
-        "goal rate": mean(values["goal"]),
-        "collision rate": mean(values["collision"]),
-        **{row: mean(values[name]) for row, name in contacts},
+        "goal rate": rate(values["goal"]),
+        "collision rate": rate(values["collision"]),
+        **{row: rate(values[name]) for row, name in contacts},
         "mean speed [m/s]": ratio(values["speed"], values["steps"]),
         "max speed [m/s]": max(map(max, values["fastest"])),
         "mean reward": mean(values["reward"]),
@@ -74,7 +74,7 @@ def training_rows(results: Sequence[Result]) -> Row:
     values, steps = _by_column(trainings), [training["steps"] for training in trainings]
     learned = [steps_to_learn(training["episodes"], training["steps"]) for training in trainings]
     return {
-        "collision rate": mean(values["collision"]),
+        "collision rate": rate(values["collision"]),
         "collisions": float(np.mean([sum(counts) for counts in values["collision"]])),
         "steps to 90 % goals": mean([[value] for value in learned]),
         "seeds that got there": sum(value < limit for value, limit in zip(learned, steps, strict=True)),
@@ -192,8 +192,8 @@ def markdown(figures: dict[str, Any]) -> str:
         "",
         f"Every method after {figures['steps']} training steps; {figures['episodes']} episodes for each of n seeds, "
         "the same for all methods. In brackets: 95 % intervals by the hierarchical bootstrap (seed, then "
-        "episode). In italics: the paper's figures, for its own task. Decision times are of policy and method "
-        "together.",
+        "episode); where nothing or all happened, the exact one of Clopper and Pearson. In italics: the paper's "
+        "figures, for its own task. Decision times are of policy and method together.",
         "",
         "Before training, the methods knew the robot from the recorded periods in the row *pre-training samples*. If "
         f"a seed did not reach 90 % of goals, {figures['steps']} counts as its steps to 90 %. Ours gets obstacles from "

@@ -301,7 +301,9 @@ the cell was stored.
 """
 MAIN = """\
 After {steps} training steps; {episodes} fresh episodes for each run and arena. n: number of runs, each from a seed of
-its own. Goals: interquartile mean over runs, with the 95 % interval of the stratified bootstrap (by arena).
+its own. Goals: interquartile mean over runs, with the 95 % interval of the stratified bootstrap (by arena). Of few
+runs it is close to their mean; over all arenas it drops the worst and the best of the runs in any of them.
+Interventions: their share of all steps of all runs; `table.md` has the mean of the runs' shares.
 Collisions: episodes of all runs, with the exact 95 % interval of Clopper and Pearson, which takes episodes as
 independent. Steps to 90 %: the training steps until 45 of some 50 episodes, begun one after the other, had reached
 the goal; a run that never got there counts with all its steps. Decision: mean time of a single decision of policy and
@@ -315,8 +317,9 @@ TUNING = """\
 Every rival tries as many values of one setting, with the same number of episodes. A filter: 60 with A*, 60 with a
 greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy policy, then the
 most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own and 120
-episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. Ours and TD3 have no such
-setting: all learners share TD3's settings.
+episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. Ours was not tuned for
+this comparison: its penalty is 1, its clearance margin follows from its model set. But all learners share TD3's
+settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 
@@ -327,7 +330,10 @@ THREATS = """## Threats to validity
 - **Own implementations of rivals.** They differ from their authors' versions as `docs/rivals.md` says.
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
   data and in models by hand: see *Methods*. The models by hand are of a robot that a unicycle describes well.
-- **Tuning.** Each rival tuned one setting over four values. More tuning may help every method, also ours.
+- **Tuning.** Each rival tuned one setting over four values. More tuning may help every method, also ours. Where the
+  best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from one seed.
+- **Turning aside.** Our filter turns a blocked robot aside (`docs/method.md`, section 4). The rivals' filters do not;
+  the same could be done with them.
 - **Learners** make an update for each step. More updates may lead to 90 % of goals in fewer steps.
 - **Episodes are not independent**: those of one run share a policy. The intervals of goals resample runs; those of
   collisions do not.

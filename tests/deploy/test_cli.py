@@ -7,6 +7,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rich.console import Console
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.commands.certify_command import validation_table
+from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
 from brakeline.errors import BadScan
 from brakeline.logs.figure_tables import analyse
@@ -332,3 +334,7 @@ def test_a_scan_is_loaded_from_a_file(tmp_path):
     ):
         with pytest.raises(BadScan, match=said):
             read(dim, text)
+
+
+def test_every_method_can_be_chosen():
+    assert get_args(Method) == (*methods.METHODS, "none")

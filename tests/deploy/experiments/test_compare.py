@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
-from brakeline.deploy.experiments.bootstrap import mean, ratio
+from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
     TrialConfig,
@@ -214,6 +214,13 @@ def test_intervals_cover_what_they_should():
         assert estimate.low <= estimate.value <= estimate.high and len(estimate.seeds) == 8
     assert inside >= 24
     assert 0.08 < np.mean(lengths) < 0.25, "the spread of the seeds is in it, not the coins' alone"
+
+
+def test_a_rate_without_an_event_has_an_exact_interval():
+    never, always, once = rate([np.zeros(500)] * 3), rate([np.ones(500)] * 3), [np.eye(500)[0], np.zeros(500)]
+    assert (never.value, never.low) == (0.0, 0.0) and never.high == pytest.approx(1.0 - 0.025 ** (1 / 1500))
+    assert (always.value, always.high) == (1.0, 1.0) and always.low == pytest.approx(0.025 ** (1 / 1500))
+    assert rate(once) == mean(once)
 
 
 def test_a_ratio_is_of_sums_and_of_seeds_alike():
