@@ -64,6 +64,7 @@ def test_scores_of_groups_are_those_of_their_runs(first: list[float], second: li
     assert (pair["of"], pair["over"]) == ("ddpc", "none") and pair["probability"] == pytest.approx(better)
 
 
+@pytest.mark.long
 def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
     """With ten runs the percentile bootstrap covers somewhat less than 95 %."""
     generator, covered = np.random.default_rng(1), 0

@@ -236,6 +236,7 @@ def test_a_robot_from_free_driving_hits_nothing_and_does_not_get_stuck(turner, p
     assert 0.0 < least < 0.1 and longest < 12 and driven > 4.0 and failsafe < 70
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("certificate", ["set-membership", "matrix-zonotope"])
 def test_the_other_error_bounds_have_predictors_in_place_too(certificate):
     model = fit_model_set(record(0, trajectories=10), ModelConfig(certificate, windows=FREE))

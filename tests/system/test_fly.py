@@ -77,7 +77,10 @@ def sent(records: list[Record]) -> Iterator[tuple[float, Any]]:
                     yield frame.wall_time * 1e-9, decoded.message
 
 
-@pytest.mark.parametrize(("policy", "perception", "periods"), [("adversary", "scan", 25), ("astar", "map", 70)])
+@pytest.mark.parametrize(
+    ("policy", "perception", "periods"),
+    [pytest.param("adversary", "scan", 25, marks=pytest.mark.long), ("astar", "map", 70)],
+)
 def test_it_flies_in_time_and_hits_nothing(
     policy: str, perception: str, periods: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -165,6 +165,7 @@ def test_a_version_that_is_not_known_is_not_replaced():
     assert attempt.model is None and "no old" in attempt.text
 
 
+@pytest.mark.long
 def test_without_a_change_a_set_is_replaced_by_a_tighter_one_after_a_quarter_of_an_hour():
     wide = replace(in_use(), steps=tuple(_wider(step) for step in in_use().steps))
     attempts = drive(Adaptation(ROBOT, lambda version: wide, ACCEPTED), driven(6, 23))
