@@ -24,7 +24,7 @@ from brakeline.safety.model.validation import ValidationReport, upper_bound
 from brakeline.safety.model.windows import FREE, PLAN, resting_periods_at_end, stopping_distances, windows
 
 NEAR = 0.05  # share of an input's range: values this close to a bound count as at the bound
-CRUISES = plans_needed(0.1)  # plans of a kind that, without a violation, bound its share outside by 10 %
+FEWEST_CRUISES = plans_needed(0.1)  # plans of a kind that, without a violation, bound its share outside by 10 %
 MOST_SHOWN = 3  # groups of violations in a message
 MOST_PLANS = 10**6  # largest number of plans that advice asks for
 
@@ -168,13 +168,13 @@ def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:
 def _cruises_missing(report: ValidationReport, robot: Robot) -> list[str]:
     """Return advice on inputs that few plans of the data hold at their bounds, as trained policies do."""
     plans = {group.name: group.plans for group in report.groups}
-    rare = [(name, plans.get(name, 0)) for name in at_bound(robot) if plans.get(name, 0) < CRUISES]
+    rare = [(name, plans.get(name, 0)) for name in at_bound(robot) if plans.get(name, 0) < FEWEST_CRUISES]
     if not report.groups or not rare:
         return []
     seen = " and ".join(f"{number} plans with {name}" for name, number in rare)
     return [
         f"only {seen} (of {report.windows} plans), so little is known of a policy that drives like that, as trained "
-        f"ones do: hold the input there for some seconds, until there are {CRUISES} such plans, or lower its bound"
+        f"ones do: hold the input there, until there are {FEWEST_CRUISES} such plans, or lower its bound"
     ]
 
 

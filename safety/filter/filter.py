@@ -46,7 +46,7 @@ from brakeline.safety.filter.request import (
 )
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.filter.tube_extent import turning_extent
-from brakeline.safety.filter.turning_aside import may_turn_aside, turned_aside
+from brakeline.safety.filter.turning_aside import find_plan
 from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
@@ -188,10 +188,7 @@ class Filter:
             record.reason = blind
         elif in_domain:
             committed = request.plan[self.robot.committed_steps : self.robot.free_steps].ravel()
-            search = PlanSearch(self, local_map, z_0, proposal, record)
-            candidate = search.candidate(committed)
-            if candidate is not None and request.turn_aside and may_turn_aside(self.robot):
-                candidate = turned_aside(search, candidate, committed)
+            candidate = find_plan(PlanSearch(self, local_map, z_0, proposal, record), committed, request.turn_aside)
         else:
             record.reason = "the state is outside the domain that was recorded"
         if candidate is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ Array = NDArray[np.float64]
 BLOCKED = 0.3  # of the proposed speed: a robot that may drive at least as fast is not blocked
 SLOWEST = 0.08  # of the speed's range: a robot that is proposed to drive slower means to stand
 PERIODS = 2  # at the highest speed, for which the new direction must be free
-PASSED = 1e-6  # rad beyond a sector's edge
+BEYOND_EDGE = 1e-6  # rad; the edge of a sector itself is blocked
 
 
 def may_turn_aside(robot: Robot) -> bool:
@@ -32,18 +33,27 @@ def may_turn_aside(robot: Robot) -> bool:
     return robot.heading is not None and sorted(robot.translates) == [False, True]
 
 
-def turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) -> PlanCandidate:
-    """Return a verified plan that turns a blocked robot aside; `stopped` if it is not blocked, or there is none.
+def find_plan(search: PlanSearch, committed: Array, turn_aside: bool) -> PlanCandidate | None:
+    """Return the first verified plan of a search, or None.
 
     Args:
-        search: that found the adjusted plan `stopped`.
+        search: the search near the proposal.
         committed: free inputs of the committed plan.
+        turn_aside: turn the robot aside if that plan leaves it blocked, and if a plan that does so is verified.
     """
-    robot, first = search.safety.robot, len(search.z_0)
+    robot, candidate = search.safety.robot, search.candidate(committed)
+    if candidate is None or candidate.kind != ADJUSTED or not (turn_aside and may_turn_aside(robot)):
+        return candidate
     speed = robot.translates.index(True)
-    executed = stopped.z[first : first + robot.action_dim]
-    if stopped.kind != ADJUSTED or not is_blocked(robot, search.proposal[speed], executed[speed]):
-        return stopped
+    if not is_blocked(robot, search.proposal[speed], candidate.z[len(search.z_0) + speed]):
+        return candidate
+    return _turned_aside(search, candidate, committed)
+
+
+def _turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) -> PlanCandidate:
+    """Return a verified plan that turns a blocked robot aside; without one, `stopped`."""
+    robot = search.safety.robot
+    speed = robot.translates.index(True)
     turn = free_turn(*blocked_sectors(search, backwards=bool(search.proposal[speed] < 0.0)))
     if turn == 0.0 or not math.isfinite(turn):
         return stopped
@@ -58,11 +68,15 @@ def turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) -
     return replace(aside, kind=ADJUSTED, for_clearance=stopped.for_clearance)
 
 
-def is_blocked(robot: Robot, proposed: float, executed: float) -> bool:
-    """Return whether a robot is blocked that drives with the speed `executed` instead of `proposed`."""
+def is_blocked(robot: Robot, proposed: Any, executed: Any, tolerance: float = 0.0) -> Any:
+    """Return whether a robot is blocked that drives with the speed `executed` instead of `proposed`.
+
+    The speeds are numbers, or arrays of any namespace. A robot that is blocked to within `tolerance` counts, too.
+    """
     speed = robot.translates.index(True)
     span = robot.action_high[speed] - robot.action_low[speed]
-    return abs(proposed) >= SLOWEST * span and abs(executed) <= BLOCKED * abs(proposed)
+    moves = abs(proposed) >= SLOWEST * span - tolerance
+    return moves & (abs(executed) <= BLOCKED * abs(proposed) + tolerance)
 
 
 def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array, Array]:
@@ -92,7 +106,7 @@ def free_turn(middles: Array, half_angles: Array) -> float:
     (-0.25..., 0.0)
     """
     left, right = _edge(middles, half_angles), _edge(-middles, half_angles)
-    return left if left <= right + PASSED else -right
+    return left if left <= right + BEYOND_EDGE else -right
 
 
 def _edge(middles: Array, half_angles: Array) -> float:
@@ -103,5 +117,5 @@ def _edge(middles: Array, half_angles: Array) -> float:
         beyond = (off + half_angles)[np.abs(off) < half_angles]
         if not beyond.size:
             return angle
-        angle += float(beyond.max()) + PASSED
+        angle += float(beyond.max()) + BEYOND_EDGE
     return math.inf

@@ -14,7 +14,7 @@ from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
-from brakeline.safety.filter.turning_aside import PASSED, free_turn
+from brakeline.safety.filter.turning_aside import BEYOND_EDGE, free_turn
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import request_of
@@ -78,10 +78,10 @@ def test_the_turn_is_the_smallest_to_a_free_direction(sectors):
     turn = free_turn(middles, halves)
     if not math.isfinite(turn):
         off = np.remainder(middles[:, None] - every + math.pi, math.tau) - math.pi
-        assert (np.abs(off) <= halves[:, None] + 2 * PASSED).any(axis=0).all()
+        assert (np.abs(off) <= halves[:, None] + 2 * BEYOND_EDGE).any(axis=0).all()
         return
     assert (np.abs(np.remainder(middles - turn + math.pi, math.tau) - math.pi) >= halves - 1e-9).all()
-    assert not free.size or abs(turn) <= np.abs(free).min() + 10 * PASSED
+    assert not free.size or abs(turn) <= np.abs(free).min() + 10 * BEYOND_EDGE
 
 
 def test_a_scan_shows_where_to_turn():

@@ -17,7 +17,7 @@ from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
 from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
-from brakeline.safety.filter.turning_aside import BLOCKED, SLOWEST, may_turn_aside
+from brakeline.safety.filter.turning_aside import is_blocked, may_turn_aside
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -203,13 +203,11 @@ class LaneDecisions:
         return done
 
     def _turns_aside(self, requests: RequestArrays, rows: Array, proposal: Array, z: Array) -> Array:
-        """Return which lanes (B,) with adjusted plans are blocked and may turn aside: `turning_aside.turned_aside`."""
+        """Return which lanes (B,) with adjusted plans are blocked and may turn aside: `turning_aside.find_plan`."""
         xp, aside, speed = self._xp, requests.turn_aside, self._speed
         if aside is False or speed is None:
             return xp.zeros_like(rows, dtype=xp.bool)
-        span = self._robot.action_high[speed] - self._robot.action_low[speed]
-        wanted, given = (xp.abs(part[speed]) for part in (proposal, z[self._search.known :]))
-        blocked = (wanted >= SLOWEST * span - NEARLY) & (given <= BLOCKED * wanted + NEARLY)
+        blocked = is_blocked(self._robot, proposal[speed], z[self._search.known + speed], NEARLY)
         return blocked if aside is True else blocked & xp.take(aside, rows, axis=0)
 
     def _goes_on(self, requests: RequestArrays, rows: Array) -> Array:
