@@ -14,9 +14,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks import situations
 from benchmarks.batch_decide import SIZES, beside, crowded, seconds
-from benchmarks.set_widths import part_of
 from benchmarks.timing import Figures
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import data_for
@@ -24,6 +25,7 @@ from brakeline.deploy.policy_loading import policy_named
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.dataset import RESTLESS, Dataset
 from brakeline.safety.model.model_config import AUTO, DIRECT, ModelConfig
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from brakeline.safety.service.wire import MAX_REQUESTS
@@ -33,6 +35,7 @@ ROBOTS = ("ground", "quadrotor")
 TOGETHER = (1, 2, 4, 8, 16, 32, MAX_REQUESTS)  # robots of a question
 HORIZONS = {"ground": (3, 4, 6, 8, 12, 16), "quadrotor": (8, 10, 12, 16)}
 MINUTES = 150.0  # of recorded driving
+SEED = 3  # of the order of its trajectories
 DECISIONS = 400
 SINGLE, BATCH = "one by one", "as a batch"
 
@@ -76,6 +79,22 @@ def _together(ready: Filter, messages: list[pb.Request]) -> dict[str, float]:
         work()
         row[str(number)] = 1e6 * min(seconds(work, 1) for _ in range(5)) / (4 * MAX_REQUESTS)
     return row
+
+
+def part_of(data: Dataset, minutes: float) -> Dataset:
+    """Return whole trajectories that last so long together, in a fixed random order; all of them if they are fewer.
+
+    Restless ones are among them. They come last, as in the recording, and only mode one-step is fitted to them.
+    """
+    order, periods = np.random.default_rng(SEED).permutation(len(data.trajectories)), 60.0 * minutes / data.robot.period
+    taken: list[int] = []
+    for i in order.tolist():
+        if sum(len(data.trajectories[k].inputs) for k in taken) >= periods:
+            break
+        taken.append(i)
+    steady = len(data.steady().trajectories)
+    about = data.about | {RESTLESS: str(sum(i >= steady for i in taken))}
+    return replace(data, trajectories=tuple(data.trajectories[i] for i in sorted(taken)), about=about)
 
 
 def _of_plans(robot: RobotWithTask, horizon: int) -> float:
