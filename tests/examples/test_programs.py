@@ -20,25 +20,20 @@ from tests.waiting import until
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run_program(name: str) -> str:
+def run_program(name: str, *more: str) -> str:
     """Run a program as a person starts it, and return its output."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
-    words = [sys.executable, str(EXAMPLES / name)]
+    words = [sys.executable, str(EXAMPLES / name), *more]
     result = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stderr
     return result.stdout
 
 
-def test_a_csv_log_leads_to_decisions():
-    output = run_program("own_robot_from_csv.py")
+@pytest.mark.parametrize("kind", ["csv", "bag"])
+def test_a_log_leads_to_decisions(kind):
+    output = run_program("own_robot_from_log.py", kind)
     assert "pillar at 2.0 m: allowed, 0.40 m/s" in output and "pillar at 0.4 m: allowed" not in output, output
-    assert "next: brakeline certify" in output and "free" in output
-
-
-def test_a_ros2_bag_leads_to_a_model_set():
-    output = run_program("own_robot_from_bag.py")
-    assert re.search(r"known to \d+ cm", output), output
-    assert "next: brakeline certify" in output and "free" in output
+    assert re.search(r"known to \d+ cm", output) and "next: brakeline certify" in output and "free" in output, output
 
 
 def test_the_cart_stops_before_the_wall(capsys):

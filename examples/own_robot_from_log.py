@@ -1,9 +1,11 @@
-"""Get decisions about your own robot from a log of it in CSV: two commands and four lines.
+"""Get decisions about your own robot from a log of it, in CSV or as a ROS 2 bag: two commands and four lines.
 
-python examples/own_robot_from_csv.py       # writes a small log first
+python examples/own_robot_from_log.py           # writes a small log in CSV first
+python examples/own_robot_from_log.py bag       # writes a small bag first; ROS is not needed
 """
 
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -14,19 +16,22 @@ from brakeline import BackupPlan, Filter, ModelSet, Obstacle, Request, Shapes
 from brakeline.deploy.cli import main as brakeline
 
 
-def main() -> None:
+def main(kind: str = "csv") -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         os.environ["BRAKELINE_DATA"] = str(folder / "data")
         robot = folder / "my.toml"  # names, units, bounds, braking
         robot.write_text(small_log.DESCRIPTION)
-        log = small_log.write_csv(folder / "drive.csv")
+        # The bag has /odom and /cmd_vel. The importer finds topics by their types; to name another one:
+        # --map v=/wheels/twist.linear.x
+        log = small_log.write_bag(folder / "bag") if kind == "bag" else small_log.write_csv(folder / "drive.csv")
 
         brakeline(["import", str(log), "--robot", str(robot)])
         certify = ["certify", str(robot), "--certificates", "residual", "--mode", "direct", "--use"]
         brakeline([*certify, "--accept-bound", "0.05"])  # from 12 minutes of data, the bound exceeds the limit of 1 %
 
         filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-direct.safetensors"))
+        print(f"a full stop from full speed is known to {100.0 * filter.half_width(filter.robot.high()):.0f} cm")
         decide(filter, 2.0)
         decide(filter, 0.4)
 
@@ -40,4 +45,4 @@ def decide(filter: Filter, distance: float) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])
