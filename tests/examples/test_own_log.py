@@ -3,33 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from brakeline.messaging.robot import robot_named
+from tests.examples.programs import EXAMPLES, run_program
 
-FOLDER = Path(__file__).parents[2] / "examples" / "own_log"
 ROBOTS = ("diff", "skid", "car", "boat")
-
-
-def run(program: str, *words: str) -> str:
-    """Return what a program of the example prints, started as a person starts it."""
-    alone = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
-    call = [sys.executable, str(FOLDER / program), *words]
-    ran = subprocess.run(call, env=alone, capture_output=True, text=True, timeout=300, check=False)
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout
 
 
 @pytest.mark.fast
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_drive_fits_its_description(name):
-    header, *rows = run("drive.py", name, "--minutes", "0.5", "--seed", "3").splitlines()
-    robot = robot_named(str(FOLDER / f"{name}.toml"))
+    header, *rows = run_program("own_log/drive.py", name, "--minutes", "0.5", "--seed", "3").splitlines()
+    robot = robot_named(str(EXAMPLES / "own_log" / f"{name}.toml"))
     labels = [label.rpartition(" [")[0] for label in (*robot.state, *robot.action)]
     assert header.split(",") == ["time", "run", *labels]
     assert len(rows) == 600
@@ -42,7 +29,7 @@ def test_a_drive_fits_its_description(name):
 
 def test_four_minutes_give_a_filter(tmp_path):
     figures = tmp_path / "figures.json"
-    output = run("table.py", "--robots", "diff", "--minutes", "4", "--quick", "--json", str(figures))
+    output = run_program("own_log/table.py", "--robots", "diff", "--minutes", "4", "--quick", "--json", str(figures))
     (row,) = json.loads(figures.read_text())
     assert output.count("\n") == 3 and output.splitlines()[2].startswith("| diff | 4 min |")
     assert row["clearance"] < 0.05 and row["straight"]["set"] < 0.02

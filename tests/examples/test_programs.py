@@ -1,12 +1,9 @@
 """The example programs and the notebook run as they stand, and print what their texts say."""
 
 import json
-import os
 import re
 import runpy
 import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import matplotlib
@@ -14,19 +11,9 @@ import pytest
 
 from brakeline import BusError, Filter, SafetyClient, SafetyWrapper
 from brakeline.messaging.free_ports import free_endpoint
+from tests.examples.programs import EXAMPLES, run_program
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def run_program(name: str, *more: str) -> str:
-    """Run a program as a person starts it, and return its output."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
-    words = [sys.executable, str(EXAMPLES / name), *more]
-    result = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
 
 
 @pytest.mark.parametrize("kind", ["csv", "bag"])
