@@ -46,10 +46,13 @@ def normalised(robot: Robot) -> ActionMapping:
     [0.25, 0.0]
     """
     low, width = robot.low(), robot.high() - robot.low()
-    return ActionMapping(
-        lambda action: low + 0.5 * width * (np.clip(np.asarray(action, float), -1.0, 1.0) + 1.0),
-        lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0),
-    )
+
+    def action_to_control(action: ArrayLike) -> Array:
+        given = np.asarray(action, float)
+        kept = np.where(np.isfinite(given), np.clip(given, -1.0, 1.0), given)  # the filter must see what is not finite
+        return np.asarray(low + 0.5 * width * (kept + 1.0))
+
+    return ActionMapping(action_to_control, lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0))
 
 
 def mapping_for_space(space: gymnasium.Space[Any], robot: Robot, given: ActionMapping | None) -> ActionMapping:

@@ -14,6 +14,7 @@ from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, no
 from brakeline.safety.environment_views import STATE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper, view_each_environment
 from brakeline.safety.model.fitting import fit_model_set
@@ -105,6 +106,15 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     assert np.array_equal(diagnostics["executed"], [0.0, 0.0]) and np.array_equal(diagnostics["proposed"], [0.0, 0.0])
     assert reward == -info["penalty"] == 0.0
     assert ModelSet.load(tmp_path / "model.safetensors").version == diagnostics["model"]
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf")])
+def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
+    """Also through a mapping that clips."""
+    _, reward, _, _, info = wrapped(Toy(CAR), ready, penalty=1.0, **HOW).step(np.array([wrong, 0.1], np.float32))
+    diagnostics = info["diagnostics"]
+    assert not diagnostics["executed"].any() and np.isfinite(reward)
+    assert (diagnostics["kind"], diagnostics["verified"], diagnostics["reason"]) == ("failsafe", True, NOT_FINITE)
 
 
 class Silent(SafetyClient):
