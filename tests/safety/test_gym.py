@@ -108,6 +108,27 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     assert ModelSet.load(tmp_path / "model.safetensors").version == diagnostics["model"]
 
 
+def test_the_wrapper_passes_a_safe_action_and_clipping_costs_nothing(ready):
+    env = wrapped(Toy(CAR), ready, penalty=2.0, **HOW)
+    for action in ([0.3, 0.5], [9.0, 0.0]):
+        _, reward, _, _, info = env.step(np.array(action, np.float32))
+        executed = normalised(CAR).action_to_control(np.clip(np.array(action, np.float32), -1.0, 1.0))
+        assert info["safety"].kind == "allowed" and np.allclose(info["diagnostics"]["executed"], executed, atol=1e-12)
+        assert reward == info["penalty"] == 0.0
+
+
+def test_the_wrapper_replaces_and_penalises_unsafe_actions(ready):
+    toy = Toy(CAR, discs(count=12))
+    env, kinds, penalties = wrapped(toy, ready, penalty=2.0, **HOW), set(), []
+    for _ in range(60):
+        _, reward, _, _, info = env.step(np.array([1.0, 0.0], np.float32))
+        kinds.add(info["safety"].kind)
+        off = np.linalg.norm((info["safety"].action - info["diagnostics"]["proposed"]) / (CAR.high() - CAR.low()))
+        penalties.append(-reward)
+        assert penalties[-1] == info["penalty"] == pytest.approx(2.0 * off)
+    assert "adjusted" in kinds and max(penalties) > 1.0 and toy.worst > 0.0
+
+
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf")])
 def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     """Also through a mapping that clips."""
@@ -115,6 +136,14 @@ def test_a_proposal_that_is_not_finite_is_a_failsafe(ready, wrong):
     diagnostics = info["diagnostics"]
     assert not diagnostics["executed"].any() and np.isfinite(reward)
     assert (diagnostics["kind"], diagnostics["verified"], diagnostics["reason"]) == ("failsafe", True, NOT_FINITE)
+
+
+def test_every_episode_starts_standing(ready):
+    env = wrapped(Toy(CAR), ready, **HOW)
+    env.step(np.array([1.0, 0.1], np.float32))
+    assert env.backup_plan.input_in_force.any()
+    env.reset(seed=4)
+    assert not env.backup_plan.input_in_force.any() and env.backup_plan.predicted is None
 
 
 class Silent(SafetyClient):
