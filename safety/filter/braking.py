@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.request import FAILSAFE, Decision, Request
 
 
 def brake(robot: Robot, before: Array) -> Array:
@@ -27,21 +25,3 @@ def braking_plan(robot: Robot, first: Array) -> Array:
     for k in range(1, robot.horizon):
         plan[k] = brake(robot, plan[k - 1])
     return plan
-
-
-def braking_decision(robot: Robot, request: Request, version: str, reason: str, total: float) -> Decision:
-    """Return the failsafe of a method that verifies nothing: μ from now on. total [ms]: time in `decide`."""
-    before = request.input_in_force
-    return Decision(
-        kind=FAILSAFE,
-        plan=braking_plan(robot, robot.clip_input(brake(robot, before), before)),
-        tube_center=np.zeros((0, robot.position_dim)),
-        tube_half_width=np.zeros((0, robot.position_dim)),
-        predicted=NO_PREDICTION,
-        margin=0.0,
-        model=version,
-        reason=reason,
-        verified=False,
-        time_ms=total,
-        verify_ms=total,
-    )

@@ -59,9 +59,9 @@ class PredictiveFilter(UnicycleRival):
         plan = next((plan for start in starts if (plan := self._solve(request, proposal, start)) is not None), None)
         if plan is None:
             reason = "the nominal model has no clear plan: the last one goes on"
-            return self.decision(FAILSAFE, request.plan, self._room(request, request.plan), started, reason)
+            return self.decision(FAILSAFE, request.plan, self._room(request, request.plan), started, reason=reason)
         reason = f"the proposal comes {-room:.3g} m too near by the nominal model"
-        return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason)
+        return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason=reason)
 
     def positions(self, state: Array, plans: Array) -> Array:
         """Return the positions (P, N · SAMPLES, 2) that the nominal model predicts for plans (P, N, 2)."""

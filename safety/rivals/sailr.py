@@ -12,18 +12,16 @@ lowest reward (`actors/episode_runner.py`, `learner/n_step.py`). In use, the rul
 
 from __future__ import annotations
 
-from time import perf_counter_ns
-
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadModel
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision, braking_plan
-from brakeline.safety.filter.request import ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
+from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.request import ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import SAILR as SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.rival import Rival
 
 Array = NDArray[np.float64]
 
@@ -34,12 +32,12 @@ def normalised_input(robot: Robot, action: Array) -> Array:
     return np.asarray((2.0 * action - low - high) / (high - low))
 
 
-class Sailr:
+class Sailr(Rival):
     """The rule of SAILR with trained critics, whose outputs are logits of the cost in [0, 1]."""
 
     def __init__(self, model: Pretrained) -> None:
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
-        self.model, self.robot, self.version = model, model.robot, model.version
+        super().__init__(model)
         try:
             self.q, self.v, self.threshold = model.networks["q"], model.networks["v"], model.settings["threshold"]
         except KeyError as error:
@@ -55,35 +53,13 @@ class Sailr:
         best = self.v(observation).min()
         return _sigmoid(float(worst)) - _sigmoid(float(best))
 
-    def decide(self, request: Request) -> Decision:
-        """Return the proposal, or the backup policy's input.
-
-        Raises:
-            BadRequest: a value is missing, not finite, or has the wrong size; `field` names it.
-        """
-        started = perf_counter_ns()
-        robot = self.robot
-        check_for_rival(robot, request, self.observed)
-        if not request.finite:
-            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = robot.clip_input(request.action, request.input_in_force)
+    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
+        """Return the proposal, or the backup policy's input."""
         advantage = self.advantage(request.observation, proposal)
         if advantage > self.threshold:
             reason = f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}"
-            return braking_decision(robot, request, self.version, reason, (perf_counter_ns() - started) * 1e-6)
-        total = (perf_counter_ns() - started) * 1e-6
-        return Decision(
-            kind=ALLOWED,
-            plan=braking_plan(robot, proposal),
-            tube_center=np.zeros((0, robot.position_dim)),
-            tube_half_width=np.zeros((0, robot.position_dim)),
-            predicted=NO_PREDICTION,
-            margin=0.0,
-            model=self.version,
-            verified=False,
-            time_ms=total,
-            verify_ms=total,
-        )
+            return self.braking(request, started, reason)
+        return self.decision(ALLOWED, braking_plan(self.robot, proposal), 0.0, started)
 
 
 def _sigmoid(x: float) -> float:

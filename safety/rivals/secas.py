@@ -22,12 +22,12 @@ from brakeline.errors import BadModel
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision, braking_plan
+from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, NOT_FINITE, Decision, Request, check_for_rival
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import SECAS as SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.rival import Rival
 
 Array = NDArray[np.float64]
 
@@ -117,12 +117,12 @@ def _usual_rays(robot: Robot) -> LidarRays:
     return robot_with_task(robot.kind).task.rays
 
 
-class Secas:
+class Secas(Rival):
     """The rule of SECAS with trained networks. Inputs are scaled by their upper bounds."""
 
     def __init__(self, model: Pretrained) -> None:
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
-        self.model, self.robot, self.version = model, model.robot, model.version
+        super().__init__(model)
         rays = model.rays or _usual_rays(self.robot)
         self.constraints = Constraints(model.robot, rays)
         try:
@@ -137,18 +137,9 @@ class Secas:
         self.bound = -clearance
         self.scale = self.robot.high()
 
-    def decide(self, request: Request) -> Decision:
-        """Return the corrected proposal.
-
-        Raises:
-            BadRequest: a value is missing, not finite, or has the wrong size; `field` names it.
-        """
-        started = perf_counter_ns()
+    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
+        """Return the corrected proposal."""
         robot = self.robot
-        check_for_rival(robot, request, self.observed)
-        if not request.finite:
-            return braking_decision(robot, request, self.version, NOT_FINITE, (perf_counter_ns() - started) * 1e-6)
-        proposal = robot.clip_input(request.action, request.input_in_force)
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c
         action, solver, iterations, solve_ns = proposal, "", 0, 0
@@ -164,20 +155,13 @@ class Secas:
             action = corrected
         worst = float((d - G @ (action / self.scale)).min())
         changed = bool((np.abs(action - proposal) > TOLERANCE * self.scale).any())
-        total, solved = (perf_counter_ns() - started) * 1e-6, solve_ns * 1e-6
-        return Decision(
-            kind=ADJUSTED if changed else ALLOWED,
-            plan=braking_plan(robot, action),
-            tube_center=np.zeros((0, robot.position_dim)),
-            tube_half_width=np.zeros((0, robot.position_dim)),
-            predicted=NO_PREDICTION,
-            margin=worst,
-            model=self.version,
+        return self.decision(
+            ADJUSTED if changed else ALLOWED,
+            braking_plan(robot, action),
+            worst,
+            started,
             reason=f"sector {int((c + G @ r).argmax())} would come too near" if changed else "",
-            verified=False,
-            time_ms=total,
-            solve_ms=solved,
-            verify_ms=total - solved,
+            solve_ms=solve_ns * 1e-6,
             solver=solver,
             iterations=iterations,
         )

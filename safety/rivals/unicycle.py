@@ -6,28 +6,21 @@ obstacles of a map, as the filter does.
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
-from time import perf_counter_ns
-
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, BadRequest
-from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import braking_decision
-from brakeline.safety.filter.request import NOT_FINITE, Decision, Request, check_for_filter
+from brakeline.safety.filter.request import Request, check_for_filter
 from brakeline.safety.rivals.pretrained import Pretrained
+from brakeline.safety.rivals.rival import Rival
 
 Array = NDArray[np.float64]
 
 OUTSIDE = 1e-9  # m; nearer to an obstacle, no direction leads away from it
 
 
-class UnicycleRival(ABC):
+class UnicycleRival(Rival):
     """A method with a unicycle by hand: a robot with the inputs [speed; turn rate], and the method's settings."""
-
-    observed = 0
 
     def __init__(self, model: Pretrained, method: str, settings: tuple[str, ...]) -> None:
         """Take over the settings. Raises BadModel if the model is of another method or does not fit the robot."""
@@ -38,25 +31,8 @@ class UnicycleRival(ABC):
         planar = robot.position_dim == 2 and robot.heading is not None and robot.translates == (True, False)
         if not planar or robot.feedback or robot.late:
             raise BadModel(f"{method} knows robots with the inputs speed and turn rate, in lockstep: not {robot.name}")
-        self.model, self.robot, self.version = model, robot, model.version
+        super().__init__(model)
         self.settings = {name: model.settings[name] for name in settings}
-
-    def decide(self, request: Request) -> Decision:
-        """Return the method's decision; brake if the proposal is not finite.
-
-        Raises:
-            BadRequest: see `check`.
-        """
-        started = perf_counter_ns()
-        self.check(request)
-        if not request.finite:
-            time_ms = (perf_counter_ns() - started) * 1e-6
-            return braking_decision(self.robot, request, self.version, NOT_FINITE, time_ms)
-        return self.correct(request, self.robot.clip_input(request.action, request.input_in_force), started)
-
-    @abstractmethod
-    def correct(self, request: Request, proposal: Array, started: int) -> Decision:
-        """Return the decision on a clipped proposal (2,). started [ns]: time of the request."""
 
     def check(self, request: Request) -> None:
         """Check a request.
@@ -82,23 +58,4 @@ class UnicycleRival(ABC):
         taken = request.obstacles.margin[:, None] + self.robot.footprint
         return lengths - taken, np.where(
             lengths[..., None] > OUTSIDE, away / np.maximum(lengths, OUTSIDE)[..., None], 0.0
-        )
-
-    def decision(
-        self, kind: str, plan: Array, margin: float, started: int, reason: str = "", iterations: int = 0
-    ) -> Decision:
-        """Return a decision, which nothing verifies. margin [m]: of the plan; started [ns]: time of the request."""
-        nothing = np.zeros((0, self.robot.position_dim))
-        return Decision(
-            kind=kind,
-            plan=plan,
-            tube_center=nothing,
-            tube_half_width=nothing,
-            predicted=NO_PREDICTION,
-            margin=margin if math.isfinite(margin) else 0.0,
-            model=self.version,
-            reason=reason,
-            verified=False,
-            time_ms=(perf_counter_ns() - started) * 1e-6,
-            iterations=iterations,
         )

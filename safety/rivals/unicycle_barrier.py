@@ -11,11 +11,10 @@ from the obstacle and n the direction away:
 from __future__ import annotations
 
 import math
-from time import perf_counter_ns
 
 import numpy as np
 
-from brakeline.safety.filter.braking import braking_decision, braking_plan
+from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import CBF as CBF
@@ -53,8 +52,8 @@ class UnicycleBarrier(UnicycleRival):
         A, b = np.vstack([A, np.eye(2), -np.eye(2)]), np.concatenate([b, bounds])
         solution = solve(QuadraticProgram(np.ones(2), -wanted, A, b, always=4))
         if not solution.found or solution.residual > TOLERANCE:
-            total = (perf_counter_ns() - started) * 1e-6
-            return braking_decision(robot, request, self.version, "no input meets the barrier", total)
+            return self.braking(request, started, "no input meets the barrier")
         action = robot.clip_input(solution.x * scale, request.input_in_force)
         reason = f"obstacle {int(h.argmin())} would come near faster than the barrier allows"
-        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, reason, solution.iterations)
+        said = {"reason": reason, "iterations": solution.iterations}
+        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **said)
