@@ -93,20 +93,10 @@ def test_the_robot_hits_nothing_and_does_not_get_stuck(ready, obstacles, policy)
     ],
 )
 def test_the_other_model_sets_hit_nothing_either(models, which, seed, most):
-    counts, least, violations, _ = drive(Filter(models[which]), ROOM, wild, 800, seed)
+    counts, least, violations, _ = drive(Filter(models[which]), ROOM, wild, 400, seed)
     assert least > 0.0
     assert violations <= most
-    assert counts[ALLOWED] + counts[ADJUSTED] > 200
-
-
-def test_a_robot_that_slips_more_than_recorded_is_noticed(ready):
-    robot = Unicycle((0, 0, 0), np.random.default_rng(14), slip=0.3)
-    safety, violations = InProcess(ready, accept_bound=1.0), 0
-    for _ in range(100):
-        answer = safety.decide(robot.measure(), [0.25, 0.1], known_free=True)
-        violations += not answer.contained
-        robot.step(answer.action)
-    assert violations > 50
+    assert counts[ALLOWED] + counts[ADJUSTED] > 100
 
 
 EXTRA = 0.02  # m: this robot keeps to its chords and stops at once, so its bounds on both are raised first

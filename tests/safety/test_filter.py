@@ -13,7 +13,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
-from brakeline.safety.model.error_bounds import KINDS, ErrorBound
+from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
@@ -144,13 +144,13 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
         assert decision.plan[0] == pytest.approx(ask.action)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_plan_keeps_clear_and_ends_in_a_stop(models, kind):
+@pytest.mark.parametrize(("kind", "count"), [("residual", 250), ("set-membership", 80), ("matrix-zonotope", 80)])
+def test_every_plan_keeps_clear_and_ends_in_a_stop(models, kind, count):
     model = models[kind, "direct"]
     ready = Filter(model)
     rng = np.random.default_rng(1)
     kinds = set()
-    for _ in range(250):
+    for _ in range(count):
         ask = random_request(rng)
         decision = ready.decide(ask)
         kinds.add(decision.kind)
