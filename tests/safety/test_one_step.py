@@ -1,4 +1,7 @@
-"""A model set that rolls one learned period out: tight from minutes of free driving, exact where it decides."""
+"""A model set that rolls one learned period out: tight from minutes of free driving, exact where it decides.
+
+How an adversary and a planner drive behind one: `tests/examples/test_own_log.py`.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -11,7 +14,6 @@ from hypothesis import strategies as st
 from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
-from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.driving_kinds import RESTLESS, START
@@ -22,7 +24,6 @@ from brakeline.safety.model.windows import FREE
 from tests.safety.asked import cylinder
 from tests.safety.test_turning_in_place import ROBOT, record
 from tests.safety.toys import puck
-from tests.safety.unicycle import Unicycle
 
 CONFIG = ModelConfig(mode=ONE_STEP)
 MINUTES = 6  # trajectories of 40 s each make four minutes
@@ -134,27 +135,6 @@ def test_every_set_holds_all_errors_of_the_predictor_and_the_body_stays_clear(se
     for post in range(3):
         center, radius = ask.obstacles.center[post, :2], ask.obstacles.rho[post]
         assert (np.linalg.norm(points - center, axis=-1) > radius + ROBOT.footprint).all()
-
-
-def test_in_closed_loop_an_adversary_comes_close_and_hits_nothing():
-    nearest = np.inf
-    for episode in range(4):
-        rng = np.random.default_rng(episode)
-        robot, backup = Unicycle((0.0, 0.0, rng.uniform(-3, 3)), rng), BackupPlan(ROBOT)
-        angles = np.arange(6) * np.pi / 3.0 + rng.uniform(0.0, 1.0)
-        posts = [cylinder(np.cos(a), np.sin(a), 0.15) for a in angles]
-        for _ in range(80):
-            state = robot.measure()
-            target = posts[int(rng.integers(6))].position
-            bearing = np.arctan2(target[1] - state[1], target[0] - state[0]) - state[2]
-            action = np.array([0.6, np.clip(3.0 * np.arctan2(np.sin(bearing), np.cos(bearing)), -1.5, 1.5)])
-            backup.measured(state)
-            committed = backup.input_in_force, backup.plan, Shapes.of(posts, 2), backup.model, backup.predicted
-            decision = ready().decide(Request(state, action, *committed))
-            robot.step(backup.accept(decision.plan, decision.model, decision.predicted, decision.verified))
-            away = min(np.hypot(*(robot.state[:2] - post.position)) - 0.15 - ROBOT.footprint for post in posts)
-            nearest = min(nearest, away)
-    assert 0.0 < nearest < 0.05
 
 
 def test_a_file_gives_the_same_model_set_and_a_damaged_one_is_refused(tmp_path):
