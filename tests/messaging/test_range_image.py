@@ -16,25 +16,12 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import BeamGrid, SphereCover, patch_free_ranges
-from tests.messaging.test_obstacle import sample
+from tests.messaging.test_obstacle import cast, sample
 from tests.robots import QUADROTOR
 
 RINGS, COLUMNS, FAR, WIDTH = 45, 90, 8.0, 0.6  # every 4°
 EDGE = 0.5 * math.pi * (1.0 - 1.0 / RINGS)
 GRID = directions(np.linspace(-EDGE, EDGE, RINGS), COLUMNS)
-
-
-def cast(obstacles, at, ways, far=FAR):
-    """Ranges along unit vectors (..., 3) by marching: the step is the distance to the nearest obstacle."""
-    shapes, flat = Shapes.of(obstacles, 3), ways.reshape(-1, 3)
-    ranges, going = np.zeros(len(flat)), np.arange(len(flat))
-    for _ in range(300):
-        steps = shapes.distance(at + ranges[going, None] * flat[going]).min(axis=0)
-        ranges[going] = np.minimum(ranges[going] + steps, far)
-        going = going[(steps > 1e-9) & (ranges[going] < far)]
-        if not len(going):
-            break
-    return ranges.reshape(ways.shape[:-1])
 
 
 def hall(rng, count=5):
@@ -55,7 +42,7 @@ def hall(rng, count=5):
 
 def taken(rng, obstacles, noise=0.0, at=(0.0, 0.0, 0.0), **more):
     """An image of these, by a sensor that is not turned."""
-    ranges = cast(obstacles, np.array(at), GRID)
+    ranges = cast(obstacles, np.array(at), GRID, FAR)
     noisy = np.where(ranges < FAR, np.clip(ranges + rng.uniform(-noise, noise, ranges.shape), 1e-3, FAR), FAR)
     more = {"far": FAR, "range_error": noise, "least_width": WIDTH} | more
     return RangeImage(noisy, at, low=-EDGE, high=EDGE, **more)
@@ -156,14 +143,6 @@ def test_the_closer_beams_are_the_more_they_show():
     assert BeamGrid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal == pytest.approx(
         0.5 * math.hypot(math.radians(4.0), math.radians(4.0))
     )
-
-
-def test_no_direction_is_farther_from_a_beam_than_half_a_meshes_diagonal():
-    rng = np.random.default_rng(0)
-    ways = rng.normal(size=(3000, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    nearest = np.arccos(np.clip((ways @ GRID.reshape(-1, 3).T).max(axis=1), -1.0, 1.0))
-    assert nearest.max() <= BeamGrid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal + 1e-6
 
 
 def test_an_image_crosses_the_wire_and_its_ranges_never_grow():

@@ -20,6 +20,7 @@ from brakeline.safety.perception.occluded_regions import (
     half_spaces,
     occluded_regions,
 )
+from tests.messaging.test_obstacle import cast
 from tests.messaging.test_range_image import (
     COLUMNS,
     EDGE,
@@ -27,7 +28,6 @@ from tests.messaging.test_range_image import (
     GRID,
     RINGS,
     WIDTH,
-    cast,
     free_towards,
     hall,
     solid,
@@ -230,17 +230,17 @@ def test_space_that_memory_shows_to_be_free_is_free(seed):
     for _ in range(6):
         off = rng.normal(size=3)
         seen = tuple(at + 0.02 * off / np.linalg.norm(off))
-        ranges = np.where(behind(), 0.0, cast(obstacles, at, GRID))
+        ranges = np.where(behind(), 0.0, cast(obstacles, at, GRID, FAR))
         known = {"far": FAR, "range_error": 0.005, "position_error": 0.02, "angle_error": 0.01, "least_width": WIDTH}
         image = RangeImage(ranges, seen, low=-EDGE, high=EDGE, **known)
         filled = memory.fill(image, 0.2)
         new = ~image.valid_beams & filled.valid_beams
         remembered += int(new.sum())
         if new.any():
-            assert (filled.ranges[new] - image.range_error <= cast(obstacles, at, GRID[new]) + 1e-6).all()
+            assert (filled.ranges[new] - image.range_error <= cast(obstacles, at, GRID[new], FAR) + 1e-6).all()
         assert np.array_equal(filled.ranges[image.valid_beams], image.ranges[image.valid_beams])
         step = np.array([0.55, 0.0, 0.0])
-        at = at + step if cast(obstacles, at, np.array([1.0, 0.0, 0.0])) > 0.8 else at - 0.3 * step
+        at = at + step if cast(obstacles, at, np.array([1.0, 0.0, 0.0]), FAR) > 0.8 else at - 0.3 * step
     assert remembered > 0
 
 

@@ -11,6 +11,7 @@ from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
+from tests.messaging import test_obstacle
 from tests.messaging.test_obstacle import sample
 
 FAR, WIDTH = 3.5, 0.1
@@ -18,17 +19,8 @@ FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
 
 
 def cast(obstacles, at, angles, far=FAR):
-    """Return ranges by sphere tracing: each step is the distance to the nearest obstacle."""
-    shapes = Shapes.of(obstacles, 2)
-    ranges, going = np.zeros(len(angles)), np.arange(len(angles))
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    for _ in range(400):
-        steps = shapes.distance(at + ranges[going, None] * directions[going]).min(axis=0)
-        ranges[going] = np.minimum(ranges[going] + steps, far)
-        going = going[(steps > 1e-13) & (ranges[going] < far)]
-        if not len(going):
-            break
-    return ranges
+    """Return the ranges in the plane along angles [rad]."""
+    return test_obstacle.cast(obstacles, at, np.stack([np.cos(angles), np.sin(angles)], axis=1), far)
 
 
 def scene(rng, count=6):
