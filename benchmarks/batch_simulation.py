@@ -1,12 +1,14 @@
 """Time many simulated robots at once beside single environments and SyncVectorEnv, with the filter and without it.
 
 All ways drive the same arenas with the same policy. Each ratio is of two times of the same block, and the interval is
-of all blocks. The time of the processor counts, over all threads, so other processes disturb little.
+of all blocks. The time of the processor counts, over all threads, so other processes disturb little. The plot is
+`docs/figures/batch_simulation.svg`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from time import process_time
 from typing import Any
 
@@ -25,6 +27,7 @@ from brakeline.safety.gym_vector import VectorSafetyWrapper
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.navigation_env import NavigationEnv
 
+PLOT = Path(__file__).parents[1] / "docs" / "figures" / "batch_simulation.svg"
 SIZES = (1, 4, 16, 64, 256, 1024)
 STEPS, BLOCKS = 1024, 5  # robot steps of a block, at least two periods of a batch
 PLAIN_SIZES, PEERS = (64, 256), 16
@@ -35,17 +38,38 @@ Act = Callable[[], None]  # one period of all robots
 def run() -> Figures:
     """Return a row for each number of robots at once, with its peer in the same blocks."""
     figures: Figures = {}
+    filtered: dict[int, dict[str, float]] = {}
     robot = robot_with_task("ground")
     alone, single, vector = _single(robot, filtered=False), _single(robot, filtered=True), _vector(robot, PEERS)
     for size in SIZES:
         batch = _filtered(robot, size)
-        figures[f"ground, filtered, {size} robots: beside one"] = beside(size, batch, single)
+        figures[f"ground, filtered, {size} robots: beside one"] = filtered[size] = beside(size, batch, single)
         if size in PLAIN_SIZES:
             figures[f"ground, filtered, {size} robots: beside SyncVectorEnv of {PEERS}"] = beside(
                 size, batch, vector, PEERS
             )
             figures[f"ground, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
+    _draw(filtered)
     return figures
+
+
+def _draw(rows: dict[int, dict[str, float]]) -> None:
+    """Draw the filtered steps for each second of processor time against the number of robots, beside one robot."""
+    from matplotlib import pyplot
+
+    pyplot.rcParams["svg.hashsalt"] = PLOT.name  # the same figures give the same file
+    figure, axes = pyplot.subplots(figsize=(6.0, 3.2), layout="constrained")
+    for name, label, style in (
+        ("batch steps/s", "BatchSafetyWrapper(BatchNavigationEnv)", "o-"),
+        ("peer steps/s", "SafetyWrapper(NavigationEnv), one robot", "s--"),
+    ):
+        axes.plot(list(rows), [row[name] for row in rows.values()], style, label=label)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(list(rows), list(map(str, rows)))
+    axes.set(ylim=(0.0, None), xlabel="robots in the batch", ylabel="filtered steps for each\nsecond of processor time")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(PLOT, metadata={"Date": None})
 
 
 def beside(size: int, batch: Act, peer: Act, peer_size: int = 1) -> dict[str, float]:
