@@ -150,21 +150,6 @@ def test_stopped_and_resumed(bus, tmp_path, loops):
     assert actor.metrics[-1].missing == 0
 
 
-def test_lockstep_over_the_bus_is_the_same_bit_for_bit_resumed_or_not(bus, tmp_path, loops):
-    config = replace(CONFIG, lockstep=True, checkpoint_every=40, steps=200)
-    for name in ("one", "other"):
-        thread, actor = start(bus, tmp_path / name, config), Actor(bus)
-        actor.join()
-        actor.drive(10**6 if name == "one" else 130)  # the other is stopped within an episode
-        loops[-1]._process.stop.set()
-        thread.join(20.0)
-    thread, actor = start(bus, tmp_path / "other", config, resume=True), Actor(bus)
-    assert actor.join().episode == 6  # the checkpoint was that of step 120
-    actor.drive(10**6)
-    thread.join(20.0)
-    assert (tmp_path / "one" / POLICY).read_bytes() == (tmp_path / "other" / POLICY).read_bytes()
-
-
 def test_what_cannot_start_is_an_error(bus, tmp_path):
     """There is nothing to resume; there is no such robot; a fresh start would overwrite a checkpoint."""
     settings = LearnerSettings(BusSettings(connect=bus.settings.listen), out=tmp_path, learner=CONFIG)
