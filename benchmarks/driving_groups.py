@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from benchmarks.timing import Figures
 from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import Evaluation, in_process, prepare_evaluation
 from brakeline.deploy.progress import console, under_way
+from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -93,7 +93,8 @@ class Containment:
 
 def lower_bound(outside: int, count: int) -> float:
     """Return the lower Clopper-Pearson bound on the probability of being outside, at 99 % confidence."""
-    return float(betaincinv(outside, count - outside + 1, 1.0 - CONFIDENCE)) if outside else 0.0
+    low, _ = clopper_pearson(outside, count, 2.0 * CONFIDENCE - 1.0) or (0.0, 1.0)
+    return low
 
 
 def drive(driver: EpisodeRunner, policy: Policy, ask: Any, longest: int) -> Iterator[tuple[float | None, bool]]:

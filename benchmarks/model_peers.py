@@ -28,7 +28,6 @@ from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv
 
 from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, Models, ModelTubes, Noise
 from benchmarks.timing import Words
@@ -37,6 +36,7 @@ from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.importer import import_sources
 from brakeline.deploy.data.rival_pretraining import BarrierConfig
 from brakeline.deploy.data.simulated_recording import load_or_record
+from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import robot_with_task
@@ -146,14 +146,6 @@ def braking(robot: Robot, inputs: Array) -> Array:
     return np.concatenate([state, inputs, np.tile(inputs, robot.free_steps)])
 
 
-def interval(outside: int, count: int) -> tuple[float, float]:
-    """Return the exact (Clopper-Pearson) interval of a share, at 99 % confidence."""
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low = float(betaincinv(outside, count - outside + 1, tail)) if outside else 0.0
-    high = float(betaincinv(outside + 1, count - outside, 1.0 - tail)) if outside < count else 1.0
-    return low, high
-
-
 def processor_s(call: Callable[[], object]) -> float:
     """Return the mean processor time of a call; other processes on this machine do not count."""
     call()
@@ -170,7 +162,7 @@ def row(recording: Recording, tubes: Tubes, fitted_s: float, one: Callable[[], o
     chunks = np.array_split(np.arange(len(z)), len(z) // CHUNK + 1)
     center, half = (np.concatenate(part) for part in zip(*(tubes(z[chunk]) for chunk in chunks), strict=True))
     outside = int((~(np.abs(recording.after - center) <= half)).any((1, 2)).sum())
-    low, high = interval(outside, len(z))
+    low, high = clopper_pearson(outside, len(z), CONFIDENCE) or (0.0, 1.0)
     plans = np.stack([braking(robot, inputs) for inputs in (fastest(robot), 0.0 * robot.high())])
     widths = 1e3 * tubes(plans @ plan_regressor_map(robot).T)[1][:, -1].max(1)
     return {

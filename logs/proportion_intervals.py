@@ -1,4 +1,4 @@
-"""Compute confidence intervals of rates, at 95 %.
+"""Compute confidence intervals of rates, at 95 % unless another confidence is given.
 
 Why not `scipy.stats.binomtest(...).proportion_ci()`: it takes 5 ms for each interval and importing `scipy.stats` takes
 up to 3 s; the inverse beta function of `scipy.special`, which it uses too, takes 5 µs. The tests compare both.
@@ -16,16 +16,17 @@ CONFIDENCE = 0.95
 _Z = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 
 
-def clopper_pearson(count: int, of: int) -> Interval | None:
+def clopper_pearson(count: int, of: int, confidence: float = CONFIDENCE) -> Interval | None:
     """Return the exact interval of a probability, after `count` successes in `of` independent trials.
 
-    Its coverage is at least 95 %; with 0 of n, the upper end is 1 - 0.025^(1/n). None without a trial.
+    Its coverage is at least the confidence; with 0 of n, the upper end at 95 % is 1 - 0.025^(1/n). None without a
+    trial.
     """
     if of <= 0:
         return None
     from scipy.special import betaincinv  # imported late: a third of a second that a launcher needs only at its end
 
-    tail = (1.0 - CONFIDENCE) / 2.0
+    tail = (1.0 - confidence) / 2.0
     low = 0.0 if count == 0 else float(betaincinv(count, of - count + 1, tail))
     high = 1.0 if count == of else float(betaincinv(count + 1, of - count, 1.0 - tail))
     return low, high

@@ -79,11 +79,11 @@ def test_bars_hold_all_positive_values_where_they_are() -> None:
     assert merged([filled([0.0])]).bars() == []
 
 
-@given(st.integers(0, 400), st.integers(1, 400))
-def test_clopper_pearson_is_scipys_exact_interval(count: int, of: int) -> None:
+@given(st.integers(0, 400), st.integers(1, 400), st.sampled_from([0.95, 0.99]))
+def test_clopper_pearson_is_scipys_exact_interval(count: int, of: int, confidence: float) -> None:
     count = min(count, of)
-    exact = binomtest(count, of).proportion_ci(0.95, "exact")
-    assert clopper_pearson(count, of) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    exact = binomtest(count, of).proportion_ci(confidence, "exact")
+    assert clopper_pearson(count, of, confidence) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 @given(st.integers(0, 400), st.integers(1, 400))

@@ -1,4 +1,4 @@
-"""benchmarks/model_peers.py: its sets of consistent models contain what they must, and its barrier keeps its rows."""
+"""The sets of consistent models of benchmarks/consistent_models.py contain what they must."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import linprog
 
 from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, ModelTubes, Noise, feature_box
-from benchmarks.model_peers import interval
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.one_step import features_for
 
@@ -91,10 +90,3 @@ def test_tubes_hold_the_rollouts_of_every_consistent_model(fit):
             p = p + np.column_stack([cos * y[:, 0] - sin * y[:, 1], sin * y[:, 0] + cos * y[:, 1]])
             heading, s = heading + y[:, 2], y[:, 3:]
             assert (np.abs(p - center[:, k - 1]) <= half[:, k - 1] + 1e-12).all()
-
-
-def test_the_interval_of_a_share_is_exact():
-    low, high = interval(0, 100)
-    assert low == 0.0 and high == pytest.approx(1.0 - 0.005 ** (1.0 / 100))
-    low, high = interval(100, 100)
-    assert low == pytest.approx(0.005 ** (1.0 / 100)) and high == 1.0
