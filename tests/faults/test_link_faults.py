@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from benchmarks import flights
-from benchmarks.flights import Failed, Flights, flown
+from benchmarks.flights import Failed, flown
 from brakeline.messaging.byte_links import Tcp, Udp, open_link
 from brakeline.messaging.free_ports import free_udp_port
 from tests.faults.link_faults import Outcomes, Relay, Steps
@@ -69,52 +65,3 @@ def test_a_flight_that_did_not_take_off_is_a_row() -> None:
         raise Failed("fly: no figures, status 1")
 
     assert flown(fly) == {"failed": "fly: no figures, status 1"}
-
-
-@pytest.mark.parametrize(
-    ("setup", "certified"),
-    [(flights.OUTDOORS, [("second", True), ("third", False)]), (flights.LED, [("second", True)])],
-)
-def test_the_last_model_set_is_of_the_longest_flight(
-    setup: str, certified: list[tuple[str, bool]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Of minutes every envelope is half as wide again (`--few`); a setup that flies a third time does without."""
-    made: list[tuple[str, bool]] = []
-
-    def printed_figures(words: list[str], data: Path, seconds: float) -> str:
-        if words[0] == "certify":
-            made.append((Path(dict(itertools.pairwise(words))["--data"]).name, "--few" in words))
-            raise Failed("no windows")
-        if words[0] == "collect":
-            return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
-        raise Failed("no room to hover")
-
-    monkeypatch.setattr(flights, "printed_figures", printed_figures)
-    monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
-    rows = dict(flights._rows(Flights(setup, Path("sitl"), tmp_path), 1.0))
-    assert made == certified
-    assert rows["certified by it"] == {"failed": "no windows"} and ("third flight" in rows) == (len(certified) > 1)
-    assert rows["astar, dense"] == {"failed": "no room to hover"}
-
-
-def test_one_flight_gives_the_only_model_set_if_its_bound_is_small(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    said: list[list[str]] = []
-
-    def printed_figures(words: list[str], data: Path, seconds: float) -> str:
-        said.append(words)
-        if words[0] == "certify":
-            return json.dumps({"residual": {"one-step": {"bound_plan": 0.02}}})
-        if words[0] == "collect":
-            return json.dumps({"minutes": 15, "periods": 4500, "level": 1, "missing": [], "model": "made"})
-        raise Failed("no room to hover")
-
-    monkeypatch.setattr(flights, "printed_figures", printed_figures)
-    monkeypatch.setattr(Flights, "_switched_on", lambda *_: ("tcp:127.0.0.1:1", 1))
-    rows = dict(flights._rows(Flights(flights.OUTDOORS_ONCE, Path("sitl"), tmp_path), 1.0))
-    assert rows["certified by it"] == {"bound_plan": 0.02} and "second flight" not in rows
-    assert all(" ".join(words).count("--accept-bound 0.03") == 1 for words in said)
-    (certify,) = (words for words in said if words[0] == "certify")
-    value_of = dict(itertools.pairwise(certify))
-    assert value_of["--data"].endswith("flown.safetensors") and value_of["--outside"] == "0.015"
