@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,6 +26,12 @@ def finished(config=CONFIG) -> Learner:
     learner, actor = started(config)
     run(learner, actor)
     return learner
+
+
+@cache
+def last_weights(config=CONFIG) -> bytes:
+    """Return the weights of a run without interruption."""
+    return finished(config).weights().file
 
 
 def step(number: int, **fields) -> pb.Step:
@@ -64,7 +71,7 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path, episodes, n_step):
     newborn = ToyActor(resumed)
     assert newborn.join().episode == episodes
     run(resumed, newborn)
-    assert resumed.weights().file == finished(config).weights().file
+    assert resumed.weights().file == last_weights(config)
     assert (resumed.steps, resumed.metrics().missing) == (400, 0)
 
 
@@ -77,7 +84,7 @@ def test_a_shorter_run_resumed_to_full_length_is_the_full_run(tmp_path):
     actor = ToyActor(learner)
     actor.join()
     run(learner, actor)
-    assert learner.weights().file == finished().weights().file
+    assert learner.weights().file == last_weights()
 
 
 def test_it_learns():
