@@ -21,6 +21,7 @@ from google.protobuf.message import Message
 from brakeline.errors import Implausible, UnknownRobot
 from brakeline.logs import foxglove_scene
 from brakeline.logs.arena_view import half_width
+from brakeline.logs.episode_stats import INTERVENTIONS, kind_of
 from brakeline.logs.reader import Record
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.segment import Entry
@@ -34,7 +35,7 @@ from brakeline.safety.perception.displayed_map import reserved_boxes
 log = logging.getLogger("brakeline.foxglove")
 
 ROOT = "foxglove"
-RATE = 10.0  # Hz per actor, wall time; interventions are always drawn
+RATE = 10.0  # Hz per actor and kind of decision, wall time
 MOST_ACTORS = 500  # more are not drawn
 GAP = 1.2  # distance between the centers of neighbouring arenas, in edges of an arena
 
@@ -69,7 +70,7 @@ class _Actor:
     exchange: Decode | None = None  # the latest; decoded only when it is drawn
     waiting: tuple[pb.Step, int] | None = None  # a step to draw, and its time of receipt, ns
     last: pb.Exchange | None = None  # the latest decoded exchange
-    drawn: float = -math.inf  # s, receipt of the last drawn step
+    drawn: dict[int, float] = field(default_factory=dict)  # s, receipt of the last drawn step, by kind of decision
 
 
 class FoxgloveConverter:
@@ -79,7 +80,9 @@ class FoxgloveConverter:
         """Create a converter.
 
         Args:
-            rate: drawn steps per second and actor, by time of receipt; infinity draws every step.
+            rate: drawn steps per second and actor, and as many more with each kind of intervention, by time of receipt;
+                infinity draws every step. A robot in real time intervenes less often, so all its interventions are
+                drawn.
             robots: the robots that messages name. The rays of a robot without a task are not drawn.
         """
         self._robots = robots or RecordedRobots()
@@ -140,8 +143,9 @@ class FoxgloveConverter:
         if actor is None:  # its Episode message has not come yet
             return []
         step: pb.Step = decode()
-        calm = step.decision in (pb.UNKNOWN, pb.ALLOWED) and not step.fallback
-        if calm and time * 1e-9 - actor.drawn < self._spacing:
+        kind = _kind(step)
+        times = (actor.drawn.get(kind, -math.inf),) if kind else actor.drawn.values()
+        if time * 1e-9 - max(times, default=-math.inf) < self._spacing:
             return []
         actor.waiting = step, time
         return self._draw(actor)
@@ -160,7 +164,7 @@ class FoxgloveConverter:
                 return []
             if decided > (step.episode, step.step):
                 exchange = None
-        actor.waiting, actor.drawn = None, time * 1e-9
+        actor.waiting, actor.drawn[_kind(step)] = None, time * 1e-9
         robot, name = actor.robot, actor.name
         scenes: dict[str, Message] = {
             "frames": foxglove_scene.frames(robot, name, actor.site, step.state, time),
@@ -180,6 +184,12 @@ class FoxgloveConverter:
 
     def _log_line(self, key: str, decode: Decode, time: int) -> list[Entry]:
         return [_stored(f"{ROOT}/log", foxglove_scene.log_line(decode(), time), time)]
+
+
+def _kind(step: pb.Step) -> int:
+    """Return the kind of the intervention at a step; 0: there was none."""
+    kind = kind_of(step)
+    return kind if kind in INTERVENTIONS else 0
 
 
 def _source(key: str) -> str:

@@ -75,8 +75,8 @@ AcceptBound = Annotated[
 Pictures = Annotated[
     float,
     tyro.conf.arg(
-        help="Draw this many pictures a second of each robot into the log for Foxglove, besides one of each "
-        "intervention. 0 draws none at all."
+        help="Draw this many pictures a second of each robot into the log for Foxglove, and up to as many of each kind "
+        "of intervention. 0 draws none at all."
     ),
 ]
 Verbose = Annotated[

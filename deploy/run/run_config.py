@@ -83,8 +83,8 @@ class RunConfig:
     rotation: Rotation = field(default_factory=Rotation)
     """Begin the next file of the log at these sizes."""
     pictures: float = 10.0
-    """Draw this many pictures a second of each robot into the log for Foxglove, besides one of each intervention. 0
-    draws none at all."""
+    """Draw this many pictures a second of each robot into the log for Foxglove, and up to as many of each kind of
+    intervention. 0 draws none at all."""
     practice: float = 0.0
     """At this share of the steps, let a robot begin to follow its backup plan to the stop. The log then has the stops
     that `brakeline certify ROBOT --data LOG` needs."""

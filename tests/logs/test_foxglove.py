@@ -140,16 +140,28 @@ def test_without_a_filter_and_without_an_answer_there_is_a_picture_too(studio: S
     assert shown.entities[0].texts[0].text == "no answer in time: braked along the plan verified before"
 
 
-def test_calm_steps_are_thinned_out_and_interventions_are_not(say: Say) -> None:
+def test_calm_steps_are_thinned_out_and_each_kind_of_intervention_too(say: Say) -> None:
     studio = Studio(say, rate=0.1)  # of messages that come every second: a tenth
     studio("episode/ground/actor-0", episode())
     for number in range(100):
-        kind = pb.FAILSAFE if number in (50, 51, 52) else pb.ALLOWED
+        kind = {50: pb.FAILSAFE, 51: pb.ADJUSTED, 52: pb.ADJUSTED}.get(number, pb.ALLOWED)
         studio("exchange/ground/actor-0", exchange(number, kind))
         studio("step/ground/actor-0", step(number, kind))
     drawn = Counter(entry.key.split("/")[1] for entry in studio.entries)
     assert drawn["decision"] == drawn["lidar"]
-    assert 3 + 18 <= drawn["decision"] <= 3 + 20  # a step comes every 2 s
+    assert 2 + 18 <= drawn["decision"] <= 2 + 20  # a step comes every 2 s
+    scenes = [SceneUpdate.FromString(one.payload) for one in studio.entries if "/decision/" in one.key]
+    words = [text.text for scene in scenes for text in scene.entities[0].texts]
+    assert words == ["failsafe", "adjusted"], "the first of each kind is drawn at once"
+
+
+def test_interventions_that_come_as_slowly_as_those_of_a_real_robot_are_all_drawn(say: Say) -> None:
+    studio = Studio(say, rate=1.0)  # of messages that come every second
+    studio("episode/ground/actor-0", episode())
+    for number in range(10):
+        studio("exchange/ground/actor-0", exchange(number, pb.ADJUSTED))
+        studio("step/ground/actor-0", step(number, pb.ADJUSTED))
+    assert sum(entry.key.split("/")[1] == "decision" for entry in studio.entries) == 10
 
 
 def test_a_scene_has_the_time_of_receipt_and_no_sequence_number(studio: Studio, say: Say) -> None:
