@@ -60,7 +60,7 @@ class ReplayBuffer:
     def insert(self, transition: Transition) -> None:
         """Add a transition; a full buffer overwrites its oldest one."""
         for array, value in zip(self._arrays, transition, strict=True):
-            array[self._next] = np.asarray(value)
+            array[self._next] = value
         self._next = (self._next + 1) % self.capacity
         self.size = min(self.size + 1, self.capacity)
 

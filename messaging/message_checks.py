@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 from google.protobuf.descriptor import Descriptor
@@ -22,7 +22,7 @@ STEP_NUMBERS = ("reward", "penalty", "speed")  # the numbers of a step that stat
 class _CheckedFields(NamedTuple):
     header: bool
     names: tuple[str, ...]
-    sizes: tuple[tuple[str, int], ...]  # repeated field, largest size
+    sizes: tuple[tuple[str, int], ...]  # repeated field, largest size; the smallest ones first
     numbers: tuple[str, ...]
     request: bool
 
@@ -33,7 +33,7 @@ def _checked_fields(kind: Descriptor) -> _CheckedFields:
     names = tuple(name for name in NAME_FIELDS if name in fields and fields[name].type == fields[name].TYPE_STRING)
     sizes = [(name, MAX_NUMBERS) for name, field in fields.items() if field.is_repeated and field.message_type is None]
     if "obstacles" in fields:
-        sizes.append(("obstacles", MAX_OBSTACLES))
+        sizes.insert(0, ("obstacles", MAX_OBSTACLES))
     numbers = STEP_NUMBERS if "reward" in fields else ()
     return _CheckedFields("header" in fields, names, tuple(sizes), numbers, "request" in fields)
 
@@ -57,7 +57,9 @@ def check(message: Any, size: int) -> None:
         _check_name(header, "source")
     for name in fields.names:
         _check_name(message, name)
-    for name, most in fields.sizes if size > MAX_OBSTACLES else ():
+    for name, most in fields.sizes:
+        if size <= most:  # too small for this field, and for the following ones, to be too large
+            break
         if (count := len(getattr(message, name))) > most:
             raise Implausible(f"{count} {name}")
     for name in fields.numbers:
@@ -68,5 +70,10 @@ def check(message: Any, size: int) -> None:
 
 
 def _check_name(message: Any, field: str) -> None:
-    if (value := getattr(message, field)) and not NAME.fullmatch(value):
+    if (value := getattr(message, field)) and not _is_name(value):
         raise Implausible(f"{field} {value[:100]!r}")
+
+
+@lru_cache(4096)
+def _is_name(value: str) -> bool:
+    return NAME.fullmatch(value) is not None

@@ -37,11 +37,11 @@ class Inbox:
         self.dropped: Counter[str] = Counter()
         self.bytes = 0
         self._bytes_of: Counter[str] = Counter()  # by identity
-        self._samples: deque[Sample] = deque()
+        self._waiting: deque[tuple[Sample, int, str]] = deque()  # with the size and the identity of each
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return len(self._waiting)
 
     def put(self, sample: Sample) -> None:
         """Add the sample, or count it as dropped."""
@@ -51,33 +51,38 @@ class Inbox:
                 self.dropped[sample.key] += 1
             else:
                 self._count(identity, size)
-                self._samples.append(sample)
+                self._waiting.append((sample, size, identity))
 
     def oldest(self, size: int = BATCH) -> list[Sample]:
         """Return the oldest samples, about `size` bytes; they stay in the inbox until `remove`."""
         batch: list[Sample] = []
         total = 0
         with self._lock:
-            for sample in self._samples:
-                if batch and total + size_in_memory(sample) > size:
+            for sample, one, _ in self._waiting:
+                if batch and total + one > size:
                     break
                 batch.append(sample)
-                total += size_in_memory(sample)
+                total += one
         return batch
 
     def remove(self, samples: list[Sample]) -> None:
         """Remove the samples that `oldest` returned."""
         with self._lock:
-            for sample in samples:
-                self._samples.popleft()
-                self._count(sender_of(sample.topic, sample.key), -size_in_memory(sample))
+            for _ in samples:
+                self._pop()
 
     def drain(self, seconds: float) -> Iterator[Sample]:
         """Remove and yield samples, oldest first, until the inbox is empty or the time has passed."""
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline and (batch := self.oldest(1)):
-            self.remove(batch)
-            yield from batch
+        while self._waiting and time.monotonic() < deadline:
+            with self._lock:
+                sample = self._pop()
+            yield sample
+
+    def _pop(self) -> Sample:
+        sample, size, identity = self._waiting.popleft()
+        self._count(identity, -size)
+        return sample
 
     def _count(self, identity: str, size: int) -> None:
         self.bytes += size

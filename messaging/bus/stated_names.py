@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -13,6 +13,7 @@ from brakeline.messaging.bus.identity import role_of, speaks_for
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.topics import TOPICS
 
+SOURCES = ("actor", "process")  # fields with the name of a process, or of a robot that it drives
 _ROOTS = {topic.key.split("/", 1)[0]: topic for topic in TOPICS}
 
 
@@ -61,24 +62,17 @@ class _NameFields:
 
     def __init__(self, kind: Descriptor) -> None:
         request = kind.fields_by_name["request"].message_type if "request" in kind.fields_by_name else None
-        self._own, self._within = _names_in(kind), _names_in(request)
+        self._robots, self._robots_within = _names_in(kind, "robot"), _names_in(request, "robot")
+        self._sources, self._sources_within = _names_in(kind, *SOURCES), _names_in(request, *SOURCES)
         self._header = "header" in kind.fields_by_name
         self.counts = "published" in kind.fields_by_name
 
-    def robots(self, message: Any) -> Iterator[str]:
-        return self._stated(message, ("robot",))
+    def robots(self, message: Any) -> list[str]:
+        return _stated(message, self._robots, self._robots_within)
 
-    def sources(self, message: Any) -> Iterator[str]:
-        if self._header:
-            yield message.header.source
-        yield from self._stated(message, ("actor", "process"))
-
-    def _stated(self, message: Any, wanted: tuple[str, ...]) -> Iterator[str]:
-        for name in wanted:
-            if name in self._own:
-                yield getattr(message, name)
-            if name in self._within:
-                yield getattr(message.request, name)
+    def sources(self, message: Any) -> list[str]:
+        stated = _stated(message, self._sources, self._sources_within)
+        return [message.header.source, *stated] if self._header else stated
 
 
 @cache
@@ -86,7 +80,14 @@ def _name_fields(kind: Descriptor) -> _NameFields:
     return _NameFields(kind)
 
 
-def _names_in(kind: Descriptor | None) -> tuple[str, ...]:
-    if kind is None:
-        return ()
-    return tuple(name for name in ("robot", "actor", "process") if name in kind.fields_by_name)
+def _names_in(kind: Descriptor | None, *names: str) -> tuple[str, ...]:
+    return () if kind is None else tuple(name for name in names if name in kind.fields_by_name)
+
+
+def _stated(message: Any, names: tuple[str, ...], within: tuple[str, ...]) -> list[str]:
+    """Return the values of fields of a message, and of fields of the request in it."""
+    values = [getattr(message, name) for name in names]
+    if within:
+        request = message.request
+        values += [getattr(request, name) for name in within]
+    return values

@@ -38,13 +38,18 @@ def own_key(key: str, session_id: object) -> str:
 
 def sender_of(topic: Topic, key: str) -> str:
     """Return the identity that answers for the samples at a key; the topic's name if its keys name no source."""
-    source = names_of(topic, key).get("source")
-    return topic.name if source is None else identity_of(source)
+    return _sender_of(topic.name, topic.key, key)
 
 
 def names_of(topic: Topic, key: str) -> dict[str, str]:
     """Return the names in a key of the topic, by field."""
     return dict(_names_of(topic.key, key))
+
+
+@lru_cache(4096)
+def _sender_of(topic: str, form: str, key: str) -> str:
+    source = dict(_names_of(form, key)).get("source")
+    return topic if source is None else identity_of(source)
 
 
 @lru_cache(4096)
