@@ -55,9 +55,9 @@ class DrivingDisturbances:
             Factors (rows, S, 2) of the speeds of the left and the right wheel, and tilts (rows, S, 2) of the floor
             along x and y [rad].
         """
-        values, samples = self._values[rows], np.empty_like(draws)
+        values, samples = self._values[rows], self._innovation * draws
         for i in range(draws.shape[1]):
-            values = self._decay * values + self._innovation * draws[:, i]
+            values = self._decay * values + samples[:, i]
             samples[:, i] = values
         self._values[rows] = values
         samples = self._sigma * np.clip(samples, -LIMIT, LIMIT)

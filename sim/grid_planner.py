@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -20,14 +21,15 @@ if TYPE_CHECKING:
 
 CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
 MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms have larger cells
+LATTICE = 5  # waypoints along x and along y of a room, for paths of two straight lines
+MOST_WAYPOINTS = 10  # tried before the search for a path
+ROUNDING = 1e-6  # m, more than the rounding errors of a distance
 
 
 class ClearanceMap:
     """The distance from the centre of every cell to the nearest obstacle.
 
     Attributes:
-        clearance: m, one index per axis, x first.
-        centres: (cells, d) m.
         cell: m, edge of a cell.
     """
 
@@ -42,10 +44,18 @@ class ClearanceMap:
         cell: float = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
         self.cell: float = widths[0] / round(widths[0] / cell)
         self.shape = tuple(round(width / self.cell) for width in widths)
-        axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
-        self.centres: Array = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
-        shapes = Shapes.of(obstacles, dim=self.dim)
-        self.clearance: Array = nearest_distances(shapes, *axes).reshape(self.shape)
+        self._axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        self._shapes = Shapes.of(obstacles, dim=self.dim)
+
+    @cached_property
+    def clearance(self) -> Array:
+        """The distances [m], one index per axis, x first."""
+        return nearest_distances(self._shapes, *self._axes).reshape(self.shape)
+
+    @cached_property
+    def centres(self) -> Array:
+        """The centres (cells, d) [m]."""
+        return np.stack(np.meshgrid(*self._axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
 
     def index(self, points: Array) -> NDArray[np.intp]:
         """Return the cells (..., d) of points (..., d); points beyond the walls belong to the outermost cells."""
@@ -74,6 +84,8 @@ class ClearanceMap:
         √(c² − h²/4) from it.
         """
         least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
+        if self._connected_by_lines(start, goal, least):
+            return True
         free = np.pad(self.clearance >= least, 1)  # outside is solid
         first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
         neighbours = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
@@ -89,6 +101,29 @@ class ClearanceMap:
             number[front] = numbers
             front = front[number[front] == numbers]  # without duplicates
         return bool(not to_reach[last])
+
+    def _connected_by_lines(self, start: Sequence[float], goal: Sequence[float], least: float) -> bool:
+        """Return whether the cells along a line, or along two lines that meet at a waypoint, keep a clearance [m].
+
+        The breadth-first search finds such a path too, but it needs the clearance of all cells of the room.
+        """
+        ends = self.index(np.array([start, goal]))
+        if self._line_is_free(ends[0], ends[1], least):
+            return True
+        plan = [np.linspace(0.0, n - 1.0, LATTICE + 2)[1:-1].astype(np.intp) for n in self.shape[:2]]
+        waypoints = np.array([(x, y, *ends[0, 2:]) for x, y in product(*plan)])
+        detour = sum(np.linalg.norm(waypoints - end, axis=1) for end in ends)
+        for waypoint in waypoints[np.argsort(detour, kind="stable")[:MOST_WAYPOINTS]]:
+            if self._line_is_free(ends[0], waypoint, least) and self._line_is_free(waypoint, ends[1], least):
+                return True
+        return False
+
+    def _line_is_free(self, first: NDArray[np.intp], last: NDArray[np.intp], least: float) -> bool:
+        """Return whether the cells of a line keep a clearance [m]; each (d,) is a neighbour of the one before."""
+        steps = max(int(np.abs(last - first).max()), 1)
+        cells = np.floor(first + np.arange(steps + 1)[:, None] * ((last - first) / steps) + 0.5).astype(np.intp)
+        points = np.column_stack([axis[cells[:, i]] for i, axis in enumerate(self._axes)])
+        return bool((_distances(self._shapes, points) >= least + ROUNDING).all())
 
 
 def nearest_distances(shapes: Shapes, x: Array, y: Array, heights: Array | None = None) -> Array:
@@ -120,6 +155,22 @@ def nearest_distances(shapes: Shapes, x: Array, y: Array, heights: Array | None 
     if heights is not None:
         np.minimum(least, np.sqrt(square), out=least)
     return np.asarray(np.maximum(least, 0.0))
+
+
+def _distances(shapes: Shapes, points: Array) -> Array:
+    """Return the distances (k,) [m] from points (k, d) to the nearest shape, like `nearest_distances`."""
+    away = points[:, None] - shapes.center
+    x, y = away[..., 0], away[..., 1]
+    beyond = [
+        np.maximum(np.abs(x * shapes.axes[:, 0, i] + y * shapes.axes[:, 1, i]) - shapes.half[:, i], 0.0) for i in (0, 1)
+    ]
+    beside = np.hypot(*beyond)
+    if points.shape[1] == 2:
+        return np.asarray((beside - shapes.rho).min(axis=1))
+    above = np.maximum(np.abs(away[..., 2]) - shapes.half[:, 2], 0.0)
+    ball = (shapes.rho > 0.0) & (shapes.round[:, 2] > 0.0)
+    grown = np.where(ball, 0.0, shapes.rho)
+    return np.asarray((np.hypot(np.maximum(beside - grown, 0.0), above) - (shapes.rho - grown)).min(axis=1))
 
 
 def _beyond(x: Array, y: Array, axis: Array, half: float) -> Array:

@@ -29,6 +29,7 @@ WHEELS = slice(7, 9)  # the wheels' angles among the coordinates
 YAW_RATE = 5  # its index among the speeds
 SAMPLES = 10  # of encoders and gyro in a period
 SAMPLE_TIME = GROUND.period / SAMPLES  # s
+MOST_IN_SAMPLE = 0.03  # m, more than a robot moves in a sample: the fastest one drives 5 mm
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of the payload
 ONLY = np.zeros(1, dtype=np.intp)  # the rows of disturbances of a single robot
 
@@ -148,7 +149,10 @@ class TurtleBot(SimulatedVehicle):
 
     def end_period(self, collision: bool, *contacts: bool) -> Period:
         """Return the report of the period. contacts: moving, standing and with another robot, as in `Period`."""
-        rates = np.diff(np.unwrap(self._headings)) * (SAMPLES / GROUND.period)
+        turns = np.diff(self._headings)
+        if (np.abs(turns) >= math.pi).any():  # across the direction west
+            turns = np.diff(np.unwrap(self._headings))
+        rates = turns * (SAMPLES / GROUND.period)
         reading = self.estimator.update(self._angles, rates, self._true_pose())
         self.true, self.measured = self._true_state(), reading.measured
         return self._report(collision, self._positions, reading.path, reading.turned, *contacts)
@@ -163,7 +167,7 @@ class TurtleBot(SimulatedVehicle):
         return np.asarray(self._qpos[WHEELS])
 
     def _true_heading(self) -> float:
-        return heading_of(self._qpos[3:7])
+        return heading_of(self._qpos[3:7].tolist())
 
     def _true_pose(self) -> Array:
         return np.array([*self._qpos[:2], self._true_heading()])
@@ -193,21 +197,25 @@ class GroundRobot(TurtleBot):
         self.alter(payload_kg=payload_kg, floor_friction=floor_friction)
         self.start_disturbances(process_noise, rng)
         mujoco.mj_forward(self._model, self._physics.data)
+        self._room = 0.0  # m, free space around the footprint at the end of the last period; 0: not known
         self._run(np.zeros(GROUND.action_dim))
         self.start_estimation(noise, rng)
 
     def step(self, input: Array) -> Period:
         self.set_input(input)
-        return self.end_period(self._run(self.input), *self._physics.movers.contacts)
+        period = self.end_period(self._run(self.input), *self._physics.movers.contacts)
+        self._room = 0.0 if self._physics.movers else period.clearance
+        return period
 
     def _run(self, input: Array) -> bool:
         """Run the physics of one period; return whether the robot collided."""
         self.begin_period(input)
         self._physics.movers.begin_period()
-        collision = False
+        collision, at_rest, start = False, not input.any(), self._qpos[:2].tolist()
         for i in range(SAMPLES):
             self.begin_sample(i)
-            collision |= self._physics.advance(at_rest=not input.any())
+            apart = math.dist(start, self._qpos[:2].tolist()) + MOST_IN_SAMPLE < self._room
+            collision |= self._physics.advance(at_rest, apart=apart)
             self.record_sample(i)
         return collision
 

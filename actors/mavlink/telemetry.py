@@ -76,7 +76,8 @@ def read_source(source: TelemetrySource, message: Message) -> Any:
     except (ValueError, OverflowError):  # an infinite angle has no sine
         return None
     if isinstance(value, MotionSample):
-        finite = math.isfinite(value.time) and bool(np.isfinite([value.position, value.velocity]).all())
+        numbers = (value.time, *value.position.tolist(), *value.velocity.tolist())
+        finite = all(map(math.isfinite, numbers))
     else:
         finite = not isinstance(value, tuple) or all(map(math.isfinite, value))
     return value if finite else None

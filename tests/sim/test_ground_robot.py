@@ -2,6 +2,7 @@
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -9,8 +10,9 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.sim.arena import Arena
+from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import NoiseLevels
-from brakeline.sim.ground_robot import GroundRobot
+from brakeline.sim.ground_robot import MODEL, SAMPLE_TIME, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.sim_conditions import ProcessNoise
 from brakeline.sim.vehicle import Period
@@ -198,3 +200,16 @@ def test_every_geom_lies_within_the_footprint() -> None:
     assert math.hypot(0.08, 0.0) + 0.009 <= GROUND.footprint
     assert model.geom("plates").size[0] == 0.069
     assert model.body_mass.sum() == pytest.approx(1.0)
+
+
+def test_samples_without_a_look_at_contacts_have_the_same_motion_to_the_bit() -> None:
+    motions = []
+    for apart in (False, True):
+        arena = room(Obstacle(CYLINDER, (1.0, 0.5), (0.2,)), start=(0.0, 0.0, 0.3), goal=(2.0, 0.0))
+        physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
+        mujoco.mj_forward(physics.model, physics.data)
+        for sample in range(60):
+            physics.data.ctrl[:] = (3.0, 3.0 - 0.1 * sample)
+            assert not physics.advance(at_rest=False, apart=apart)
+        motions.append(np.concatenate((physics.data.qpos, physics.data.qvel, physics.data.qacc_warmstart)))
+    assert np.array_equal(*motions)
