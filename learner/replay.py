@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -59,7 +59,8 @@ class ReplayBuffer:
 
     def insert(self, transition: Transition) -> None:
         """Add a transition; a full buffer overwrites its oldest one."""
-        for array, value in zip(self._arrays, transition, strict=True):
+        values: tuple[Any, ...] = transition
+        for array, value in zip(self._arrays, values, strict=True):
             array[self._next] = value
         self._next = (self._next + 1) % self.capacity
         self.size = min(self.size + 1, self.capacity)
