@@ -45,7 +45,7 @@ class PlanAuthenticator:
     def __init__(self, key: bytes) -> None:
         if len(key) < KEY_SIZE:
             raise BadKeys(f"the key of the plan tokens has {len(key)} bytes; it needs {KEY_SIZE}")
-        self._key = key
+        self._mac_of_nothing = hmac.new(key, digestmod="sha256")  # a copy of it takes half of the time of a new one
 
     @classmethod
     def of(cls, folder: Path | None) -> PlanAuthenticator:
@@ -66,13 +66,14 @@ class PlanAuthenticator:
         The last token stays valid, since from there on the plan's tail no longer changes.
         """
         m, n = robot.action_dim, robot.horizon
-        plan = list(decision.plan)
+        plan = decision.plan[:]
         stop = [0.0 if robot.stop[j] != HOLD else plan[j - m] for j in range(m)]
         moving = n  # periods until the plan stops
         while moving > 0 and plan[(moving - 1) * m : moving * m] == stop:
             moving -= 1
         inputs = plan + stop * (n + 1)
-        tails, in_force, row = _bytes(inputs), _bytes(_without_feedback(inputs, robot)), 8 * m
+        tails, row = _bytes(inputs), 8 * m
+        in_force = tails if FEEDBACK not in robot.stop else _bytes(_without_feedback(inputs, robot))
         names, predicted = _names(robot.name, asker, request.actor, decision.model), _prediction(decision)
         tokens = []
         for k in range(1, max(2, 1 + moving) + 1):
@@ -97,7 +98,9 @@ class PlanAuthenticator:
         return self._mac(message)
 
     def _mac(self, message: bytes) -> bytes:
-        return hmac.digest(self._key, message, "sha256")[:SIZE]
+        mac = self._mac_of_nothing.copy()
+        mac.update(message)
+        return mac.digest()[:SIZE]
 
 
 def _names(robot: str, asker: str, actor: str, model: str) -> bytes:

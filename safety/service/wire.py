@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest, BadScan, BadShape
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.moving_obstacles import split_moving
-from brakeline.messaging.obstacle import FARTHEST, Obstacle
+from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
+from brakeline.messaging.obstacle import FARTHEST, Obstacle, Shapes
 from brakeline.messaging.obstacle_messages import obstacle_of
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement, measurement_in
@@ -118,7 +119,7 @@ def request_of(
     if plan.size != robot.horizon * robot.action_dim:
         size = f"{robot.horizon} x {robot.action_dim}"
         raise BadRequest("plan", f"plan has {plan.size} numbers; a plan of {robot.name} has {size}")
-    obstacles, movers = split_moving(obstacles_of(message.obstacles, robot.position_dim), robot.position_dim)
+    obstacles, movers = surroundings_of(message.obstacles, robot.position_dim)
     return Request(
         state=array_of(message.state),
         action=array_of(message.action),
@@ -151,6 +152,21 @@ def _past_of(message: pb.Request, robot: Robot) -> PastWindow | None:
 def array_of(field: Collection[float]) -> NDArray[np.float64]:
     """Return a repeated field as an array. `np.array` would take five times as long."""
     return np.fromiter(field, np.float64, len(field))
+
+
+def surroundings_of(messages: Sequence[pb.Obstacle], dim: int) -> tuple[Shapes, MovingObstacles | None]:
+    """Return the standing and the moving obstacles in messages, as `split_moving`. Raises BadRequest.
+
+    A robot names the same standing obstacles in many requests, one after the other.
+    """
+    if any(message.HasField("motion") for message in messages):
+        return split_moving(obstacles_of(messages, dim), dim)
+    return _standing(dim, *[message.SerializeToString() for message in messages]), None
+
+
+@lru_cache(256)
+def _standing(dim: int, *payloads: bytes) -> Shapes:
+    return Shapes.of(obstacles_of([pb.Obstacle.FromString(payload) for payload in payloads], dim), dim)
 
 
 def obstacles_of(messages: Sequence[pb.Obstacle], dim: int) -> list[Obstacle]:
