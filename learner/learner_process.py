@@ -34,6 +34,7 @@ log = logging.getLogger("brakeline.learner")
 UPDATES_A_TURN = 4  # take about 20 ms, the longest that a joining actor or a step in lockstep waits
 FLOW_SPACING = 0.02  # least time between two flows [s]; in lockstep every change is published
 FLOW_PERIOD = 0.5  # longest time between two flows [s]
+IDLE = 0.1  # longest wait for steps and joins, if no flow is due before [s]
 JOIN_PATIENCE = 10.0  # longest time to answer a join, with the time of a checkpoint [s]
 LINGER = 1.0  # time for which the process announces the end of the run [s]
 
@@ -92,6 +93,7 @@ class LearnerLoop:
         self._wake = Event()
         self._last_flow = pb.Flow()  # without the header, which `put` fills in
         self._flow_at = -1e9
+        self._flow_waits = False  # a flow that actors need waits for its time
         self.output = LearnerOutput(process, learner, settings.out, clock)
         bus, robot = process.bus, learner.robot.name
         self._weights, self._flow = bus.publisher(WEIGHTS, robot=robot), bus.publisher(FLOW, robot=robot)
@@ -119,7 +121,7 @@ class LearnerLoop:
         end: float | None = None
         while not self._process.stop.is_set():
             if not self.turn():
-                self._wake.wait(FLOW_SPACING)
+                self._wake.wait(FLOW_SPACING if self._flow_waits else IDLE)
             self._wake.clear()
             if self._learner.done and not self._learner.weights_due():
                 end = end or self._clock() + LINGER
@@ -171,7 +173,7 @@ class LearnerLoop:
             due = flow != last
         else:
             changed = (flow.warmup, flow.done) != (last.warmup, last.done) or self._learner.needed(last.limit)
-            due = changed and age >= FLOW_SPACING
+            due, self._flow_waits = changed and age >= FLOW_SPACING, changed and age < FLOW_SPACING
         if due or age > FLOW_PERIOD:
             self._last_flow.CopyFrom(flow)
             self._flow_at = self._clock()

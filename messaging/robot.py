@@ -246,7 +246,8 @@ class Robot:
         wanted = np.asarray(wanted, dtype=np.float64)
         if wanted.shape != (self.action_dim,) or not np.isfinite(wanted).all():
             raise BadInput(f"the input of {self.name} must be {self.action_dim} finite numbers, not {wanted!r}")
-        return np.clip(np.clip(wanted, before - self.slew, before + self.slew), self.low(), self.high())
+        near = np.minimum(np.maximum(wanted, before - self.slew), before + self.slew)  # `np.clip` takes longer
+        return np.asarray(np.minimum(np.maximum(near, self.low()), self.high()))
 
     def is_stop_input(self, inputs: Array) -> NDArray[np.bool_]:
         """Return whether inputs (..., m) are zero where a standing robot has zero: (...,)."""

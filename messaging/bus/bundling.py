@@ -23,6 +23,7 @@ from brakeline.messaging.topics import BUNDLE, BUNDLED, Topic
 HOLD = 0.2  # longest time for which a message waits [s]
 MOST_BUNDLED = 16  # messages of a bundle: half of what a learner permits an actor in advance, with the decisions
 LARGE = 2**18  # bytes from which a bundle leaves at once
+MOST_ROUTES = 4096  # that a receiver remembers
 
 Deliver = Callable[[str, bytes, int], None]  # takes a key, a payload and the time of receipt [ns]
 
@@ -78,22 +79,34 @@ class Unbundler:
     def __init__(self, rejected: RejectedMessages) -> None:
         self._rejected = rejected
         self._listeners: dict[str, list[tuple[Mapping[str, str], Deliver]]] = {}
+        self._routes: dict[tuple[str, str], list[Deliver]] = {}  # by the key of a bundle and of a message in it
 
     def add(self, topic: Topic, names: Mapping[str, str], deliver: Deliver) -> None:
         """Call `deliver` with the messages of a topic, too. names: those that it wants, of the key."""
         self._listeners.setdefault(topic.name, []).append((names, deliver))
+        self._routes = {}
 
     def take(self, sample: Sample) -> None:
         """Take a bundle apart. A message that its sender may not publish is rejected, the others are not."""
-        sender = names_of(BUNDLE, sample.key)
         for number, one in enumerate(sample.message().messages):
             with self._rejected.skip_on_error(sample.key):
-                topic = _ROOTS.get(one.key.split("/", 1)[0])
-                names = {} if topic is None else names_of(topic, one.key)
-                if topic is None or one.key != topic.at(**names) or names["robot"] != sender["robot"]:
-                    raise Malformed(f"a bundle holds a message at {one.key[:200]!r}")
-                if not speaks_for(sender["source"], names["source"]):
-                    raise Malformed(f"a bundle holds a message of {names['source'][:100]!r}")
-                for wanted, deliver in self._listeners.get(topic.name, ()):
-                    if wanted.items() <= names.items():
-                        deliver(one.key, one.payload, sample.received + number)
+                key = one.key
+                routes = self._routes.get((sample.key, key))
+                if routes is None:
+                    routes = self._route(sample.key, key)
+                for deliver in routes:
+                    deliver(key, one.payload, sample.received + number)
+
+    def _route(self, bundle: str, key: str) -> list[Deliver]:
+        """Return who wants the messages at a key in the bundles at another. Raises Malformed."""
+        sender, topic = names_of(BUNDLE, bundle), _ROOTS.get(key.split("/", 1)[0])
+        names = {} if topic is None else names_of(topic, key)
+        if topic is None or key != topic.at(**names) or names["robot"] != sender["robot"]:
+            raise Malformed(f"a bundle holds a message at {key[:200]!r}")
+        if not speaks_for(sender["source"], names["source"]):
+            raise Malformed(f"a bundle holds a message of {names['source'][:100]!r}")
+        listeners = self._listeners.get(topic.name, ())
+        routes = [deliver for wanted, deliver in listeners if wanted.items() <= names.items()]
+        if len(self._routes) < MOST_ROUTES:
+            self._routes[bundle, key] = routes
+        return routes

@@ -196,6 +196,7 @@ def correction_penalty(
     """
     low, high, slew = robot.low(), robot.high(), robot.slew
     before = np.asarray(before, float)
-    wanted = np.nan_to_num(np.asarray(proposed, float), posinf=0.0, neginf=0.0)
-    clipped = np.clip(wanted, np.maximum(low, before - slew), np.minimum(high, before + slew))
+    wanted = np.asarray(proposed, float)
+    wanted = np.where(np.isfinite(wanted), wanted, 0.0)
+    clipped = np.minimum(np.maximum(wanted, np.maximum(low, before - slew)), np.minimum(high, before + slew))
     return weight * float(np.linalg.norm((np.asarray(executed, float) - clipped) / (high - low)))
