@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from brakeline.compilation import compiled
 from brakeline.messaging.robot import Robot
-from brakeline.safety.compilation import compiled
 from brakeline.safety.model.error_bounds import envelope, least_squares, whitening
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features

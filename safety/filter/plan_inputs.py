@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.compilation import compiled
 from brakeline.messaging.robot import Robot
-from brakeline.safety.compilation import compiled
 
 Array = NDArray[np.float64]
 

@@ -27,10 +27,11 @@ PARTS: dict[str, tuple[str, ...]] = {
     "learner": ("messaging", "errors"),
     # The viewers draw the map that the filter was shown.
     "logs": ("messaging", "errors", "safety.perception.displayed_map"),
-    "safety": ("messaging", "errors"),
-    "sim": ("messaging", "errors"),
+    "safety": ("messaging", "errors", "compilation"),
+    "sim": ("messaging", "errors", "compilation"),
     "messaging": ("errors",),
     "errors": ("messaging.brakeline_pb2",),  # for its types alone
+    "compilation": (),
     "envs": ("sim.registration",),
     "extras": ("errors",),
     "robots": (),
@@ -66,7 +67,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "cma": ("deploy.experiments.worst_case_search",),
     "pyulog": ("deploy.data.sources.px4_log",),
     "pyarrow": ("deploy.data.sources.parquet_files", "deploy.data.sources.csv_file"),
-    "numba": ("safety.compilation",),
+    "numba": ("compilation",),
     "proxsuite": ("safety.filter.qp_solver",),
     "array_api_compat": ("safety.filter.batch",),
     "mujoco": ("sim",),

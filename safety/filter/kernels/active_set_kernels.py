@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

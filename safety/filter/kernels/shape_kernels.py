@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 from brakeline.safety.filter.kernels.rollout_kernels import SHARED, Array, Index, rollouts, stretches
 
 

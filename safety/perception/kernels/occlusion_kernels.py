@@ -13,8 +13,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.compilation import compiled
 from brakeline.messaging.obstacle import FARTHEST
-from brakeline.safety.compilation import compiled
 from brakeline.safety.filter.halfspaces import TOUCHING
 from brakeline.safety.perception.kernels.shadow_kernels import (
     AXIS_X,

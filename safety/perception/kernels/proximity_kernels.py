@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 from brakeline.safety.perception.image_coverage import SINGLE
 
 Array = NDArray[np.float64]

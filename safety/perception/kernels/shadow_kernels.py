@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.compilation import compiled
+from brakeline.compilation import compiled
 from brakeline.safety.filter.halfspaces import TOUCHING
 from brakeline.safety.perception.kernels.proximity_kernels import minimum_ahead
 
