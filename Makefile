@@ -6,7 +6,8 @@ STAMP := .venv/.installed
 # Compiles all loops (Numba), if their code has changed. Otherwise the first command or each test would wait for it.
 define COMPILE
 $(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels' & \
-	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare()' && wait $$!
+	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare(); \
+		import brakeline.sim.kernels.flight_kernels as flight, brakeline.sim.kernels.ray_kernels; flight.prepare()' && wait $$!
 endef
 
 .PHONY: demo setup test test-fast check style types compiled unit bench messages docs three safety-gymnasium bullet-safety-gym safe-control-gym clean

@@ -17,11 +17,12 @@ F = TypeVar("F", bound=Callable[..., object])
 log = logging.getLogger(__name__)
 
 
-def compiled(signature: str) -> Callable[[F], F]:
+def compiled(signature: str | None = None) -> Callable[[F], F]:
     """Return a decorator that compiles a function for a signature in Numba's notation.
 
-    `f8[::1]` is a contiguous array of float64. Arguments of other types raise TypeError. Division by zero gives inf or
-    NaN, as in NumPy. The compiled code does not check indices, unless NUMBA_BOUNDSCHECK=1 is set.
+    `f8[::1]` is a contiguous array of float64. Arguments of other types raise TypeError. Without a signature, which has
+    no words for records, the first call compiles the function for its arguments. Division by zero gives inf or NaN, as
+    in NumPy. The compiled code does not check indices, unless NUMBA_BOUNDSCHECK=1 is set.
     """
 
     def decorate(function: F) -> F:

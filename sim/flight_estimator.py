@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.sim.flight_controller import GRAVITY, Vector
+from brakeline.messaging.obstacle import Array
 from brakeline.sim.ground_estimator import cut_normal
+from brakeline.sim.kernels.flight_kernels import GRAVITY
 from brakeline.sim.sim_conditions import QuadrotorNoise as QuadrotorNoise
 
+Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; world from body
 
 
@@ -36,7 +38,7 @@ class FlightEstimator:
     Interpolated errors never exceed the cut-off, and errors of different periods are independent.
 
     Attributes:
-        errors: (9) of position, velocity and attitude.
+        errors: (9,) of position [m], velocity [m/s] and attitude [rad].
     """
 
     def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
@@ -44,26 +46,26 @@ class FlightEstimator:
         self.noise, self._rng, self._steps = noise, rng, steps
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
         self.errors = self._next = self._draw()
-        self._slopes = [0.0] * 9
+        self._slopes = np.zeros(9)
         self._left = 0
 
     def advance(self) -> None:
         """Advance the errors by one step."""
         if self._left == 0:
             self.errors, self._next = self._next, self._draw()
-            self._slopes = [(b - a) / self._steps for a, b in zip(self.errors, self._next, strict=True)]
+            self._slopes = (self._next - self.errors) / self._steps
             self._left = self._steps
         self._left -= 1
         if self._left == 0:
             self.errors = self._next
         else:
-            self.errors = [e + s for e, s in zip(self.errors, self._slopes, strict=True)]
+            self.errors = self.errors + self._slopes
 
     def read(
         self, position: Vector, velocity: Vector, attitude: Quaternion, rates: Vector, acceleration: Vector
     ) -> Estimate:
         """Return the estimate of a true state; `acceleration` is in the world frame [m/s²]."""
-        e = self.errors
+        e = self.errors.tolist()
         white = cut_normal(self._rng, self.noise.scale, (6,)).tolist()
         ax, ay, az = acceleration
         w, x, y, z = attitude
@@ -81,9 +83,8 @@ class FlightEstimator:
             ),
         )
 
-    def _draw(self) -> list[float]:
-        errors: list[float] = (cut_normal(self._rng, 1.0, (9,)) * self._sigma).tolist()
-        return errors
+    def _draw(self) -> Array:
+        return cut_normal(self._rng, 1.0, (9,)) * self._sigma
 
 
 def rotate(attitude: Quaternion, vector: Vector) -> Vector:

@@ -15,9 +15,10 @@ import numpy as np
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import robot_named
 from brakeline.sim.arena import Arena
-from brakeline.sim.flight_controller import GRAVITY, STILL, FlightController, Vector
+from brakeline.sim.flight_controller import FlightController, Vector
 from brakeline.sim.flight_estimator import Estimate, FlightEstimator, QuadrotorNoise, Quaternion, rotate
 from brakeline.sim.ground_estimator import heading_of
+from brakeline.sim.kernels.flight_kernels import GRAVITY, OUTER_EVERY, TIMESTEP, add_drag
 from brakeline.sim.mujoco_obstacles import MoverBodies, add_obstacles
 from brakeline.sim.vehicle import Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
@@ -26,7 +27,6 @@ from brakeline.sim.wind import Wind, WindProcess
 QUADROTOR = robot_named("quadrotor")
 MODEL = Path(__file__).with_name("quadrotor.xml").read_text()
 SAMPLES = 5  # of the position in a period
-OUTER_EVERY = 2  # physics steps for one step of the velocity loop
 FLOOR_BIT = 1
 STANDING = 0.15  # m/s; below this speed, and at the setpoint zero, it hovers in place
 SETTLE = 5  # periods of hovering before the episode starts
@@ -61,12 +61,12 @@ class Quadrotor(SimulatedVehicle):
             floor: height of a plane to start from and to land on [m]. Without one, the vehicle starts hovering.
         """
         self.arena = arena
-        self._model = _build(arena, floor)
+        self._model = arena_model(arena, floor)
         self._data = mujoco.MjData(self._model)
         self._first_rotor = WeakMotor(self._model, 0)
-        self.timestep: float = self._model.opt.timestep
+        self.timestep = TIMESTEP
         self._steps_per_sample = round(QUADROTOR.period / SAMPLES / self.timestep)
-        self.controller = FlightController(self.timestep, OUTER_EVERY)
+        self.controller = FlightController()
         self._body = self.controller.body
         steps = round(QUADROTOR.period / self.timestep / OUTER_EVERY)
         self._estimator = FlightEstimator(noise or QuadrotorNoise(), rng, steps)
@@ -80,7 +80,9 @@ class Quadrotor(SimulatedVehicle):
         self.on_floor = False
         self._count = 0
         self._path: deque[list[float]] = deque(maxlen=64)  # true positions after each `advance` of the period
-        self._acceleration = (0.0, 0.0, 0.0)
+        self._before = np.zeros(3)  # m/s, the velocity before the last physics step
+        self._air = np.zeros(3)  # m/s, the velocity of the wind
+        self._acceleration: Vector = (0.0, 0.0, 0.0)
         self.input = np.zeros(QUADROTOR.action_dim)
         mujoco.mj_forward(self._model, self._data)
         if self.flying:
@@ -133,20 +135,23 @@ class Quadrotor(SimulatedVehicle):
     def _set_wind(self, name: str, value: float) -> None:
         self._wind = replace(self._wind, **{name: value})
         self._wind_process = None if self._wind.calm else WindProcess(self._wind, self._rng, self.timestep)
+        self._air[:] = 0.0
 
     def advance(self, steps: int) -> None:
         """Advance by some physics steps, each with the rotors' thrusts from the controller."""
         model, data = self._model, self._data
-        estimated, before = (STILL, STILL), STILL
         for _ in range(steps):
-            _, before, attitude, rates = self._motion()
             if self._count % OUTER_EVERY == 0:
                 self._estimator.advance()
-                estimated = self.position_and_velocity()
             self._count += 1
+            qvel = data.qvel
+            self._before[:] = qvel[:3]
             if self.flying:
-                data.ctrl[:] = self.controller.update(*estimated, attitude, rates)
-            self._apply_drag(*before)
+                self.controller.update(data.qpos, qvel, self._estimator.errors, data.ctrl)
+            if self._wind_process is not None:
+                self._wind_process.advance()
+                self._air[:] = self._wind_process.velocity
+            add_drag(qvel, self._air, data.qfrc_applied)
             if self._movers:
                 self._time += self.timestep
                 self._movers.place(self._time)
@@ -158,10 +163,9 @@ class Quadrotor(SimulatedVehicle):
             else:
                 self.on_floor = False
                 self._movers.note_no_contact()
-        vx, vy, vz = data.qvel[:3].tolist()
-        dt = self.timestep
         self._path.append(data.qpos[:3].tolist())
-        self._acceleration = ((vx - before[0]) / dt, (vy - before[1]) / dt, (vz - before[2]) / dt)
+        x, y, z = ((data.qvel[:3] - self._before) / self.timestep).tolist()
+        self._acceleration = (x, y, z)
 
     def cut_rotors(self) -> None:
         """Stop the rotors, or let them idle, until `start_rotors`."""
@@ -222,25 +226,13 @@ class Quadrotor(SimulatedVehicle):
     def _hover(self) -> None:
         """Start in steady hover: rotors at hovering thrust, tilted against the mean wind, holding the start."""
         self._data.act[:] = 0.25 * self._body.mass * GRAVITY
-        controller = self.controller
-        controller.x.hold, controller.y.hold, controller.z.hold = self._data.qpos[:3].tolist()
+        integral = np.zeros(3)
         if self._wind_process is not None:
-            for axis, wind in zip((controller.x, controller.y, controller.z), self._wind_process.mean, strict=True):
-                axis.integral = -wind * (
-                    self._body.drag_linear + self._body.drag_quadratic * math.hypot(*self._wind_process.mean)
-                )
+            mean = np.array(self._wind_process.mean)
+            integral = -mean * (self._body.drag_linear + self._body.drag_quadratic * math.hypot(*mean))
+        self.controller.hold(self._data.qpos[:3], integral)
         self.advance(SETTLE * SAMPLES * self._steps_per_sample)
         self.collided = False
-
-    def _apply_drag(self, vx: float, vy: float, vz: float) -> None:
-        """Apply the air's drag on the body, at a velocity [m/s]."""
-        if self._wind_process is not None:
-            self._wind_process.advance()
-            wx, wy, wz = self._wind_process.velocity
-            vx, vy, vz = vx - wx, vy - wy, vz - wz
-        body = self._body
-        drag = body.mass * (body.drag_linear + body.drag_quadratic * math.sqrt(vx * vx + vy * vy + vz * vz))
-        self._data.qfrc_applied[:3] = (-drag * vx, -drag * vy, -drag * vz)
 
     def _note_contacts(self) -> None:
         """Note the present contacts. A plane is the lowest type of geom, and comes first in a contact."""
@@ -255,7 +247,7 @@ class Quadrotor(SimulatedVehicle):
             self.collided = self.collided or bool((first != floor).any())
 
 
-def _build(arena: Arena, floor: float | None) -> mujoco.MjModel:
+def arena_model(arena: Arena, floor: float | None) -> mujoco.MjModel:
     """Compile the vehicle and the arena, with the vehicle at the start or on the floor below it."""
     spec = mujoco.MjSpec.from_string(MODEL)
     add_obstacles(spec, arena)

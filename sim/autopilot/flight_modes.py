@@ -180,12 +180,12 @@ class FlightStateMachine:
         controller, wanted = self.vehicle.controller, self.setpoint
         if self.mode is Mode.OFFBOARD and self.landed is not LandedState.TAKING_OFF:
             self._flown_velocity = controller.setpoint = self._followed(wanted.velocity, seconds)
-            controller.yaw_rate = wanted.yaw_rate or 0.0
+            controller.turn_at(wanted.yaw_rate or 0.0)
             if wanted.yaw is not None:
-                controller.yaw_goal = wanted.yaw
+                controller.turn_to(wanted.yaw)
             return
         position, self._flown_velocity = self.vehicle.position_and_velocity()
-        controller.yaw_rate = 0.0
+        controller.turn_at(0.0)
         if self.landed is LandedState.TAKING_OFF:
             left = self._takeoff_height - position[2]
             controller.setpoint = (0.0, 0.0, min(max(left, 0.3), TAKEOFF_CLIMB))

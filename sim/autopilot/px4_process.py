@@ -14,7 +14,8 @@ from pathlib import Path
 
 from brakeline.errors import LaunchError
 from brakeline.messaging.free_ports import free_udp_port
-from brakeline.sim.flight_controller import GRAVITY, Airframe
+from brakeline.sim.kernels.flight_kernels import AIRFRAME as BODY
+from brakeline.sim.kernels.flight_kernels import GRAVITY
 
 AIRFRAME = "none_iris"  # the airframe of PX4 that expects its simulator at a TCP port
 FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the number of the instance
@@ -26,7 +27,6 @@ TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder fo
 START_TIMEOUT = 30.0  # s until PX4 must have connected
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
-BODY = Airframe()
 ARM, TORQUE = BODY.arm, BODY.rotor_torque
 
 # The parameters of the vehicle in sim/quadrotor.xml, and of a companion computer that sends velocities

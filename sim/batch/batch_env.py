@@ -19,13 +19,23 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import arena_kind, draw_arena
-from brakeline.sim.batch.ground_batch import GroundBatch, MotionBatch, PeriodBatch
+from brakeline.sim.batch.ground_batch import GroundBatch
 from brakeline.sim.batch.ground_estimator_batch import wrapped
-from brakeline.sim.batch.ground_observation_batch import GroundObservationBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.observation_batch import GroundObservationBatch, ObservationBatch, QuadrotorObservationBatch
+from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
+from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.ground_robot import GROUND
 from brakeline.sim.navigation_env import OBSERVED_LIMIT
+from brakeline.sim.quadrotor import QUADROTOR
 from brakeline.sim.sim_conditions import Conditions
+
+# The code of the tasks that batches simulate: simulator and observation.
+GROUND_CODES = "brakeline.sim.ground_robot:simulated", "brakeline.sim.observations:GroundObservation"
+QUADROTOR_CODES = (
+    "brakeline.deploy.quadrotor_vehicles:embedded",
+    "brakeline.sim.observations:QuadrotorObservation",
+)
 
 Infos = dict[str, Any]
 Flags = NDArray[np.bool_]
@@ -97,10 +107,16 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self._episode_seeds = episode_seeds or (lambda i: int(self._generators[i].integers(2**31)))
         kind = arena_kind(self.robot, arena)
         self._streams = NormalStreams(num_envs)
-        self._robots = GroundBatch(num_envs, kind, self.conditions, threads if threads > 1 else 0, self._streams)
-        noise = self.conditions.lidar_noise(flies=False)
-        obstacles = self._robots.obstacles
-        self._observations = GroundObservationBatch(num_envs, self.robot, obstacles, self._streams, noise)
+        flies = self.robot.position_dim == 3
+        self._robots: VehicleBatch
+        if flies:
+            self._robots = QuadrotorBatch(num_envs, kind, self.conditions, self._streams)
+        else:
+            self._robots = GroundBatch(num_envs, kind, self.conditions, threads if threads > 1 else 0, self._streams)
+        observed = QuadrotorObservationBatch if flies else GroundObservationBatch
+        self._observations: ObservationBatch = observed(
+            num_envs, self.robot, self._robots.obstacles, self._streams, self.conditions.lidar_noise(flies)
+        )
         self._bound = np.asarray(self.robot.measurement_bound)
         self._goal_radius, self._step_limit = kind.goal_radius, kind.step_limit
         self._arenas = np.empty(num_envs, dtype=object)
@@ -108,7 +124,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self._goals, self._distance = np.zeros((num_envs, self.robot.position_dim)), np.zeros(num_envs)
         self._ended: Flags = np.zeros(num_envs, dtype=bool)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="physics")
-        self._stepping: tuple[NDArray[np.intp], Future[MotionBatch]] | None = None
+        self._stepping: tuple[NDArray[np.intp], Future[Any]] | None = None
         self._now: tuple[Observations, Infos] | None = None
 
     def reset(
@@ -255,7 +271,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "subsamples": period.subsamples,
             "turned": period.turned,
             "at_goal": self._at_goal(rows, period),
-            "speed": period.true[:, 3],
+            "speed": self._observations.speeds(period.true),
             "episode_seed": self._seeds[rows],
         }
 
@@ -268,12 +284,12 @@ def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> Non
         UnknownName: the robot has no arena of this name.
     """
     kind, advice = arena_kind(robot, arena), "use NavigationEnv, or train without --backend batch"
-    if robot.layout() != GROUND.layout() or robot.task.senses != GROUND_SENSES:
+    codes = robot.task.simulator, robot.task.senses
+    if (robot.layout(), codes) not in ((GROUND.layout(), GROUND_CODES), (QUADROTOR.layout(), QUADROTOR_CODES)):
         raise NoBatch(f"{robot.name} with the task {robot.task.name} is not simulated in batches: {advice}")
     if kind.movers is not None or kind.ring is not None:
         raise NoBatch(f"the arena {arena} has moving obstacles or other robots, which no batch simulates: {advice}")
     if conditions.perception.kind != "map":
         raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {advice}")
-
-
-GROUND_SENSES = "brakeline.sim.observations:GroundObservation"
+    if robot.position_dim == 3 and not conditions.wind.calm:
+        raise NoBatch(f"a batch of quadrotors flies in calm air (--wind 0 --gust 0): {advice}")

@@ -21,6 +21,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch
+from brakeline.sim.batch.vehicle_batch import PeriodBatch, resting_period
 from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_robot import (
@@ -45,18 +46,6 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 BARE = Arena("bare", (), (0.0, 0.0, 0.0), (0.0, 0.0), 0.0, 1, ((-1.0, 1.0), (-1.0, 1.0)))
 SAFE_GAP = 0.01  # m; the wheels turn too slowly to cover it between two samples
-
-
-@dataclass(frozen=True)
-class PeriodBatch:
-    """The reports of one period, with a row for each robot: see `Period`."""
-
-    measured: Array  # (rows, n)
-    true: Array  # (rows, n)
-    collision: NDArray[np.bool_]  # (rows,)
-    clearance: Array  # (rows,) m
-    subsamples: Array  # (rows, S, d) m
-    turned: Array  # (rows,) rad
 
 
 @dataclass(frozen=True)
@@ -114,7 +103,6 @@ class GroundBatch:
         self.input = np.zeros((size, GROUND.action_dim))
 
     def close(self) -> None:
-        """End the threads."""
         self._rollout.close()
 
     def begin(self, rows: Rows, arenas: list[Arena], generators: list[np.random.Generator]) -> None:
@@ -144,18 +132,12 @@ class GroundBatch:
         self.measured[rows] = np.column_stack([self._estimator.pose[rows], np.zeros((len(rows), 2))])
 
     def initial_period(self, rows: Rows) -> PeriodBatch:
-        """Return the reports of a period in which nothing happened, at the present states."""
-        k = len(rows)
-        states = self.measured[rows], self.true[rows]
-        path = np.zeros((k, SAMPLES, 2))
-        return PeriodBatch(*states, np.zeros(k, dtype=bool), self._clearance[rows], path, np.zeros(k))
+        return resting_period(self.measured[rows], self.true[rows], self._clearance[rows], SAMPLES, 2)
 
     def set_input(self, rows: Rows, inputs: Array) -> None:
-        """Set the inputs (rows, 2) of the next period, which are finite; clip them to the robot's bounds."""
         self.input[rows] = np.clip(inputs, GROUND.low(), GROUND.high())
 
     def advance(self, rows: Rows) -> MotionBatch:
-        """Simulate a period of the physics. It uses no array but the robots' own motion, so it may run in a thread."""
         reach = GROUND.period * np.maximum(self.input[rows, 0], np.abs(self.true[rows, 3])) + SAFE_GAP
         near = self._clearance[rows] < reach
         controls, forces = self._disturbed(rows)
@@ -177,7 +159,6 @@ class GroundBatch:
         return MotionBatch(coordinates, collision, clearance)
 
     def finish(self, rows: Rows, motion: MotionBatch) -> PeriodBatch:
-        """Measure, and return the reports of a period whose physics `advance` simulated."""
         headings = headings_of(motion.coordinates[..., 3:7])
         headings = np.column_stack([self.true[rows, 2], headings])
         rates = np.diff(np.unwrap(headings, axis=1), axis=1) * (SAMPLES / GROUND.period)

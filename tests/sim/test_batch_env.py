@@ -7,9 +7,8 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from brakeline.errors import BadInput, NoBatch, UnknownName
-from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.ray_directions import planar_rays
-from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.obstacle import Shapes, rotate
+from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.batch.normal_streams import NormalStreams
@@ -18,8 +17,8 @@ from brakeline.sim.ground_estimator import cut_normal
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.scripted_policies import scripted
-from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception
-from tests.robots import GROUND
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, Wind
+from tests.robots import GROUND, QUADROTOR
 
 COMPARED = (
     *("state", "true_state", "outside", "input_in_force", "goal", "time", "collision", "contact_moving", "clearance"),
@@ -36,19 +35,23 @@ def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arena", "policy", "steps", "conditions"),
+    ("robot", "arena", "policy", "steps", "conditions"),
     [
-        ("default", "greedy", 40, Conditions()),
-        ("dense", "adversary", 90, Conditions(noise=NoiseLevels(scale=0.5), payload_kg=0.4, floor_friction=0.7)),
-        ("open", "random", 25, Conditions(noise=NoiseLevels(scale=0.0))),
+        (GROUND, "default", "greedy", 40, Conditions()),
+        (GROUND, "dense", "adversary", 90, Conditions(NoiseLevels(scale=0.5), payload_kg=0.4, floor_friction=0.7)),
+        (GROUND, "open", "random", 25, Conditions(NoiseLevels(scale=0.0))),
+        (QUADROTOR, "default", "astar", 25, Conditions(flight_noise=QuadrotorNoise(scale=0.5))),
+        (QUADROTOR, "dense", "adversary", 40, Conditions()),
     ],
 )
-def test_robots_of_a_batch_move_as_single_ones(arena: str, policy: str, steps: int, conditions: Conditions) -> None:
+def test_robots_of_a_batch_move_as_single_ones(
+    robot: RobotWithTask, arena: str, policy: str, steps: int, conditions: Conditions
+) -> None:
     """Everything is equal within 1e-9. In the period of a collision, the impact amplifies the rounding of the state."""
-    size = 4
-    batch = BatchNavigationEnv(GROUND, size, arena, conditions=conditions, seed_key=3, threads=2)
-    singles = [NavigationEnv(GROUND, arena, conditions=conditions, seed_key=3) for _ in range(size)]
-    policies = [scripted(policy, GROUND, np.random.default_rng(i)) for i in range(size)]
+    size = 4 if robot is GROUND else 2
+    batch = BatchNavigationEnv(robot, size, arena, conditions=conditions, seed_key=3, threads=2)
+    singles = [NavigationEnv(robot, arena, conditions=conditions, seed_key=3) for _ in range(size)]
+    policies = [scripted(policy, robot, np.random.default_rng(i)) for i in range(size)]
     observations, infos = batch.reset(seed=7)
     now = [env.reset(seed=7 + i) for i, env in enumerate(singles)]
     collisions = ends = 0
@@ -98,23 +101,25 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     assert ended > 3
 
 
-def test_ranges_are_those_of_the_lidar_of_mujoco() -> None:
-    """Within 1e-9, in all arenas of the plane, from random points and headings."""
-    rng, rays = np.random.default_rng(0), planar_rays(18, 180.0, 3.5)
-    for name in ("default", "dense", "open"):
-        arenas = [draw_arena(name, rng, GROUND) for _ in range(8)]
-        batch = ObstacleBatch(8, GROUND.task.arenas[name])
-        for row, arena in enumerate(arenas):
-            batch.put(row, arena)
-        rows, points = np.arange(8), rng.uniform(-2.4, 2.4, (8, 2))
-        for turn in rng.uniform(-np.pi, np.pi, 5):
-            cos, sin = np.cos(turn), np.sin(turn)
-            beams = np.tile(rays.directions @ np.array([[cos, sin], [-sin, cos]]), (8, 1, 1))
-            ranges = batch.cast(rows, points, beams, 3.5)
-            for row, arena in enumerate(arenas):
-                assert np.abs(ranges[row] - Lidar(arena, rays).cast(points[row], turn)).max() <= SAME
-        clear = [Shapes.of(arena.obstacles, 2).distance(points[row]).min() for row, arena in enumerate(arenas)]
-        assert np.abs(batch.clearance(rows, points[:, None])[:, 0] - clear).max() <= SAME
+@pytest.mark.parametrize(
+    ("robot", "arena"), [*((GROUND, name) for name in ("default", "dense", "open")), (QUADROTOR, "dense")]
+)
+def test_ranges_are_those_of_the_lidar_of_mujoco(robot: RobotWithTask, arena: str) -> None:
+    """Within 1e-9, from random points and headings, also from inside an obstacle."""
+    rng, rays, kind = np.random.default_rng(0), robot.task.rays, robot.task.arenas[arena]
+    arenas = [draw_arena(arena, rng, robot) for _ in range(8)]
+    batch, d = ObstacleBatch(8, kind), robot.position_dim
+    for row, one in enumerate(arenas):
+        batch.put(row, one)
+    low, high = np.array(arenas[0].bounds).T
+    rows, points = np.arange(8), rng.uniform(low + 0.1, high - 0.1, (8, d))
+    for turn in rng.uniform(-np.pi, np.pi, 5):
+        beams = np.tile(rotate(rays.directions, turn), (8, 1, 1))
+        ranges = batch.cast(rows, points, beams, rays.range)
+        for row, one in enumerate(arenas):
+            assert np.abs(ranges[row] - Lidar(one, rays).cast(points[row], turn)).max() <= SAME
+    clear = [Shapes.of(one.obstacles, d).distance(points[row]).min() for row, one in enumerate(arenas)]
+    assert np.abs(batch.clearance(rows, points[:, None])[:, 0] - clear).max() <= SAME
 
 
 def test_noise_is_that_of_each_generator() -> None:
@@ -134,6 +139,8 @@ def test_what_only_single_environments_simulate_is_refused() -> None:
         ("ground", "crossing", Conditions()),
         ("ground+tracks", "default", Conditions()),
         ("ground", "default", Conditions(perception=Perception("scan"))),
+        ("quadrotor", "traffic", Conditions()),
+        ("quadrotor", "default", Conditions(wind=Wind(speed=1.0))),
     ):
         with pytest.raises(NoBatch, match="NavigationEnv"):
             BatchNavigationEnv(robot_with_task(robot), 2, arena, conditions=conditions)

@@ -18,8 +18,8 @@ from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_link import HilLink
 from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, HilSensors, SensorNoise
 from brakeline.sim.autopilot.px4_process import Px4Process
-from brakeline.sim.flight_controller import GRAVITY
 from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
+from brakeline.sim.kernels.flight_kernels import GRAVITY
 from brakeline.sim.quadrotor import Quadrotor
 from tests.sim.station import field
 

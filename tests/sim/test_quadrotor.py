@@ -9,8 +9,9 @@ import pytest
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.arena import Arena
-from brakeline.sim.flight_controller import FlightController, VelocityAxis
+from brakeline.sim.flight_controller import FlightController
 from brakeline.sim.flight_estimator import QuadrotorNoise
+from brakeline.sim.kernels.flight_kernels import OUTER, OUTER_EVERY
 from brakeline.sim.quadrotor import MODEL, SAMPLES, Quadrotor
 from brakeline.sim.wind import Wind, WindProcess
 from tests.arenas import staged_arena
@@ -180,10 +181,10 @@ def test_the_seed_determines_the_flight() -> None:
 
 def test_a_large_jump_of_the_setpoint_is_ramped() -> None:
     """The reference limits a setpoint without slew to the acceleration that the airframe can give."""
-    axis = VelocityAxis(FlightController(0.005, 2).gains, 0.01, 0.03)
-    speeds = []
-    for _ in range(300):
-        axis.follow(5.0)
-        speeds.append(axis.velocity)
-    assert np.diff(speeds).max() / 0.01 < 5.5
+    controller, speeds = FlightController(), []
+    controller.setpoint = (5.0, 0.0, 0.0)
+    for _ in range(300 * OUTER_EVERY):
+        controller.update(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(9), np.zeros(4))
+        speeds.append(controller.record["velocity"][0, 0])
+    assert np.diff(speeds[::OUTER_EVERY]).max() / OUTER < 5.5
     assert speeds[-1] == pytest.approx(5.0)
