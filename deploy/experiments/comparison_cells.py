@@ -122,7 +122,9 @@ def learning(td3: TD3Config, method: str) -> TD3Config:
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
     """Return the methods that are compared on a robot in these arenas."""
-    every = backend_for(robot, arenas) == "batch"
+    from brakeline.messaging.task import robot_with_task
+
+    every = backend_for(robot, arenas) == "batch" and robot_with_task(robot).heading is not None
     return tuple(name for name, method in METHODS.items() if every or not method.unicycles_alone)
 
 
@@ -143,7 +145,7 @@ def cell_configs(
     from brakeline.messaging.task import robot_with_task
 
     task, backend = robot_with_task(robot).task, backend or backend_for(robot, arenas)
-    others: dict[str, Any] = {"backend": backend, "physics": task.simulator_version}
+    others: dict[str, Any] = {"backend": backend, "robots": task.at_once, "physics": task.simulator_version}
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     return [
         CellConfig(robot, method, seed, task.steps, EPISODES, arenas, **others)

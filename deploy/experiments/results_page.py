@@ -157,7 +157,11 @@ def _setup(robot: RobotWithTask, found: RobotResults) -> str:
         ("arenas", arenas),
         ("reward", ", ".join(f"{name} {value:g}" for name, value in asdict(task.reward).items())),
         ("simulator", f"MuJoCo, version {study.get('physics', 1)} of the robot's simulator"),
-        ("training", f"{study['steps']:,} steps in `{first}`, " + ("64 robots at once" if batch else "one robot")),
+        (
+            "training",
+            f"{study['steps']:,} steps in `{first}`, "
+            + (f"{study['robots']} robots at once" if batch else "one robot"),
+        ),
         ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
