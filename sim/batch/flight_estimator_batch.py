@@ -20,7 +20,7 @@ class FlightEstimatorBatch:
     """The estimates of N quadrotors. Every argument and result has a row for each of the `rows` that it is about.
 
     Attributes:
-        errors, growth: (N, 9) of position, velocity and attitude at the start of the period, and by its end.
+        errors: (N, 9) of position [m], velocity [m/s] and attitude [rad] at the start of the period.
     """
 
     def __init__(self, size: int, noise: QuadrotorNoise, streams: NormalStreams) -> None:
@@ -37,14 +37,14 @@ class FlightEstimatorBatch:
         """Draw the errors that grow, or shrink, in the next period."""
         self.errors[rows], self._next[rows] = self._next[rows], self._draw(rows)
 
-    def growth(self, rows: Rows) -> Array:
-        """Return by how much the errors change in this period, (rows, 9)."""
-        return np.asarray(self._next[rows] - self.errors[rows])
+    def steps(self, rows: Rows, count: int) -> Array:
+        """Return the errors (rows, count, 9) after each of `count` equal parts of the period."""
+        shares, start = np.linspace(0.0, 1.0, count + 1)[1:, None], self.errors[rows, None]
+        return np.asarray(start + shares * (self._next[rows, None] - start))
 
     def path(self, rows: Rows, positions: Array) -> Array:
         """Return what messages say of positions (rows, S, 3) [m] at even times of the period."""
-        shares = np.linspace(0.0, 1.0, positions.shape[1] + 1)[1:, None]
-        return _sent(positions + self.errors[rows, None, :3] + shares * self.growth(rows)[:, None, :3])
+        return _sent(positions + self.steps(rows, positions.shape[1])[..., :3])
 
     def read(self, rows: Rows, coordinates: Array, accelerations: Array) -> Array:
         """Return the states (rows, 9) that messages tell at the end of the period.

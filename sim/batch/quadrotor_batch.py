@@ -119,20 +119,19 @@ class QuadrotorBatch:
         self._estimator.begin_period(rows)
 
     def advance(self, rows: Rows) -> FlightBatch:
-        errors, slopes = self._estimator.errors[rows], self._estimator.growth(rows) / OUTER_STEPS
+        errors = self._estimator.steps(rows, OUTER_STEPS)
         controllers, coordinates = self._controllers[rows], self._coordinates[rows]
         path, accelerations = np.empty((len(rows), TICKS, 3)), np.empty((len(rows), 3))
         collision = np.zeros(len(rows), dtype=bool)
         starts = coordinates[:, None, :3].copy()
-        fly(controllers, coordinates, errors, slopes, path, accelerations)
+        fly(controllers, coordinates, errors, path, accelerations)
         clearance = self.obstacles.clearance(rows, path) - QUADROTOR.footprint
         moves = np.linalg.norm(np.diff(path, axis=1, prepend=starts), axis=2)
         for i in np.flatnonzero((clearance < 0.5 * moves + DOUBT).any(axis=1)):
             row = int(rows[i])
             controllers[i], coordinates[i] = self._controllers[row], self._coordinates[row]
-            errors[i] = self._estimator.errors[row]
             path[i], accelerations[i], collision[i] = self._fly_in_arena(
-                row, controllers[i : i + 1], coordinates[i], errors[i], slopes[i]
+                row, controllers[i : i + 1], coordinates[i], errors[i]
             )
             clearance[i] = self.obstacles.clearance(rows[i : i + 1], path[i : i + 1])[0] - QUADROTOR.footprint
         self._controllers[rows], self._coordinates[rows] = controllers, coordinates
@@ -152,7 +151,7 @@ class QuadrotorBatch:
         self.measured[rows] = self._estimator.read(rows, coordinates, motion.accelerations)
 
     def _fly_in_arena(
-        self, row: int, controller: Controllers, coordinates: Array, error: Array, slopes: Array
+        self, row: int, controller: Controllers, coordinates: Array, errors: Array
     ) -> tuple[Array, Array, bool]:
         """Fly a quadrotor in its arena as `fly` does; return its path, its last acceleration, whether it collided."""
         if row not in self._near:
@@ -165,10 +164,8 @@ class QuadrotorBatch:
         mujoco.mj_step1(model, data)
         collision, path, air, before = False, np.empty((TICKS, 3)), np.zeros(3), np.empty(3)
         for step in range(TICKS * STEPS_OF_TICK):
-            if step % OUTER_EVERY == 0:
-                error += slopes
             before[:] = data.qvel[:3]
-            control(controller, data.qpos, data.qvel, error, data.ctrl)
+            control(controller, data.qpos, data.qvel, errors[step // OUTER_EVERY], data.ctrl)
             add_drag(data.qvel, air, data.qfrc_applied)
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)

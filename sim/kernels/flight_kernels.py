@@ -301,25 +301,23 @@ def _turn_by(qpos: Array, a: float, b: float, c: float) -> None:
 
 
 @compiled()
-def fly(controllers: Any, coordinates: Array, errors: Array, slopes: Array, path: Array, accelerations: Array) -> None:
+def fly(controllers: Any, coordinates: Array, errors: Array, path: Array, accelerations: Array) -> None:
     """Fly vehicles that touch nothing in calm air, each for as many ticks as `path` has.
 
     Args:
         controllers (R,): records of `CONTROLLER`.
         coordinates (R, 17): qpos, qvel and act.
-        errors (R, 9): when the flight begins; they grow by `slopes` (R, 9) before each step of the velocity loop.
-        path (R, T, 3): is filled with the positions after each tick of two steps of the velocity loop [m].
+        errors (R, K, 9): in each step of the velocity loop.
+        path (R, T, 3): is filled with the positions after each tick [m].
         accelerations (R, 3): are filled with the means over the last physics step [m/s²].
     """
     thrusts, force, wind, before = np.empty(4), np.empty(3), np.zeros(3), np.empty(3)
     for row in range(len(controllers)):
-        one, error = controllers[row : row + 1], errors[row]
+        one = controllers[row : row + 1]
         qpos, qvel, act = coordinates[row, :7], coordinates[row, 7:13], coordinates[row, 13:]
         for step in range(path.shape[1] * STEPS_OF_TICK):
-            if step % OUTER_EVERY == 0:
-                error += slopes[row]
             before[:] = qvel[:3]
-            control(one, qpos, qvel, error, thrusts)
+            control(one, qpos, qvel, errors[row, step // OUTER_EVERY], thrusts)
             add_drag(qvel, wind, force)
             _fly_freely(qpos, qvel, act, thrusts, force)
             if step % STEPS_OF_TICK == STEPS_OF_TICK - 1:
@@ -330,6 +328,6 @@ def fly(controllers: Any, coordinates: Array, errors: Array, slopes: Array, path
 def prepare() -> None:
     """Compile or load the loops, which otherwise the first flight waits for."""
     one, three = np.zeros(1, CONTROLLER), np.zeros((1, 3))
-    fly(one, np.zeros((1, 17)), np.zeros((1, 9)), np.zeros((1, 9)), np.zeros((1, 0, 3)), three)
+    fly(one, np.zeros((1, 17)), np.zeros((1, 0, 9)), np.zeros((1, 0, 3)), three)
     control(one, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(9), np.zeros(4))
     add_drag(np.zeros(6), np.zeros(3), np.zeros(6))

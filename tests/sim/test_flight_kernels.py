@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from brakeline.messaging.obstacle import Obstacle
 from brakeline.sim.flight_controller import FlightController, controllers_at_rest
 from brakeline.sim.kernels.flight_kernels import AIRFRAME, GRAVITY, fly
 from brakeline.sim.quadrotor import Quadrotor, QuadrotorNoise
@@ -39,7 +40,8 @@ def test_the_controller_is_its_twin_bit_for_bit() -> None:
 def test_free_flight_is_that_of_mujoco() -> None:
     """Forty seconds of restless flight, within 1e-9 m, m/s and m/s²."""
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
-    one, errors, rng = controllers_at_rest(1), np.zeros((1, 9)), np.random.default_rng(1)
+    vehicle.alter(weak_motor=1.0)  # so that MuJoCo flies it
+    one, errors, rng = controllers_at_rest(1), np.zeros((1, 2 * TICKS, 9)), np.random.default_rng(1)
     one["hold"], one["holds"] = vehicle.arena.start, True
     hover = 0.25 * AIRFRAME.mass * GRAVITY
     coordinates = np.array([[*vehicle.arena.start, 1.0, *[0.0] * 9, *[hover] * 4]])
@@ -49,7 +51,23 @@ def test_free_flight_is_that_of_mujoco() -> None:
             setpoint = rng.uniform(-5.0, 5.0, 3) * (rng.random() < 0.8)
         vehicle.step(setpoint)
         one["setpoint"] = vehicle.input
-        fly(one, coordinates, errors, np.zeros((1, 9)), path, accelerations)
+        fly(one, coordinates, errors, path, accelerations)
         mine = [*coordinates[0, :3], *coordinates[0, 7:10], *accelerations[0]]
         assert np.abs(vehicle.true - mine).max() < 1e-9
         assert path[0, -1].tolist() == coordinates[0, :3].tolist()
+
+
+@pytest.mark.fast
+def test_a_vehicle_flies_freely_until_it_may_touch_something() -> None:
+    """Beside one that MuJoCo flies all the time, towards a wall: the same motion, and the same collision."""
+    wall = Obstacle("box", (6.0, 0.0, 10.0), (2.0, 8.0, 8.0))
+    pair = [Quadrotor(field(wall), np.random.default_rng(5)) for _ in range(2)]
+    pair[1].alter(weak_motor=1.0)
+    for _ in range(30):
+        free, always = (vehicle.step(np.array([4.0, 0.0, 0.0])) for vehicle in pair)
+        assert free.collision == always.collision
+        if free.collision:
+            break
+        assert np.abs(free.true - always.true).max() < 1e-9 and abs(free.clearance - always.clearance) < 1e-9
+        assert np.abs(free.measured - always.measured).max() < 1e-9
+    assert free.collision
