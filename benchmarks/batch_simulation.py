@@ -28,7 +28,7 @@ from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.navigation_env import NavigationEnv
 
 PLOT = Path(__file__).parents[1] / "docs" / "figures" / "batch_simulation.svg"
-SIZES = (1, 4, 16, 64, 256, 1024)
+SIZES = {"ground": (1, 4, 16, 64, 256, 1024), "quadrotor": (1, 16, 64, 256)}
 STEPS, BLOCKS = 1024, 5  # robot steps of a block, at least two periods of a batch
 PLAIN_SIZES, PEERS = (64, 256), 16
 
@@ -38,18 +38,18 @@ Act = Callable[[], None]  # one period of all robots
 def run() -> Figures:
     """Return a row for each number of robots at once, with its peer in the same blocks."""
     figures: Figures = {}
-    filtered: dict[int, dict[str, float]] = {}
-    robot = robot_with_task("ground")
-    alone, single, vector = _single(robot, filtered=False), _single(robot, filtered=True), _vector(robot, PEERS)
-    for size in SIZES:
-        batch = _filtered(robot, size)
-        figures[f"ground, filtered, {size} robots: beside one"] = filtered[size] = beside(size, batch, single)
-        if size in PLAIN_SIZES:
-            figures[f"ground, filtered, {size} robots: beside SyncVectorEnv of {PEERS}"] = beside(
-                size, batch, vector, PEERS
-            )
-            figures[f"ground, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
-    _draw(filtered)
+    for name, sizes in SIZES.items():
+        robot = robot_with_task(name)
+        alone, single, vector = _single(robot, filtered=False), _single(robot, filtered=True), _vector(robot, PEERS)
+        for size in sizes:
+            batch = _filtered(robot, size)
+            figures[f"{name}, filtered, {size} robots: beside one"] = beside(size, batch, single)
+            if size in PLAIN_SIZES:
+                figures[f"{name}, filtered, {size} robots: beside SyncVectorEnv of {PEERS}"] = beside(
+                    size, batch, vector, PEERS
+                )
+                figures[f"{name}, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
+    _draw({size: figures[f"ground, filtered, {size} robots: beside one"] for size in SIZES["ground"]})
     return figures
 
 

@@ -53,7 +53,7 @@ class RunConfig:
     arena: str = "default"
     """Drive in arenas of this name."""
     backend: Literal["processes", "batch"] = "processes"
-    """Simulate in actor processes, or all ground robots at once (batch: much faster)."""
+    """Simulate in actor processes, or all robots at once (batch: much faster)."""
     actors: int = 2
     """Run this many actor processes for each robot kind. With --from-logs it may be 0."""
     robots_per_actor: int = 1
