@@ -65,7 +65,9 @@ class QuantileSketch:
             self._flush()
 
     def flushed(self) -> QuantileSketch:
-        """Return a copy without pending values."""
+        """Return a copy without pending values; of a sketch without any value, the sketch itself."""
+        if not self.pending and not self.bins:
+            return self
         copy = replace(self, bins=self.bins.copy(), pending=self.pending[:])
         copy._flush()
         return copy

@@ -22,7 +22,7 @@ from brakeline.logs.figure_tables import show
 from brakeline.logs.stacking_table import PLAIN
 from brakeline.logs.tube_stats import stated
 
-REFRESH = 0.5  # s between updates of the table
+REFRESH = 1.0  # s between updates of the table: one takes 20 to 50 ms of processor time
 SPACING = 10.0  # s between lines without a terminal
 LINES = 5  # shown warnings
 
