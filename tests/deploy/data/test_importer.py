@@ -71,6 +71,8 @@ def test_a_clock_that_begins_again_cuts_messages_as_it_cuts_columns(driven, tmp_
     write, within = SOURCES[source]
     messages = import_sources([write(tmp_path, time, values)], porter())
     same(columns.data, messages.data, within)
+    said = "line 1002: the time goes back from 19.98 to 0 s: the recording is cut there"
+    assert any(said in note for note in columns.report.notes)
     assert any("time steps back by 19.98 s" in note and "cut there" in note for note in messages.report.notes)
 
 

@@ -267,19 +267,7 @@ def test_a_description_without_varying_inputs_passes_and_says_what_to_drive(driv
     assert "record a drive with changing v and w" in text
 
 
-# --- stamps that step back, damage --------------------------------------------------------------------------------
-
-
-def test_a_step_back_of_the_stamps_cuts_the_recording(driven, tmp_path, capsys):
-    time, values = driven
-    path = write_csv(tmp_path / "twice.csv", np.r_[time, time], np.vstack([values, values]))
-    out = tmp_path / "a.safetensors"
-    assert main(["import", str(path), "--robot", str(FILE), "--out", str(out), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)["report"]
-    assert any(
-        "line 3002: the time goes back from 59.98 to 0 s: the recording is cut there" in n for n in report["notes"]
-    )
-    assert report["periods"] == pytest.approx(2 * len(time) / 10, rel=0.05)
+# --- rows out of order, damage --------------------------------------------------------------------------------
 
 
 def test_rows_out_of_order_are_sorted(driven, plain, tmp_path, capsys):
