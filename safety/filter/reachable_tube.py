@@ -18,7 +18,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.model.error_bounds import ErrorBound
 
 if TYPE_CHECKING:
-    from brakeline.safety.model.one_step import Arguments, OneStep
+    from brakeline.safety.model.one_step import OneStep, Predictor
 
 Array = NDArray[np.float64]
 
@@ -158,7 +158,7 @@ class RolloutTube(Tube):
         return partial(rollout_kernels.sets_around, *predictor, self.inputs_of, self._kept, *sets)
 
     @cached_property
-    def _arguments(self) -> Arguments:
+    def _arguments(self) -> Predictor:
         return self.one_step.arguments(self.robot)
 
     def at(self, z: Array) -> Tube:
@@ -177,7 +177,7 @@ class RolloutTube(Tube):
         """Return gradient and offset of the centers, and of the other coordinates: the rollout, linearised at z."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        return rollout_kernels.affine(*self._arguments, z, self.inputs_of, self._kept)
+        return rollout_kernels.affine(self._arguments, z, self.inputs_of, self._kept)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,12 +24,12 @@ class WindowScore:
         W = np.ascontiguousarray(model.first.W)  # the same for all periods
         from brakeline.safety.filter.kernels import window_kernels
 
-        self._score, self._predictor = window_kernels.score, one_step.stretch_arguments(robot)
+        self._score = partial(window_kernels.score, *one_step.stretch_arguments(robot))
         self._sets = W, M, kappa, w, scored
         self._start = one_step.start
 
     def __call__(self, past: PastWindow, state: Array) -> float:
         """Return the largest ratio of an error to its set in the window that ends in a measured state (n,)."""
         states = np.concatenate([past.states, state[None]])
-        score = self._score(*self._predictor, states, np.ascontiguousarray(past.inputs), *self._sets)
+        score = self._score(states, np.ascontiguousarray(past.inputs), *self._sets)
         return score / self._start if past.from_start else score

@@ -20,7 +20,7 @@ from brakeline.messaging.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Arguments = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
+Predictor = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
 
 TENSOR = "one_step."  # prefix of the names in a file
 WIDTHS = (0.2, 0.5)  # of saturating features, as shares of the largest recorded difference of input and speed
@@ -133,7 +133,7 @@ class OneStep:
         """Return the outputs (T, N, n + d·discs) for windows z (T, r + N·m), as `predicted_outputs` has them."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        return rollout_kernels.rollouts(*self.arguments(robot), np.ascontiguousarray(z))
+        return rollout_kernels.rollouts(self.arguments(robot), np.ascontiguousarray(z))
 
     def stretches(self, robot: Robot, z: Array) -> Array:
         """Return the factors on the sets (T, N) of windows z (T, r + N·m), at least 1: sqrt(1 + weight · leverage)."""
@@ -145,8 +145,8 @@ class OneStep:
         """Return the leverages (T, N) of windows z (T, r + N·m), with which the sets grow."""
         return replace(self, weight=1.0).stretches(robot, z) ** 2 - 1.0
 
-    def arguments(self, robot: Robot) -> Arguments:
-        """Return the arguments of the kernels that are the same for every plan."""
+    def arguments(self, robot: Robot) -> Predictor:
+        """Return the first argument of the kernels, which is the same for every plan: the predictor and its robot."""
         f, d = self.features, robot.position_dim
         heading = -1 if robot.heading is None else robot.heading
         arms = [disc.at for disc in robot.body if disc.arm > 0.0 and heading >= 0]
@@ -155,6 +155,6 @@ class OneStep:
         predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(f.terms)
         return *predictor, others, heading, centers, d, robot.action_dim
 
-    def stretch_arguments(self, robot: Robot) -> tuple[*Arguments, Array, float]:
+    def stretch_arguments(self, robot: Robot) -> tuple[Predictor, Array, float]:
         """Return the arguments of the kernels that know how the sets grow: also the root, and the weight."""
-        return *self.arguments(robot), np.ascontiguousarray(self.root), self.weight
+        return self.arguments(robot), np.ascontiguousarray(self.root), self.weight

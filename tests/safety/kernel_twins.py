@@ -131,8 +131,9 @@ def regressors_of_braking(z_0, braking, action):
     return np.concatenate([z_0, (braking * action).ravel()])
 
 
-def rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, z):
+def rollouts(predictor, z):
     """`rollout_kernels.rollouts`."""
+    C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     r, found = len(others), []
     for window in z:
         s, plan, p, angle, rows = window[:r], window[r:].reshape(-1, inputs), np.zeros(d), 0.0, []
@@ -153,8 +154,9 @@ def rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, z):
     return np.array(found)
 
 
-def stretches(C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, z):
+def stretches(predictor, root, weight, z):
     """`rollout_kernels.stretches`."""
+    C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, found = len(others), []
     for window in z:
         s, plan, total, rows = window[:r], window[r:].reshape(-1, inputs), 0.0, []
@@ -168,62 +170,41 @@ def stretches(C, scale, saturations, terms, others, heading, arms, d, inputs, ro
     return np.array(found)
 
 
-def linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T):
+def linearized(predictor, z, T):
     """`rollout_kernels.linearized`: the gradient by central differences."""
-    parts, step = (C, scale, saturations, terms, others, heading, arms, d, inputs), 1e-6
-    ends = [rollouts(*parts, ((z + sign * step * np.eye(len(z))) @ T.T)) for sign in (1.0, -1.0)]
+    step = 1e-6
+    ends = [rollouts(predictor, ((z + sign * step * np.eye(len(z))) @ T.T)) for sign in (1.0, -1.0)]
     gradient = (ends[0] - ends[1]) / (2.0 * step)
-    return rollouts(*parts, (T @ z)[None])[0], np.moveaxis(gradient, 0, -1)
+    return rollouts(predictor, (T @ z)[None])[0], np.moveaxis(gradient, 0, -1)
 
 
-def affine(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T, kept):
+def affine(predictor, z, T, kept):
     """`rollout_kernels.affine`."""
-    outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
-    offset = outputs - gradient @ z
+    outputs, gradient = linearized(predictor, z, T)
+    offset, d = outputs - gradient @ z, predictor[7]
     return gradient[:, :d], offset[:, :d], gradient[:, kept], offset[:, kept]
 
 
-def sets_around(
-    C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, T, kept, sets, more_sets, z
-):
+def sets_around(predictor, root, weight, T, kept, sets, more_sets, z):
     """`rollout_kernels.sets_around`."""
-    parts, window = (C, scale, saturations, terms, others, heading, arms, d, inputs), (T @ z)[None]
-    outputs, stretch = rollouts(*parts, window)[0], stretches(*parts, root, weight, window)[0]
+    window, n, d = (T @ z)[None], len(predictor[0]), predictor[7]
+    outputs, stretch = rollouts(predictor, window)[0], stretches(predictor, root, weight, window)[0]
     wide, more_wide = (stretch[:, None, None] * part for part in (sets, more_sets))
-    return outputs[:, :d], wide, outputs[:, kept], more_wide, outputs[0, : len(C)], stretch
+    return outputs[:, :d], wide, outputs[:, kept], more_wide, outputs[0, :n], stretch
 
 
-def score(
-    C,
-    scale,
-    saturations,
-    terms,
-    others,
-    heading,
-    arms,
-    d,
-    inputs,
-    root,
-    weight,
-    states,
-    executed,
-    W,
-    M,
-    kappa,
-    w,
-    scored,
-):
+def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
     """`window_kernels.score`."""
+    _, _, _, _, others, heading, _, d, _ = predictor
     window = np.concatenate([states[0, others], executed.ravel()])
-    parts = C, scale, saturations, terms, others, heading, arms, d, inputs
     after, turn = states[1:].copy(), np.eye(d)
     cos, sin = np.cos(states[0, heading]), np.sin(states[0, heading])
     turn[:2, :2] = [[cos, sin], [-sin, cos]]
     after[:, :d] = (states[1:, :d] - states[0, :d]) @ turn.T
     after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
-    off = np.abs(after - rollouts(*parts, window[None])[0, :, : states.shape[1]])
-    shares = off / (widths * stretches(*parts, root, weight, window[None])[0][:, None])
+    off = np.abs(after - rollouts(predictor, window[None])[0, :, : states.shape[1]])
+    shares = off / (widths * stretches(predictor, root, weight, window[None])[0][:, None])
     return max(shares[:, scored].max(), shares[0].max())
 
 

@@ -1,6 +1,6 @@
 """Compiled rollout of a one-step predictor, with its gradient (docs/method.md §13; see `OneStep`).
 
-Arguments that all functions share:
+The parts of the predictor, and what else the functions share:
 
     C (n, F)            outputs of one period, from the features φ
     scale (v,)          units of the variables v = [s; u; input of the period before]
@@ -24,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.compilation import compiled
+from brakeline.safety.model.one_step import Predictor
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-SHARED = "f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8"  # types of the shared arguments
+PREDICTOR = "Tuple((f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], i8[::1], i8, f8[:,::1], i8, i8))"  # its type for Numba
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[:,::1], i8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1])")
@@ -137,24 +138,14 @@ def _write(
                 slope[at + 1, c] += east * dpose[0, c]
 
 
-@compiled(f"f8[:,:,::1]({SHARED}, f8[:,::1])")
-def rollouts(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    z: Array,
-) -> Array:
+@compiled(f"f8[:,:,::1]({PREDICTOR}, f8[:,::1])")
+def rollouts(predictor: Predictor, z: Array) -> Array:
     """Return the outputs (T, N, n + D·d) after each period, in the frame of the start, for windows z (T, r + m + N·m).
 
     The outputs are the displacement, the change of heading and the other coordinates, as in `Windows.y`, then the
     displacements of the discs at `arms`.
     """
+    C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r = len(C), len(others)
     N = (z.shape[1] - r) // inputs - 1
     found, v, y = np.zeros((len(z), N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
@@ -173,25 +164,13 @@ def rollouts(
     return found
 
 
-@compiled(f"f8[:,::1]({SHARED}, f8[:,::1], f8, f8[:,::1])")
-def stretches(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    root: Array,
-    weight: float,
-    z: Array,
-) -> Array:
+@compiled(f"f8[:,::1]({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
+def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
     """Return the factors sqrt(1 + weight h_k) (T, N) on the sets of windows z (T, r + m + N·m).
 
     h_k = |root Σ_{j<k} φ_j|² / k is the leverage of the first k periods (docs/method.md §14).
     """
+    C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, F = len(others), len(terms)
     N = (z.shape[1] - r) // inputs - 1
     found, v, y = np.empty((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
@@ -216,24 +195,13 @@ def stretches(
     return found
 
 
-@compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({SHARED}, f8[::1], f8[:,::1])")
-def linearized(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    z: Array,
-    T: Array,
-) -> tuple[Array, Array]:
+@compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({PREDICTOR}, f8[::1], f8[:,::1])")
+def linearized(predictor: Predictor, z: Array, T: Array) -> tuple[Array, Array]:
     """Return the outputs (N, n + D·d) for the regressors T z, and their gradient (N, n + D·d, nz) in z (nz,).
 
     T (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs.
     """
+    C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r, nz = len(C), len(others), len(z)
     N, V = (len(T) - r) // inputs - 1, r + 2 * inputs
     outputs, gradient = np.zeros((N, n + len(arms) * d)), np.zeros((N, n + len(arms) * d, nz))
@@ -258,28 +226,15 @@ def linearized(
     return outputs, gradient
 
 
-@compiled(f"Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]))({SHARED}, f8[::1], f8[:,::1], i8[::1])")
-def affine(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
-    z: Array,
-    T: Array,
-    kept: Index,
-) -> tuple[Array, Array, Array, Array]:
+@compiled(f"Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]))({PREDICTOR}, f8[::1], f8[:,::1], i8[::1])")
+def affine(predictor: Predictor, z: Array, T: Array, kept: Index) -> tuple[Array, Array, Array, Array]:
     """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `kept` (k,).
 
     Returns:
         Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the kept coordinates.
     """
-    outputs, gradient = linearized(C, scale, saturations, terms, others, heading, arms, d, inputs, z, T)
-    N, nz, k = len(outputs), len(z), len(kept)
+    outputs, gradient = linearized(predictor, z, T)
+    N, nz, k, d = len(outputs), len(z), len(kept), predictor[7]
     position, offset = np.empty((N, d, nz)), np.empty((N, d))
     more, more_offset = np.empty((N, k, nz)), np.empty((N, k))
     for i in range(N):
@@ -297,19 +252,11 @@ def affine(
 
 @compiled(
     "Tuple((f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[::1], f8[::1]))"
-    f"({SHARED}, f8[:,::1], f8,"
+    f"({PREDICTOR}, f8[:,::1], f8,"
     " f8[:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1])"
 )
 def sets_around(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
+    predictor: Predictor,
     root: Array,
     weight: float,
     T: Array,
@@ -330,9 +277,8 @@ def sets_around(
     for i in range(len(T)):
         for j in range(len(z)):
             window[0, i] += T[i, j] * z[j]
-    outputs = rollouts(C, scale, saturations, terms, others, heading, arms, d, inputs, window)[0]
-    stretch = stretches(C, scale, saturations, terms, others, heading, arms, d, inputs, root, weight, window)[0].copy()
-    N, k = len(outputs), len(kept)
+    outputs, stretch = rollouts(predictor, window)[0], stretches(predictor, root, weight, window)[0].copy()
+    (N, d, _), k = directions.shape, len(kept)
     centers, wide, more, more_wide = (
         np.empty((N, d)),
         np.empty_like(directions),
@@ -345,4 +291,4 @@ def sets_around(
         for axis in range(k):
             more[i, axis] = outputs[i, kept[axis]]
         more_wide[i] *= stretch[i]
-    return centers, wide, more, more_wide, outputs[0, : len(C)].copy(), stretch
+    return centers, wide, more, more_wide, outputs[0, : len(predictor[0])].copy(), stretch

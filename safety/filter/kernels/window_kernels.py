@@ -7,20 +7,15 @@ import math
 import numpy as np
 
 from brakeline.compilation import compiled
-from brakeline.safety.filter.kernels.rollout_kernels import SHARED, Array, Index, rollouts, stretches
+from brakeline.safety.filter.kernels.rollout_kernels import PREDICTOR, Array, Index, rollouts, stretches
+from brakeline.safety.model.one_step import Predictor
 
 
-@compiled(f"f8({SHARED}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1])")
+@compiled(
+    f"f8({PREDICTOR}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1])"
+)
 def score(
-    C: Array,
-    scale: Array,
-    saturations: Array,
-    terms: Index,
-    others: Index,
-    heading: int,
-    arms: Array,
-    d: int,
-    inputs: int,
+    predictor: Predictor,
     root: Array,
     weight: float,
     states: Array,
@@ -38,13 +33,14 @@ def score(
         W (q, nz), M (N, n, q), kappa (N, n, nz), w (N, n): the sets' half-widths, M |W z| + kappa |z| + w.
         scored: indices of the coordinates that count after every period. After the first, all count.
     """
-    shared, r = (C, scale, saturations, terms, others, heading, arms, d, inputs), len(others)
+    _, _, _, _, others, heading, _, d, _ = predictor
+    r = len(others)
     z = np.empty((1, r + executed.size))
     window = z[0]
     for i in range(r):
         window[i] = states[0, others[i]]
     window[r:] = executed.ravel()
-    predicted, stretch = rollouts(*shared, z)[0], stretches(*shared, root, weight, z)[0]
+    predicted, stretch = rollouts(predictor, z)[0], stretches(predictor, root, weight, z)[0]
     atoms, first, largest = np.zeros(len(W)), states[0], 0.0
     for i in range(len(W)):
         for j in range(len(window)):
