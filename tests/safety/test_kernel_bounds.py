@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from brakeline.safety import compilation
+from brakeline import compilation
 
 HERE = Path(__file__).resolve().parent
 # They call every kernel, with arrays of random sizes and with images of a real sensor's size.

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline import compilation
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.safety import compilation
 from brakeline.safety.perception.image_coverage import BeamGrid
 from brakeline.safety.perception.kernels import occlusion_kernels, proximity_kernels, shadow_kernels
 from brakeline.safety.perception.kernels.shadow_kernels import AXIS_X, EXTENT, LENGTH, NEAR_RADIUS, NEAR_X, ROWS, TAPER
