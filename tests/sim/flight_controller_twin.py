@@ -7,53 +7,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+
+from brakeline.sim.kernels.flight_kernels import AIRFRAME, GAINS, GRAVITY, STOPPED, Gains
 
 Vector = tuple[float, float, float]
 
-GRAVITY = 9.81  # m/s²
-STOPPED = 0.05  # m/s; below this speed, and at the setpoint zero, the reference is at rest
 STILL: Vector = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Airframe:
-    """The airframe as the controller knows it (sim/quadrotor.xml)."""
-
-    mass: float = 1.2  # kg
-    inertia: Vector = (0.009, 0.009, 0.016)  # kg m²
-    arm: float = 0.12  # m, of each rotor along x and along y
-    rotor_torque: float = 0.016  # m, torque about z per thrust
-    least_thrust: float = 0.1  # N, a rotor
-    most_thrust: float = 8.8  # N, a rotor
-    drag_linear: float = 0.15  # 1/s, drag per mass and airspeed
-    drag_quadratic: float = 0.02  # 1/m, drag per mass and squared airspeed
-
-
-@dataclass(frozen=True)
-class Gains:
-    """The gains of all loops. Times in s, limits in SI units."""
-
-    ramp: float = 0.2  # averaging time of the setpoint: the period of its sender
-    round: float = 0.4  # of the second average
-    ease: float = 0.06  # of the third
-    attitude_lag: float = 0.03  # delay of a horizontal acceleration
-    thrust_lag: float = 0.02  # delay of a vertical acceleration
-    velocity: float = 4.0  # 1/s
-    integral: float = 2.0  # 1/s²
-    integral_limit: float = 4.0  # m/s²
-    position: float = 1.5  # 1/s, while holding
-    attitude: float = 16.0  # 1/s
-    rate: float = 30.0  # 1/s
-    yaw: float = 3.0  # 1/s
-    yaw_rate_limit: float = 1.5  # rad/s
-    tilt_limit: float = 1.0  # rad
-    rate_limit: float = 8.0  # rad/s
-    known_drag: float = 0.9  # share of the drag in the feedforward
-    # A setpoint may jump by `jump`; a larger change continues at `acceleration`. The robot's own slew, 0.8 m/s every
-    # 0.2 s, passes unchanged, with some room for jitter.
-    acceleration: float = 4.2  # m/s²
-    jump: float = 0.82  # m/s
 
 
 class MovingAverage:
@@ -168,11 +127,11 @@ class FlightController:
             period: time between two updates [s].
             outer_every: updates of the attitude loop for each update of the velocity loop.
         """
-        self.gains, self.body = Gains(), Airframe()
+        self.gains, self.body = GAINS, AIRFRAME
         self._period, self._outer_every = period, outer_every
         outer = period * outer_every
         g = self.gains
-        self.x, self.y, self.z = (VelocityAxis(g, outer, lag) for lag in (g.attitude_lag, g.attitude_lag, g.thrust_lag))
+        self.x, self.y, self.z = (VelocityAxis(g, outer, lag) for lag in g.lags)
         self.reset()
 
     def reset(self, yaw: float = 0.0) -> None:
