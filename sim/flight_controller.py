@@ -26,7 +26,7 @@ STILL: Vector = (0.0, 0.0, 0.0)
 
 def controllers_at_rest(size: int) -> Controllers:
     """Return controllers (size,) at rest, with the heading zero and no position to hold."""
-    rest: Controllers = np.zeros(size, CONTROLLER)
+    rest: Controllers = np.zeros(size, CONTROLLER).view(np.recarray)
     rest["allowance"] = GAINS.jump
     rest["force"][:, 0, 2] = GRAVITY
     return rest

@@ -4,7 +4,7 @@
 
 Arguments that functions share:
 
-    c            one controller, a record of `CONTROLLER`
+    c            one controller, a record of a `recarray` of `CONTROLLER`
     qpos (7,)    position [m] and attitude (w, x, y, z; world from body), as MuJoCo has them
     qvel (6,)    velocity [m/s] in the world and body rates [rad/s]
     errors (9,)  of the estimated position [m], velocity [m/s] and attitude [rad]
@@ -327,7 +327,7 @@ def fly(controllers: Any, coordinates: Array, errors: Array, path: Array, accele
 
 def prepare() -> None:
     """Compile or load the loops, which otherwise the first flight waits for."""
-    one, three = np.zeros(1, CONTROLLER), np.zeros((1, 3))
+    one, three = np.zeros(1, CONTROLLER).view(np.recarray), np.zeros((1, 3))
     fly(one, np.zeros((1, 17)), np.zeros((1, 0, 9)), np.zeros((1, 0, 3)), three)
     control(one, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(9), np.zeros(4))
     add_drag(np.zeros(6), np.zeros(3), np.zeros(6))

@@ -9,17 +9,21 @@ import pytest
 
 from brakeline import compilation
 
-HERE = Path(__file__).resolve().parent
+TESTS = Path(__file__).resolve().parents[1]
 # They call every kernel, with arrays of random sizes and with images of a real sensor's size.
-KERNEL_TESTS = ("filter_kernels", "halfspace_kernels", "perception_kernels", "occlusion_kernels")
+KERNEL_TESTS = (
+    *(f"safety/test_{name}_kernels.py" for name in ("filter", "halfspace", "perception", "occlusion")),
+    "sim/test_flight_kernels.py",
+    "sim/test_batch_env.py::test_ranges_are_those_of_the_lidar_of_mujoco",
+)
 OF_COMPILATION = ("every_kernel_has_a_twin", "refuses_other_types", "prepare_loads_every_kernel")  # no indices in these
 
 
 def run_kernel_tests(environment, *options):
     """Run the tests of the kernels in another interpreter."""
-    files = [str(HERE / f"test_{name}.py") for name in KERNEL_TESTS]
+    files = [str(TESTS / name) for name in KERNEL_TESTS]
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *options, *files]
-    there = {"PYTHONPATH": str(HERE.parents[1])} | environment
+    there = {"PYTHONPATH": str(TESTS.parent)} | environment
     run = subprocess.run(command, env=os.environ | there, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
 

@@ -18,7 +18,7 @@ def test_the_controller_is_its_twin_bit_for_bit() -> None:
     """Along random motions, with holds, jumps of the setpoint, a turning heading and saturated rotors."""
     rng, mine, twin = np.random.default_rng(0), FlightController(), flight_controller_twin.FlightController(0.005, 2)
     thrusts, qpos, qvel, errors = np.zeros(4), np.zeros(7), np.zeros(6), np.zeros(9)
-    for step in range(4000):
+    for step in range(1600):
         if step % 200 == 0:
             setpoint = rng.uniform(-6.0, 6.0, 3) * (rng.random() < 0.6)
             mine.setpoint = twin.setpoint = tuple(setpoint.tolist())
@@ -38,7 +38,7 @@ def test_the_controller_is_its_twin_bit_for_bit() -> None:
 
 @pytest.mark.fast
 def test_free_flight_is_that_of_mujoco() -> None:
-    """Forty seconds of restless flight, within 1e-9 m, m/s and m/s²."""
+    """Twelve seconds of restless flight, within 1e-9 m, m/s and m/s²."""
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
     vehicle.alter(weak_motor=1.0)  # so that MuJoCo flies it
     one, errors, rng = controllers_at_rest(1), np.zeros((1, 2 * TICKS, 9)), np.random.default_rng(1)
@@ -46,7 +46,7 @@ def test_free_flight_is_that_of_mujoco() -> None:
     hover = 0.25 * AIRFRAME.mass * GRAVITY
     coordinates = np.array([[*vehicle.arena.start, 1.0, *[0.0] * 9, *[hover] * 4]])
     path, accelerations = np.zeros((1, TICKS, 3)), np.zeros((1, 3))
-    for period in range(200):
+    for period in range(60):
         if period % 4 == 0:
             setpoint = rng.uniform(-5.0, 5.0, 3) * (rng.random() < 0.8)
         vehicle.step(setpoint)
