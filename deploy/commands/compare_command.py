@@ -50,6 +50,9 @@ class CompareCommand:
     backend: Literal["single", "batch"] | None = None
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
+    at_once: int | None = None
+    """Train this many robots at once, where a batch trains. Defaults to the number in the robot's task. Give another
+    --results folder if you change it."""
     quick: bool = False
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
@@ -122,7 +125,10 @@ class CompareCommand:
 
         cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
-        changed = {name: value for name in ("steps", "episodes") if (value := getattr(self, name)) is not None}
+        given: dict[str, Any] = {"steps": self.steps, "episodes": self.episodes, "robots": self.at_once}
+        changed = {name: value for name, value in given.items() if value is not None}
+        if few := [name for name, value in changed.items() if value < 1]:
+            raise ValueError(f"the number of {few[0]} is at least 1, not {changed[few[0]]}")
         jobs: list[Job] = []
         for cell in cells:
             own = replace(cell, penalty=self.penalty, td3=learning(self.td3, cell.method))
