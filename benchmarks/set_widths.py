@@ -103,11 +103,13 @@ def _draw(figures: Figures) -> None:
                 if points:
                     axes.plot(*zip(*points, strict=True), "o-" if form.startswith("one") else "s--", label=form)
             axes.set_xscale("log")
+            axes.set_xticks(MINUTES, [f"{minutes:g}" for minutes in MINUTES])
+            axes.minorticks_off()
+            axes.set_ylim(bottom=0.0)
             axes.set_xlabel("minutes of recorded driving")
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
             if row == 0:
-                axes.set_yscale("log")
                 axes.set_title(name)
     grid[0][0].legend(fontsize=7, frameon=False)
     pyplot.rcParams["svg.hashsalt"] = PLOT.name  # the same figures give the same file
