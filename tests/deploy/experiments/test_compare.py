@@ -254,8 +254,8 @@ def test_a_batch_is_not_taken_for_a_fast_learner_because_its_short_episodes_end_
 
 
 def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_none():
-    assert backend_for("ground", ("default", "dense")) == "batch"
-    assert backend_for("ground", ("default", "walkers")) == backend_for("quadrotor", ("default",)) == "single"
+    assert backend_for("ground", ("default", "dense")) == backend_for("quadrotor", ("default", "dense")) == "batch"
+    assert backend_for("ground", ("default", "walkers")) == backend_for("ground+tracks", ("default",)) == "single"
     given = replace(TD3Config(), updates_per_step=0.5)
     assert learning(given, "none") == given and learning(TD3Config(), "none").updates_per_step == 1.0
     assert given.cost_limit is None and learning(given, "lagrange").cost_limit is not None

@@ -211,8 +211,8 @@ def test_the_backend_has_settings_of_its_own_which_options_change() -> None:
 def test_what_a_batch_does_not_do_is_refused(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         replace(in_batches(RunConfig()), **changes)
-    with pytest.raises(NoBatch, match="quadrotor"):
-        replace(in_batches(RunConfig()), robots=("quadrotor",))
+    with pytest.raises(NoBatch, match="moving obstacles"):
+        replace(in_batches(RunConfig()), robots=("quadrotor",), arena="traffic")
 
 
 @pytest.mark.long
