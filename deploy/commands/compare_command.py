@@ -51,8 +51,8 @@ class CompareCommand:
     """Train and evaluate many robots at once (batch), or one at a time (single). Defaults to batch where the robot and
     the arenas allow it."""
     at_once: int | None = None
-    """Train this many robots at once, where a batch trains. Defaults to the number in the robot's task. Give another
-    --results folder if you change it."""
+    """Train this many robots at once, where a batch trains. Defaults to the number in the robot's task. If you change
+    it, give another --results folder."""
     quick: bool = False
     """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
