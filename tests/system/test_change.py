@@ -36,7 +36,8 @@ def test_a_set_from_a_run_is_published_into_the_run_by_hand(data_folder, tmp_pat
     assert [r.message.version for r in records if r.topic == "model"][-1] == version
     decided = [r.message.reply.decision.model for r in records if isinstance(r.message, pb.Exchange)]
     anew = decided[decided.index(version) + 20 :]  # an answer of before may be recorded after one of the other actor
-    assert set(anew) == {version} and len(anew) > 50, "from then on, all are decided on by it"
+    # A busy service refuses a question without a model; the robot then brakes along its plan.
+    assert set(anew) - {""} == {version} and anew.count(version) > 50, "from then on, all are decided on by it"
 
 
 def beyond(exchanges):
