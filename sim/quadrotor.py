@@ -167,7 +167,8 @@ class Quadrotor(SimulatedVehicle):
                 float(self.clearance(self._data.qpos[:3])), self._data.qpos[2] - self._floor - CLEAR_OF_FLOOR
             )
         self._room -= reach
-        return steps % STEPS_OF_TICK == 0 and self._room > 0.0
+        whole = steps % STEPS_OF_TICK == 0 and self._count % OUTER_EVERY == 0
+        return whole and self._room > 0.0
 
     def _fly_freely(self, steps: int) -> None:
         """Advance by compiled code, which gives the motion of MuJoCo in a tenth of the time."""

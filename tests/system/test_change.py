@@ -34,10 +34,11 @@ def test_a_set_from_a_run_is_published_into_the_run_by_hand(data_folder, tmp_pat
     assert figures["collisions"] == 0
     records = list(open_log(run.folder))
     assert [r.message.version for r in records if r.topic == "model"][-1] == version
-    decided = [r.message.reply.decision.model for r in records if isinstance(r.message, pb.Exchange)]
+    # A busy service may answer a question with an error, which is no decision.
+    replies = [r.message.reply for r in records if isinstance(r.message, pb.Exchange)]
+    decided = [reply.decision.model for reply in replies if reply.HasField("decision")]
     anew = decided[decided.index(version) + 20 :]  # an answer of before may be recorded after one of the other actor
-    # A busy service refuses a question without a model; the robot then brakes along its plan.
-    assert set(anew) - {""} == {version} and anew.count(version) > 50, "from then on, all are decided on by it"
+    assert set(anew) == {version} and len(anew) > 50, "from then on, all are decided on by it"
 
 
 def beyond(exchanges):
