@@ -49,15 +49,15 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "brakeline evaluate ground --policy astar --episodes 100 --json",
         ),
         "compare": CommandEntry(
-            "Train and evaluate each method from the same seeds, as tables and figures. Resumes from results/.",
+            "Train and evaluate each method from the same seeds; write tables and figures. Continues from results/.",
             "brakeline compare ground --quick",
         ),
         "campaign": CommandEntry(
-            "Drive many episodes of many kinds behind the filter, and search for the worst case. Can be resumed.",
+            "Drive many episodes of many kinds behind the filter, and search for the worst case. You can resume it.",
             "brakeline campaign ground --episodes 10000 --search 1000",
         ),
         "pretrain": CommandEntry(
-            "Drive and fit what a rival method must know of a robot.", "brakeline pretrain secas ground"
+            "Drive a robot, and fit the networks of a rival method to the data.", "brakeline pretrain secas ground"
         ),
     },
     "Your own robot": {
@@ -65,11 +65,11 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"
         ),
         "import": CommandEntry(
-            "Make a data set from a log of any robot: CSV, Parquet, ROS 2 bags, ArduPilot, PX4, own runs.",
+            "Make a data set from a log of any robot: CSV, Parquet, ROS bags, ArduPilot, PX4 or Brakeline runs.",
             "brakeline import drive.csv --robot my.toml --picture driven.png",
         ),
         "collect": CommandEntry(
-            "Record the data set that the filter learns a robot from.",
+            "Record the data set from which the filter learns how a robot moves.",
             "brakeline collect ground --seed 1",
         ),
         "excite": CommandEntry(
@@ -77,7 +77,7 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
         ),
         "certify": CommandEntry(
-            "Validate model sets on held-out data, and put them to use or publish them.",
+            "Fit model sets to recorded data, validate them, and put them to use or publish them.",
             "brakeline certify ground",
         ),
     },
@@ -91,7 +91,7 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
             "brakeline fly --minutes 10 --policy astar",
         ),
         "ros2": CommandEntry(
-            "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. Needs no ROS installation.",
+            "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. You need no ROS installation.",
             "brakeline ros2 ground --router tcp/localhost:7447",
         ),
         "autopilot": CommandEntry(
@@ -105,13 +105,13 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
     },
     "Look at runs": {
         "watch": CommandEntry("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
-        "status": CommandEntry("Show the living processes and their figures.", "brakeline status"),
+        "status": CommandEntry("Show the running processes and their figures.", "brakeline status"),
         "analyse": CommandEntry(
             "Compute the figures of one or many logs, also of incomplete ones, and write a report page.",
             "brakeline analyse runs/latest --html report.html",
         ),
         "replay": CommandEntry(
-            "Decide each logged request again and compare, to within 1e-12, or with another model set.",
+            "Decide each logged request again, with the same model set or another, and compare the decisions.",
             "brakeline replay runs/latest --certificate set-membership",
         ),
         "export": CommandEntry(
@@ -122,7 +122,7 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
     },
     "Processes on several machines": {
         "keys": CommandEntry(
-            "Make the keys of processes on several machines, of whoever signs models, and of verified plans.",
+            "Make keys for processes on several machines, for signers of model sets, and for plan tokens.",
             "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
         ),
         "router": CommandEntry(
@@ -145,7 +145,7 @@ GROUPS: dict[str, dict[str, CommandEntry]] = {
     },
     "The command line": {
         "completion": CommandEntry(
-            "Print what a shell evaluates to complete commands and options with the Tab key.",
+            "Print the script with which a shell completes commands and options at the Tab key.",
             "brakeline completion bash",
         ),
     },
@@ -155,7 +155,9 @@ COMMANDS: dict[str, CommandEntry] = {name: entry for group in GROUPS.values() fo
 
 def print_overview(console: Console) -> None:
     """Print each command with its example."""
-    console.print("[bold]brakeline[/]: robots learn by trial and error without ever hitting anything\n")
+    console.print(
+        "[bold]brakeline[/]: robots learn by trial and error without hitting anything, so far in simulation\n"
+    )
     for title, group in GROUPS.items():
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
         for name, (summary, example) in group.items():

@@ -42,10 +42,10 @@ class TD3Config:
     updates_per_step: float = 1.0
     """Update this many times for each step."""
     cost_limit: float | None = None
-    """Raise a penalty on collisions until at most this share of the episodes collides (a Lagrange multiplier). None:
-    the reward alone counts."""
+    """Raise a penalty on collisions until at most this share of the episodes collides (a Lagrange multiplier). With
+    None, the reward alone counts."""
     multiplier_rate: float = 10.0
-    """Raise the penalty by this reward for an episode that collides, with a cost limit."""
+    """With a cost limit, raise the penalty by this reward for each episode that collides."""
     stored: Stored = "both"
     """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
     symmetric: bool = True

@@ -14,9 +14,9 @@ class Rotation:
     """When the recorder finishes a file and continues in the next one. You can move a finished file away."""
 
     mib: float = 512.0
-    """Size of a file of the log, MiB, after which the next one begins."""
+    """Begin the next file of the log when a file has reached this size [MiB]."""
     seconds: float = 3600.0
-    """Duration of a file of the log, s, after which the next one begins."""
+    """Begin the next file of the log after this time [s]."""
 
     def __post_init__(self) -> None:
         if not self.mib > 0.0 or not self.seconds > 0.0:

@@ -23,8 +23,8 @@ class AnalyseCommand:
     html: Path | None = None
     """Write a report to this file: one page that needs no network."""
     figure: Path | None = None
-    """Draw the learning curves into this file (.png, .pdf or .svg): several runs as mean and 95 % interval of those
-    that differ only in their seed."""
+    """Draw the learning curves into this file (.png, .pdf or .svg). Runs that differ only in their seed become one
+    curve: their mean with its 95 % interval."""
     episode: int | None = None
     """Show each step of the episode with this number, of each actor."""
     actor: str | None = None

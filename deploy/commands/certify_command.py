@@ -36,8 +36,8 @@ class CertifyCommand:
 
     robot: options.Robot = "ground"
     data: Path | None = None
-    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the data set in use of the
-    robot."""
+    """Certify this data set, or the last steps of this log (file or run folder). Defaults to the
+    robot's data set in use."""
     certificates: tuple[str, ...] = ()
     """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you
     give --mode direct or recursion."""
@@ -45,20 +45,20 @@ class CertifyCommand:
     """Validate this prediction mode; one-step rolls out one learned period. Defaults to one-step, or to direct and
     recursion if you give --certificates. A robot that stops by feedback has no mode one-step."""
     windows: Literal["plan", "free", "auto"] = "auto"
-    """Fit and validate on this driving: plan for plans as the filter makes them, free for any, auto for any if there
-    are too few plans."""
+    """Fit and validate on this kind of driving: plan takes the windows that brake as the filter does, free takes every
+    window, and auto takes every window if the others are too few."""
     few: bool = False
     """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled
     by 1.5 instead of 1.15, as after `collect --url`."""
     outside: float = ModelConfig.outside
-    """Share of the recorded plans that may leave their sets in mode one-step. A larger share makes the sets narrower
+    """Let this share of the recorded plans leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""
     until_held: bool = False
     """Widen each envelope until no held-out plan leaves its set, and no further."""
     last: int = 20_000
-    """Take this many last steps of a log."""
+    """Take this many steps from the end of a log."""
     use: bool = False
-    """Write the model sets to where the other commands load them from."""
+    """Put the model sets to use: write them to the files that the other commands load."""
     accept_bound: options.AcceptBound = None
     publish: bool = False
     """Replace the model set of running safety services by the first of --certificates, in direct mode unless you

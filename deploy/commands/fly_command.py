@@ -53,8 +53,9 @@ class FlyCommand:
     """At this share of the steps, let a vehicle begin to follow its backup plan to the stop. The log then has the stops
     that `brakeline certify ROBOT --data LOG` needs."""
     adapt: bool = False
-    """Certify the vehicle anew in flight: if it needs wider sets than its model set states for long, a certifier
-    process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
+    """Certify the vehicle anew in flight. If the vehicle needs wider sets than its model set states for some time, a
+    certifier process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give
+    it."""
     deadline: float = 0.12
     """Let an actor wait this long for an answer of the safety service [s]. The answer applies from the next control
     period (0.2 s) on."""

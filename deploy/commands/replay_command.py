@@ -35,9 +35,9 @@ class ReplayCommand:
     mode: Mode = "direct"
     """With --certificate or --data, predict in this mode."""
     data: Path | None = None
-    """Decide with a model set of this data set (a file that `brakeline collect` wrote) instead."""
+    """Decide with a model set that is fitted to this data set (a file that `brakeline collect` wrote) instead."""
     margin: float | None = None
-    """Decide with this clearance margin [m] instead of the one of the model set."""
+    """Decide with this clearance margin [m] instead of the model set's own."""
     quiet: Quiet = False
     json: Json = False
 

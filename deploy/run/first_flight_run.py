@@ -24,19 +24,19 @@ class FirstFlightSettings:
     """The first flight of a vehicle. These are options of `brakeline collect --url`."""
 
     minutes: float = 15.0
-    """Duration of the flight [min], without takeoff and landing."""
+    """Fly for this long [min], without takeoff and landing."""
     height: float = 30.0
-    """Height that the vehicle climbs to [m]. It stays between a third and five thirds of it."""
+    """Climb to this height [m]. The vehicle then stays between a third and five thirds of it."""
     room: float = 80.0
-    """Side of the square that the vehicle stays in [m]."""
+    """Stay within a square whose sides have this length [m]."""
     system: int = 1
-    """MAVLink system id of the vehicle."""
+    """Address the vehicle by this MAVLink system id."""
     raise_limits: bool = False
     """Raise the parameters of the vehicle that limit it below its description: speeds, accelerations, tilt."""
     lead: bool = False
-    """Send position targets instead of velocities. When setpoints stop, the vehicle then stays at the last target; an
-    ArduCopter without GUID_TIMEOUT would fly on for 3 s. The vehicle flies differently then: use the option with
-    both `collect` and `fly`."""
+    """Send position targets instead of velocities. If setpoints stop, the vehicle then stays at the last target.
+    Without this option, an ArduCopter without GUID_TIMEOUT flies on for 3 s. The option changes how the vehicle flies,
+    so use it with both `collect` and `fly`."""
 
 
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> FirstFlightResult:

@@ -55,19 +55,19 @@ class RunConfig:
     backend: Literal["processes", "batch"] = "processes"
     """Simulate in actor processes, or all robots at once (batch: much faster)."""
     actors: int = 2
-    """Run this many actor processes for each robot kind. With --from-logs it may be 0."""
+    """Run this many actor processes for each robot kind. You may give 0 with --from-logs."""
     robots_per_actor: int = 1
     """Run this many robots in each actor process. They share one request to the safety service. With --backend batch,
-    run this many in all; 64 unless you say otherwise."""
+    run this many in all, by default 64."""
     fleet: int = 0
-    """Let this many robots of each actor process share one world and avoid each other. 0 gives each a world of its
-    own."""
+    """Let this many robots of each actor process share one world and avoid each other. 0 gives each robot a world of
+    its own."""
     steps: int = 100_000
     """Train for this many steps of each robot kind."""
     seed: int = 0
     """Draw everything random in the run from this seed."""
     penalty: float = 1.0
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input."""
+    """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range."""
     deadline: float = 0.1
     """Let an actor wait this long for an answer of the safety service [s]. Then its robot brakes along its backup
     plan."""
@@ -75,13 +75,13 @@ class RunConfig:
     """Run one actor in lockstep without deadlines: the same seed gives the same weights, bit for bit."""
     from_logs: tuple[str, ...] = ()
     """Let the learner take the steps of these logs (files or run folders) before any robot starts. With --actors 0 it
-    learns from them alone; with --resume they replace a lost checkpoint."""
+    learns from them alone. With --resume the logs replace a lost checkpoint."""
     replicas: int = 1
-    """Run this many safety service processes. A robot goes on if one of several fails."""
+    """Run this many safety service processes. The robots drive on if one of several processes fails."""
     record: bool = True
     """Record a log. Without a log you can't analyse, replay or certify the run."""
     rotation: Rotation = field(default_factory=Rotation)
-    """Begin the next file of the log at these sizes."""
+    """Begin the next file of the log after this size or duration."""
     pictures: float = 10.0
     """Draw this many pictures a second of each robot into the log for Foxglove, and up to as many of each kind of
     intervention. 0 draws none at all."""
@@ -91,8 +91,9 @@ class RunConfig:
     change: PhysicsChange = field(default_factory=PhysicsChange)
     """Change the robots or the floor in the middle of the run, such as --change.after 5000 --change.payload-kg 1."""
     adapt: bool = False
-    """Certify a robot anew while it drives: if it needs wider sets than its model set states for long, a certifier
-    process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give it."""
+    """Certify a robot anew while it drives. If the robot needs wider sets than its model set states for some time, a
+    certifier process fits a model set to the last minutes and puts it to use. --practice is then 0.01, unless you give
+    it."""
     conditions: Internal[Conditions] = field(default_factory=Conditions)
     policy: Internal[str] = ""  # a name or a file, as `evaluate` takes it; empty: the run learns a policy
     flights: Internal[tuple[FlightSettings, ...]] = ()  # links to vehicles in real time, one for each actor
