@@ -101,7 +101,7 @@ class TurtleBot(SimulatedVehicle):
     def start_disturbances(self, noise: ProcessNoise | None, rng: np.random.Generator) -> None:
         """Begin an episode's disturbances, before the robot settles on its wheels.
 
-        They come from a generator spawned from the episode's, which gives the numbers that it gives without them.
+        They come from a generator spawned from the episode's, so the episode's other random numbers do not change.
         """
         self._draws = rng.spawn(1)[0]
         self._disturbances = DrivingDisturbances(noise or ProcessNoise(), 1, SAMPLE_TIME)

@@ -13,7 +13,7 @@ from brakeline.sim.mujoco_obstacles import HEIGHT, MoverBodies, map_model
 
 
 class Lidar:
-    """One lidar in one arena. It sees the static and the moving obstacles of the arena, and no robot of its own.
+    """One lidar in one arena. It sees the static and the moving obstacles of the arena, but not its own robot.
 
     Attributes:
         rays: the directions of the beams and their range.

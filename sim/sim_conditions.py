@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """Standard deviations of the ground robot's sensor errors, which are normal and cut off at two of them.
+    """Standard deviations of the ground robot's sensor errors: normal, cut off at two standard deviations.
 
     `scale` = 0 switches all errors off but the encoders' resolution.
     """
@@ -31,7 +31,7 @@ class NoiseLevels:
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Standard deviations of the disturbances of the ground robot's true motion, cut off at three of them.
+    """Standard deviations of the disturbances of the ground robot's true motion, each cut off at three of its own.
 
     The wheels' speeds and the tilts of the floor fluctuate as first-order Gauss-Markov processes, with a value for each
     sample of 20 ms. `scale` = 0 switches all of them off.
@@ -59,7 +59,7 @@ class ProcessNoise:
 
 @dataclass(frozen=True)
 class QuadrotorNoise:
-    """Standard deviations of the quadrotor's errors, which are normal and cut off at two of them (`CUT`).
+    """Standard deviations of the quadrotor's errors: normal, cut off at two standard deviations (`CUT`).
 
     `scale` = 0 switches them off. With scale 1 the errors stay within the robot's `measurement_bound`: position and
     velocity because of the cut-off. The acceleration has the accelerometer's error and, by an error of the attitude, a

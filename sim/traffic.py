@@ -1,8 +1,8 @@
 """Obstacles that move by themselves: people on the ground, other aircraft in the air. They do not see the robot.
 
-Each walks in a random direction at a random speed, turns and stops at random, and never walks into a static obstacle.
-In every tick it follows its wish only if it could still stop before every static obstacle afterwards; otherwise it
-brakes. So it keeps to its largest acceleration and speed at all times. Moving obstacles pass through one another.
+Each moves in a random direction at a random speed, turns and stops at random, and never hits a static obstacle. In
+every tick it moves on only if it could still stop before every static obstacle afterwards; otherwise it brakes. So it
+never exceeds its largest acceleration and speed. Moving obstacles pass through one another.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class OtherRobots:
 
 
 class CrowdSensor:
-    """Measures the positions and velocities of a crowd with errors, and adds the sighting before to each."""
+    """Measures the positions and velocities of a crowd with errors, and adds the previous measurement to each."""
 
     def __init__(self, crowd: Crowd, rng: np.random.Generator) -> None:
         self._crowd, self._rng = crowd, rng

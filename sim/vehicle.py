@@ -103,10 +103,10 @@ class SimulatedVehicle:
         return {}
 
     def alter(self, **changes: float) -> None:
-        """Change `setters` from now on.
+        """Change the physics from now on, with one of `setters`.
 
         Raises:
-            ValueError: the name is another one, or the value is negative or not finite.
+            ValueError: `setters` lacks the name, or the value is negative or not finite.
         """
         setters = self.setters()
         if unknown := changes.keys() - setters.keys():

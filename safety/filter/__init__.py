@@ -1,1 +1,1 @@
-"""From a proposed action to a verified plan."""
+"""Decide on proposed actions: tube, half-spaces, QP, backup plan and recovery."""

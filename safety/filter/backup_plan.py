@@ -68,7 +68,7 @@ class BackupPlan:
     Attributes:
         plan (N, m): rest of the plan. Its first row is what to execute without a better answer; in real time, the input
             that is being executed.
-        model: version of the model set that verified the plan. Empty if the robot stands, `UNVERIFIED` without one.
+        model: version of the model set that verified the plan. Empty if the robot stands, `UNVERIFIED` if none did.
         predicted: set of the next measured state, if the decision had one.
         reservation: what is left of the robot's reservation, in a world with other robots.
         seen (n,): last measured state.
@@ -108,11 +108,11 @@ class BackupPlan:
 
     @property
     def plan_token(self) -> bytes:
-        """For the next request; empty: the service gave none."""
+        """The plan token for the next request. Empty if the service gave none."""
         return self._plan_tokens[0] if self._plan_tokens else b""
 
     def measured(self, state: Array) -> None:
-        """Store the measured state (n,) of a period before its request; ignore what is not finite or misshapen."""
+        """Store the measured state (n,) of a period before its request; ignore it if it is not finite or misshapen."""
         if state.shape == self.seen.shape and np.isfinite(state).all():
             self.seen, self._compare = state, True
 
@@ -130,8 +130,8 @@ class BackupPlan:
         """Commit to the plan of a decision; return the input to execute next.
 
         Args:
-            plan, model, predicted, verified, plan_tokens, reservation: of the decision.
-            score: of the window that ended with the request, if the filter gave one.
+            plan, model, predicted, verified, plan_tokens, reservation: those of the decision.
+            score: the score of the window that ended with the request, if the filter gave one.
             judges: whether the filter can score a window; if not, `past` gives none.
         """
         self._judged = judges

@@ -329,7 +329,7 @@ class TubeConstraints:
         return parts
 
     def kept_off(self, rows: int) -> Array:
-        """Return how far each row (rows,) keeps off by the clearance margin [m]. Limits, the last rows, do not."""
+        """Return the clearance margin (rows,) [m] by which each row is tightened: none for limits, the last rows."""
         kept_off = np.full(rows, self.clearance_margin)
         if self.limits is not None:
             kept_off[rows - len(self.limits) :] = 0.0
@@ -353,7 +353,7 @@ class TubeConstraints:
     def clear(self, request: Request, local_map: LocalMap, z: Array, margin: float) -> tuple[float, bool]:
         """Return the margin [m] for a report, and whether it is only a lower bound.
 
-        An obstacle beyond reach decides nothing, but it may be nearest to the tube. Then the lower bound is its
+        An obstacle beyond reach changes no decision, but may be nearest to the tube. Then the lower bound is its
         distance less the extent of the tube. margin [m]: to everything within reach.
         """
         if isinstance(local_map.unseen, shades.OccludedRegions) and margin >= ASIDE:

@@ -1,10 +1,10 @@
-"""`decide`: a proposed action in, a verified plan out (paper, algorithms 1 and 2; docs/method.md §4).
+"""Decide on a proposed action: return a verified plan (paper, algorithms 1 and 2; docs/method.md §4).
 
 The filter allows a proposal whose tube keeps the clearance margin to every obstacle. Where turning in place does not
 keep that margin, the proposal must not drive nearer. The filter replaces every other proposal by the closest input
-that keeps to this, even if the proposal's own tube is verified: a robot that stops nearer than the clearance margin
-may not be able to turn there. Such decisions are `for_clearance`. If no input keeps to it, the filter allows a
-verified proposal, and adjusts others to free space alone.
+that meets this rule, even if the proposal's own tube is verified: a robot that stops nearer than the clearance margin
+may not be able to turn there. Such decisions are `for_clearance`. If no input meets the rule, the filter allows a
+verified proposal. It replaces any other proposal by the closest input whose tube stays in free space.
 
 A decision is a pure function of the request and the model set. The filter stores nothing about a robot, so any replica
 can answer, and a log can be replayed.
@@ -69,13 +69,13 @@ class Filter:
 
     Attributes:
         tube: the exact tube, for the final check. The QP uses an outer tube (docs/method.md §2).
-        constraints: holds the tube of any plan against a map of the surroundings.
+        constraints: compares the tube of any plan with a map of the surroundings.
         in_place: bounds of z (2, nz), and the constraints for plans in place within them; None without such plans.
         standing (m,): inputs that leave the robot in place.
         translating (nz,): 1 for free inputs that move it, else 0.
         domain (2, r): recorded range of [x_0; input in force], with room for rounding.
         clearance_margin: distance to obstacles that the QP keeps [m].
-        reach: an obstacle farther away cannot decide anything [m].
+        reach: an obstacle farther away than this cannot change a decision [m].
         bound: the share of plans outside their tubes that the model set states.
         start: factor on the sets of a request without past window (see `OneStep.start`).
     """

@@ -46,13 +46,13 @@ class LocalMap:
 
     @property
     def parked(self) -> LocalMap:
-        """Return the map without what moves: a standing robot need not avoid it (passive safety, §8)."""
+        """Return the map without moving obstacles: a standing robot need not avoid them (passive safety, §8)."""
         unseen = None if self.unseen is not None and self.unseen.speed > 0.0 else self.unseen
         return replace(self, moving=None, unseen=unseen)
 
     @property
     def away(self) -> Array | None:
-        """The direction (d,), world, away from what is nearest to the start; None if nothing near has a direction."""
+        """The direction (d,), world, away from the nearest obstacle; None if no near obstacle has a direction."""
         ways = [escape_direction(self.near, self.start)[None]] if len(self.near) else []
         if isinstance(self.unseen, OccupiedCells):
             ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))

@@ -7,7 +7,7 @@ robot to the obstacle, `n·p <= b` keeps the robot off the obstacle at all of th
 
 O is convex and only translates, so the two ends suffice; r grows, so its last value suffices. Normals point from
 nominal positions (start, middle and end of each period up to this one) to the closest point of the moved shape. The
-plane that leaves both ends the most room is taken.
+filter takes the plane that leaves both ends the most room.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 
 @dataclass
 class DecisionRecord:
-    """What the filter learns during one decision, for its report."""
+    """The values that the filter collects during one decision, for its report."""
 
     started: int
     solver: str = ""
@@ -73,8 +73,8 @@ class Linearized:
 
     Attributes:
         constraints: the tube. planes: the half-spaces.
-        slack (rows,): what the rows leave for the plan.
-        kept_off (rows,) [m]: how far each row keeps off by the clearance margin.
+        slack (rows,): bound minus support of each row for the plan.
+        kept_off (rows,) [m]: the clearance margin of each row.
         kept: the rows with the clearance margin, once they are known.
     """
 
@@ -94,7 +94,7 @@ class PlanSearch:
     """The search for one decision.
 
     Attributes:
-        safety: the filter. record: what the search learns.
+        safety: the filter. record: the values for its report.
         local_map: the surroundings. z_0 (known,): regressors that are known. proposal (m,): the proposed input.
         before (m,): the input in force.
     """
@@ -164,7 +164,7 @@ class PlanSearch:
 
     @property
     def standing(self) -> Linearized:
-        """Turning in place, or standing where turns have their own tube, linearised."""
+        """The plan of turning in place, or of standing if turns have their own tube, linearised."""
         return self._around(self._staying[0])
 
     def _around(self, z: Array) -> Linearized:

@@ -2,7 +2,7 @@
 
 The candidates are slow inputs, each followed by braking. A candidate must not violate any row more than standing does.
 Of these, recovery takes the one with the lexicographically smallest violations at the end of the plan, the worst first.
-Otherwise a robot with a heading turns on the spot towards the open side. Recovery is never verified.
+If there is none, a robot with a heading turns on the spot towards the open side. Recovery is never verified.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]] 
 
 @dataclass(frozen=True)
 class Request:
-    """A request: what the filter must know to decide on one input.
+    """A request: all that the filter must know to decide on one proposal.
 
     >>> from brakeline import Filter, Obstacle
     >>> ground = Filter.load("ground")
@@ -62,7 +62,7 @@ class Request:
         other_reservations: the reservations of the other robots.
         observation: the input of a rival's networks; the filter does not need it.
         widening: factor on every set, at least 1 (docs/method.md §15).
-        past: the last periods of a plan's length, whose score the decision tells.
+        past: the last periods of a plan's length; the decision returns their score.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it. In joint space there is no space to describe: no request needs it.
         turn_aside: the filter turns a blocked robot towards the nearest direction in which it can drive on
@@ -122,7 +122,7 @@ class Decision:
         margin: distance of the tube to the nearest half-space [m], or to a limit in the limit's own unit. The margin
             of a failsafe may be negative although the plan is verified: an earlier decision verified it, but this
             margin starts from the new measurement.
-        at_least: the margin is only a lower bound, since nothing is within reach.
+        at_least: the margin is only a lower bound, since no obstacle is within reach.
         model: version of the model set.
         broken: number of moving obstacles that a sensor saw outside their bounds of motion.
         blocked_by: the constraint that the proposal violated, if it was not allowed.

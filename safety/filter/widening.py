@@ -1,6 +1,6 @@
-"""How much wider than stated the sets of a robot must be today (docs/method.md §15).
+"""Compute the factor by which the filter must widen a robot's sets at present (docs/method.md §15).
 
-A payload, a worn tyre or wind makes any model wrong for good. Whoever keeps the backup plan also keeps the last states
+A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
 """

@@ -1,1 +1,1 @@
-"""From recorded data to a model set: what a robot may do next, and how sure that is."""
+"""Fit model sets to recorded data: predictors of a robot's motion, with their error bounds."""

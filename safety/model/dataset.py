@@ -98,7 +98,7 @@ class Dataset:
         return sum(len(t.inputs) for t in self.trajectories)
 
     def steady(self) -> Dataset:
-        """Return the data set without the restless trajectories, which only mode one-step is fitted to."""
+        """Return the data set without the restless trajectories, which only mode one-step uses."""
         restless = int(self.about.get(RESTLESS, "0"))
         about = {name: value for name, value in self.about.items() if name != RESTLESS}
         return replace(self, trajectories=self.trajectories[: len(self.trajectories) - restless], about=about)

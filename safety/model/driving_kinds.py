@@ -19,13 +19,14 @@ RESTLESS_SHARE, JUMPING_SHARE = 0.3, 0.5  # of a plan's periods with a jump
 def driving_kinds(robot: Robot, z: Array, start: NDArray[np.int64]) -> dict[str, NDArray[np.bool_]]:
     """Return which windows (T,) belong to each kind of driving; a window may belong to several kinds.
 
-    A trained policy often holds an input at its bound. A random one seldom does, and "fast" is half the bound and more.
+    A trained policy often holds an input at its bound. A random one seldom does, and the kind "fast" begins at half of
+    the bound. So inputs at their bounds are a kind of their own.
 
     Args:
         robot: the robot.
         z (T, r + m + N·m): regressors with all inputs.
-        start (T, 2): trajectory and first period. The start of an episode are the plans that begin in its first
-            `horizon` periods, as long as the robot has no past window to send along.
+        start (T, 2): trajectory and first period. Plans that begin in the first `horizon` periods of an episode, while
+            the robot has no past window to send, belong to its start.
     """
     inputs = z[:, len(robot.regressor) :].reshape(len(z), -1, robot.action_dim)
     changes = np.diff(inputs, axis=1) / np.minimum(robot.high() - robot.low(), np.asarray(robot.action_slew))

@@ -70,7 +70,7 @@ class ModelSet:
 
     @property
     def first(self) -> ErrorBound:
-        """The bound for one period, which the next measurement is compared with."""
+        """The bound for one period, with which the filter compares the next measurement."""
         return self.steps[0]
 
     @cached_property

@@ -21,7 +21,7 @@ LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millim
 
 
 def spread_features(robot: Robot, z: Array, k: int) -> Array:
-    """Return what the half-widths after k periods grow with (T, q), for regressors z (T, r + m + N·m).
+    """Return the features (T, q) with which half-widths grow after k periods, for regressors z (T, r + m + N·m).
 
     These are the speeds, the input in force, and the means of the k inputs and of their jumps, each without its sign:
     with a slope for each input, minutes of driving would not determine a half-width. A jump is the first change, or the
@@ -88,8 +88,8 @@ class Shape:
     ) -> Shape:
         """Return the shape that holds the errors (T, N, n') and is tightest, on average, for plans as the filter has.
 
-        Driving that was recorded holds large inputs to the end of a window; plans brake. A stop from full speed counts
-        as much as `FULL_SPEED` of the recorded plans: those are fewest, and need the most room.
+        Recorded driving holds large inputs until the end of a window, while plans brake. A stop from full speed counts
+        as much as `FULL_SPEED` of the recorded plans: such stops are rare, and need the most room.
 
         Args:
             robot: the robot.

@@ -43,11 +43,11 @@ class FlightEstimatorBatch:
         return np.asarray(start + shares * (self._next[rows, None] - start))
 
     def path(self, rows: Rows, positions: Array) -> Array:
-        """Return what messages say of positions (rows, S, 3) [m] at even times of the period."""
+        """Return positions (rows, S, 3) [m], at even times of the period, as messages report them."""
         return _sent(positions + self.steps(rows, positions.shape[1])[..., :3])
 
     def read(self, rows: Rows, coordinates: Array, accelerations: Array) -> Array:
-        """Return the states (rows, 9) that messages tell at the end of the period.
+        """Return the states (rows, 9) that messages report at the end of the period.
 
         Args:
             coordinates (rows, 13 or more): true, as of `flight_kernels`.

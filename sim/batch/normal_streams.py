@@ -22,7 +22,7 @@ class NormalStreams:
         self._next = np.full(count, DRAWN)
 
     def begin(self, row: int, generator: np.random.Generator) -> None:
-        """Use this generator from now on. Nobody else may draw from it."""
+        """Use this generator from now on. No other code may draw from it."""
         self._generators[row] = generator
         self._next[row] = DRAWN
 

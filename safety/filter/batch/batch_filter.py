@@ -3,10 +3,10 @@
     batch = BatchFilter(Filter.load("ground"))
     answers = batch.decide(RequestArrays.of(requests))     # or arrays of your own; torch tensors may lie on a GPU
 
-The batch decides what it can verify as the single path does: proposals and inputs of a QP among obstacles that stand
-still. It leaves every other row to `Filter.decide`: a state outside the recorded domain, a proposal that is not finite,
-a plan that turns in place, a blocked robot that is to turn aside, a failsafe, a recovery, and every comparison that
-rounding could turn.
+The batch decides the rows whose answer is the proposal or the input of a QP, among obstacles that stand still. It
+leaves every other row to `Filter.decide`, the *single path*: a state outside the recorded domain, a proposal that is
+not finite, a plan that turns in place, a blocked robot that is to turn aside, a failsafe, a recovery, and every
+comparison whose result rounding could change.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class BatchFilter:
 
     Attributes:
         safety: the filter, which is also the single path.
-        covers: whether batches decide for this robot at all. A robot in joint space, with limits or with a feedback
-            has every request decided singly.
+        covers: whether batches decide for this robot at all. For a robot in joint space, with limits or with a
+            feedback, the single path decides every request.
     """
 
     def __init__(self, safety: Filter) -> None:

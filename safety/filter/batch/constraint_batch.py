@@ -52,7 +52,7 @@ class PlanBatch:
     Attributes:
         z (nz, B): regressors. path: predicted centers. sizes (L+N+1, B): magnitudes with widening.
         planes: the half-spaces, for each disc of the body.
-        slack (R, B) [m]: what the rows of all half-spaces leave.
+        slack (R, B) [m]: bound minus support of the rows of all half-spaces.
         extent (B,) [m]: distance from the measured position to the farthest point of the body in the tube.
     """
 
@@ -110,7 +110,7 @@ class ConstraintBatch:
         return found
 
     def slack(self, planes: list[PlaneBatch], path: PathBatch, sizes: Array) -> Array:
-        """Return what the half-spaces leave to tubes (R, B), R = ends · obstacles · discs."""
+        """Return the slack (R, B) of the half-spaces for the tubes, R = ends · obstacles · discs."""
         parts = []
         for (*_, first, ends), plane in zip(self.discs, planes, strict=True):
             positions = [path.outputs[:, first + i] for i in range(self.d)]
@@ -119,7 +119,7 @@ class ConstraintBatch:
         return parts[0] if len(parts) == 1 else self._xp.concat(parts)
 
     def extent(self, scene: SceneBatch, path: PathBatch, sizes: Array) -> Array:
-        """Return the distances (B,) [m] that no point of the body exceeds from its start."""
+        """Return bounds (B,) [m] on the distance of every point of the body from the start."""
         xp, L = self._xp, self.L
         width = xp.reshape(self._spans @ sizes[:L], (self.N, self.d, -1)) * path.stretch[:, None]
         corner = xp.abs(path.outputs[:, : self.d]) + width

@@ -24,7 +24,7 @@ class BlockingArrays:
 
     Attributes:
         obstacle (B,): index among the row's obstacles; -1: the tube leaves the visible space.
-        room, after (B,). normal, at (B, d): NaN where there is no half-space.
+        room, after (B,): see `BlockingConstraint`. normal, at (B, d): likewise; NaN if there is no half-space.
     """
 
     obstacle: Array
@@ -63,7 +63,7 @@ class DecisionArrays:
         scored (B,): whether the row has a score.
         steps (B,): number of steps of the solver.
         proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
-        blocked: what the proposals of adjusted rows violated.
+        blocked: the constraints that the proposals of adjusted rows violated.
         singly: the decisions of the rows that the single path decided, by row.
         obstacles: those of the requests.
         model: see `Decision`.

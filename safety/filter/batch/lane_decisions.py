@@ -1,4 +1,4 @@
-"""The decisions of a batch that need no single path, in lanes; the batch is last."""
+"""Decide the rows of a batch that need no `Filter.decide`, in lanes; the batch is last."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class LaneDecisions:
         self._lanes, self._numbers = (LANES, NUMBERS) if at_home else (LANES_ON_DEVICE, NUMBERS_ON_DEVICE)
 
     def decide(self, requests: RequestArrays, answers: dict[str, Any]) -> Array:
-        """Write what can be decided into `answers`; return which rows that is (B,)."""
+        """Write the decisions that the batch can make into `answers`; return which rows (B,) they are."""
         xp, B = self._xp, len(requests)
         decided = xp.zeros(B, dtype=xp.bool, device=self._device)
         rows = xp.nonzero(self._usable(requests))[0]

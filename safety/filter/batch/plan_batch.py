@@ -44,7 +44,7 @@ class BatchOutcome:
         inputs (B, m): to execute in the coming period.
         decided (B,): whether the row has a decision; without one, the robot follows its committed plan.
         answers: the decisions; None: the whole batch has none.
-        failure: why a row has no decision; empty: all have one.
+        failure: why a row has no decision. Empty if all rows have one.
     """
 
     inputs: Array
@@ -56,7 +56,7 @@ class BatchOutcome:
 class BackupPlanBatch:
     """The committed plans of B robots between two decisions, and the requests about them.
 
-    It holds for a robot in lockstep, without feedback and without reservations, in a batch with one filter. A row
+    It is for robots in lockstep, without feedback and without reservations, in a batch with one filter. A row
     without a valid decision follows its committed plan. If the filter raises an error, all rows do.
 
     Attributes:
@@ -126,7 +126,7 @@ class BackupPlanBatch:
     ) -> BatchOutcome:
         """Decide on proposals (B, m), and commit to the plans of the decisions.
 
-        observations (B, o): what a rival decides by; the filter does not need them.
+        observations (B, o): by which a rival decides; the filter does not need them.
         """
         finite = np.asarray(np.isfinite(actions).all(axis=1))
         proposals = np.where(finite[:, None], actions, self.input_in_force)

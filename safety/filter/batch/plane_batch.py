@@ -1,4 +1,4 @@
-"""Half-spaces beside the obstacles of a batch, and what they leave to a tube (docs/method.md §3); the batch is last.
+"""Half-spaces beside the obstacles of a batch, and their slack for a tube (docs/method.md §3); the batch is last.
 
 The twin of `shape_kernels.planes_beside`, `shape_kernels.roomiest_planes` and `halfspace_kernels.slack`.
 """
@@ -130,7 +130,7 @@ class EndBatch:
         return found
 
     def slack(self, planes: PlaneBatch, positions: Axes, stretch: Array, sizes: Array) -> Array:
-        """Return what the half-spaces leave (E, K, B).
+        """Return the slack (E, K, B) of the half-spaces.
 
         Args:
             planes: the half-spaces. positions: per axis (N, B), in the robot's frame. stretch (N, B).

@@ -102,7 +102,7 @@ class QPBatch:
 
         Returns:
             Free inputs (F, B), whether they solve the QP (B,), whether no input meets the rows (B,), steps (B,).
-            In a lane with neither, nothing is known.
+            If both are false in a lane, the solver found no answer.
         """
         xp = self._xp
         before = z_0[self.known - self._m :]

@@ -24,7 +24,7 @@ FEW = 24  # lanes, below which the single path is faster than a further step of 
 
 @dataclass(frozen=True)
 class LaneBatch:
-    """What a search knows of each robot.
+    """The inputs of a search, for each robot.
 
     Attributes:
         scene: the surroundings. z_0 (known, B): known regressors. proposal (m, B): within bounds and slew.
@@ -62,11 +62,11 @@ class ProposalBatch:
 
 @dataclass
 class CandidateBatch:
-    """What a search found.
+    """The results of a search.
 
     Attributes:
         z (nz, B): regressors of the verified plans. margin (B,) [m]: their margins.
-        allowed, adjusted, hopeless (B,): what was found. hopeless: no plan near the proposal is verified. A lane with
+        allowed, adjusted, hopeless (B,): the result. hopeless: no plan near the proposal is verified. A lane with
             none of the three is left to the single path.
         for_clearance (B,): the proposal is verified too.
         steps (B,): of the solver.

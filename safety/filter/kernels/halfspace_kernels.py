@@ -88,7 +88,7 @@ def slack(
     sizes: Array,
     z: Array,
 ) -> Array:
-    """Return what the rows (3) leave, bound - gradient z - spread sizes (n·E,), without building the rows.
+    """Return the slack of the rows (3), bound - gradient z - spread sizes (n·E,), without building the rows.
 
     sizes (L+N+1,): the tube's magnitudes under regressors z. NaN in a half-space or in z gives NaN.
     """
