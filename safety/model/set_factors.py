@@ -32,8 +32,9 @@ class SetFactors:
     def of(plan: Array, first: Array, kinds: dict[str, Mask], outside: float, same: bool = False) -> SetFactors:
         """Return the least factors that leave at most a share `outside` of the windows of every kind outside.
 
-        Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude: `plan` would
-        have to be several times as large for all driving. No plan of the filter jumps like this, so only `first` covers it.
+        Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude. For all
+        driving, `plan` would have to be several times as large. No plan of the filter jumps like this, so only `first`
+        covers it.
 
         Args:
             plan (T,), first (T,): scores of the windows, for both parts.
