@@ -12,7 +12,7 @@ Stored = Literal["executed", "both"]  # actions of a corrected step to learn fro
 
 @dataclass(frozen=True)
 class TD3Config:
-    """Settings of TD3."""
+    """Set the parameters of TD3."""
 
     hidden: tuple[int, ...] = (256, 256)
     """Give the hidden layers of actor and critics these widths."""

@@ -48,13 +48,13 @@ class CertifyCommand:
     """Fit and validate on this kind of driving: plan takes the windows that brake as the filter does, free takes every
     window, and auto takes every window if the others are too few."""
     few: bool = False
-    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each envelope is scaled
+    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each error bound is scaled
     by 1.5 instead of 1.15, as after `collect --url`."""
     outside: float = ModelConfig.outside
     """Let this share of the recorded plans leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""
     until_held: bool = False
-    """Widen each envelope until no held-out plan leaves its set, and no further."""
+    """Widen each error bound until no held-out plan leaves its set, and no further."""
     last: int = 20_000
     """Take this many steps from the end of a log."""
     use: bool = False

@@ -146,7 +146,7 @@ class PhysicsOptions:
     false_far: float = 0.0
     """Let this share of the beams of a scan pass through an obstacle."""
     ghosts: float = 0.0
-    """Let this share of the beams of a scan return from a point where nothing is."""
+    """Let this share of the beams of a scan return from a point in free space."""
     blind: float = 0.0
     """Hide a sector of this width behind the robot from the sensor [deg]."""
     late: int = 0
@@ -198,7 +198,7 @@ class BusOptions:
     """Listen beyond this machine without keys. Everyone who reaches the bus can then command the robots, and each
     Health message warns of it."""
     metrics: str = ""
-    """Serve /metrics (Prometheus), /live and /ready at PORT of this machine, or at HOST:PORT. Without it the process
+    """Serve /metrics (Prometheus), /live and /ready at PORT of this machine, or at HOST:PORT. By default the process
     serves none."""
 
     def bus(self) -> BusSettings:

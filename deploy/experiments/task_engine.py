@@ -50,13 +50,13 @@ def unsaid(name: str, text: str) -> None:
 
 @dataclass(frozen=True)
 class Engine:
-    """Choose what runs the parts of a study."""
+    """Choose where the parts of a study run."""
 
     workers: int = 1
     """Use this many processes of this machine at once, each on one core."""
     ray: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = ""
-    """Use a Ray cluster instead: local starts one on this machine, auto takes the running one, HOST:PORT takes
-    another's. A part whose machine dies runs again. Needs the extra ray."""
+    """Use a Ray cluster instead: local starts one on this machine, auto takes the running one, and HOST:PORT takes the
+    one at this address. A part whose machine dies runs again. You need the extra ray."""
 
     def completed(self, tasks: Sequence[T], runs: Path, say: Say = unsaid) -> Iterator[tuple[T, Any]]:
         """Run tasks, and yield each with its result once it is there.

@@ -21,7 +21,7 @@ LANDING_TIMEOUT = 120.0  # s
 
 @dataclass(frozen=True)
 class FirstFlightSettings:
-    """The first flight of a vehicle. These are options of `brakeline collect --url`."""
+    """Set the first flight of a vehicle, which `brakeline collect --url` flies."""
 
     minutes: float = 15.0
     """Fly for this long [min], without takeoff and landing."""
