@@ -1,4 +1,4 @@
-"""A base class for robots on the floor in MuJoCo: a subclass says how an input drives it and what speeds it has."""
+"""A base class for robots on the floor in MuJoCo: a subclass defines how inputs drive it, and returns its speeds."""
 
 from __future__ import annotations
 

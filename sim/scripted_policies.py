@@ -1,6 +1,6 @@
 """Scripted policies by name, and those of the ground robot; `brakeline.sim.quadrotor_policies` has the quadrotor's.
 
-They collect data, test the safety filter, and show what an arena allows.
+They collect data, test the safety filter, and show how well a robot can do in an arena.
 """
 
 from __future__ import annotations

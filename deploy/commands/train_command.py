@@ -20,7 +20,7 @@ STOPPED = 130  # exit status: the user stopped the run before its last step
 
 @dataclass(frozen=True)
 class TrainCommand(RunConfig):
-    """The options of `brakeline train`: the fields of RunConfig, and what a configuration does not hold."""
+    """The options of `brakeline train`: the fields of RunConfig, and options that a configuration does not hold."""
 
     steps: int = 0
     """Train for this many steps of each robot kind. 0 takes the steps of the experiment, of the resumed run, or of the

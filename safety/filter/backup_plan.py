@@ -66,11 +66,11 @@ class BackupPlan:
     [0.1, 0.0]
 
     Attributes:
-        plan (N, m): rest of the plan. Its first row is what to execute without a better answer; in real time, the input
-            that is being executed.
+        plan (N, m): rest of the plan. Its first row is the input to execute if no better answer comes; in real time, it
+            is the input that the robot is executing.
         model: version of the model set that verified the plan. Empty if the robot stands, `UNVERIFIED` if none did.
         predicted: set of the next measured state, if the decision had one.
-        reservation: what is left of the robot's reservation, in a world with other robots.
+        reservation: the rest of the robot's reservation, in a world with other robots.
         seen (n,): last measured state.
         widening: the last states and inputs, and the factor on the sets of the next decision.
         turn_aside: its requests let the filter turn a blocked robot aside (`Request.turn_aside`).

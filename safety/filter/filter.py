@@ -207,9 +207,9 @@ class Filter:
         """Decide on many requests at once: arrays in, arrays out, with the batch first.
 
         Every decision is of the kind that `decide` gives, and its inputs differ by less than 1e-6. The batch verifies
-        its plans with the same tubes and half-spaces, and leaves to `decide` what it does not cover or what rounding
-        could turn (docs/performance.md). The arrays may be NumPy's, or torch tensors on any device; the answers are of
-        the same namespace and on the same device.
+        its plans with the same tubes and half-spaces. It leaves to `decide` the rows that it does not cover, or whose
+        result rounding could change (docs/performance.md). The arrays may be NumPy's, or torch tensors on any device;
+        the answers are of the same namespace and on the same device.
 
         >>> from brakeline import Filter, Obstacle, ObstacleArrays, RequestArrays, Shapes
         >>> ground, rows = Filter.load("ground"), 2

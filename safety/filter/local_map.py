@@ -1,4 +1,4 @@
-"""The space within reach of a robot, from what a request says about it (docs/method.md §3, §8-§10)."""
+"""The space within reach of a robot, as its request describes it (docs/method.md §3, §8-§10)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def local_map(robot: Robot, request: Request, reach: float, turn: Array, occlude
     """Return the map of a request.
 
     Args:
-        robot: the robot. request: what it asks.
+        robot: the robot. request: its request.
         reach [m]: radius of the map. turn (d, d): rotation from the robot's frame to the world.
         occluded: the shadows of the request's range image, if it has one.
     """

@@ -239,7 +239,7 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
 
 
 def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationReport:
-    """State what the calibration of a model set of mode one-step says (docs/method.md §13, §14).
+    """Return the statement of a model set of mode one-step, from its calibration (docs/method.md §13, §14).
 
     Every window was predicted without its fold. The bounds at 99 % confidence count windows that do not overlap: plans
     for `bound_plan`, periods for `bound_step`.

@@ -133,7 +133,7 @@ class DecisionArrays:
         )
 
     def _blocking(self, index: int) -> BlockingConstraint:
-        """Return what the proposal of an adjusted row violated."""
+        """Return the constraint that the proposal of an adjusted row violated."""
         blocked = self.blocked
         obstacle, room, after = (part[index] for part in (blocked.obstacle, blocked.room, blocked.after))
         by = SIGHT if int(obstacle) < 0 else self.obstacles.of_row(index).kind(int(obstacle))
