@@ -7,7 +7,8 @@ STAMP := .venv/.installed
 define COMPILE
 $(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels' & \
 	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare(); \
-		import brakeline.sim.kernels.flight_kernels as flight, brakeline.sim.kernels.ray_kernels; flight.prepare()' && wait $$!
+		import brakeline.sim.kernels.flight_kernels as flight; flight.prepare(); \
+		import brakeline.sim.kernels.arena_kernels, brakeline.sim.kernels.ray_kernels' && wait $$!
 endef
 
 .PHONY: demo setup test test-fast check style types compiled unit bench messages docs three safety-gymnasium bullet-safety-gym safe-control-gym clean

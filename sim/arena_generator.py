@@ -8,23 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import NoArena, UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
 from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
+from brakeline.sim.grid_planner import nearest_distances
 from brakeline.sim.traffic import Crowd
 
 ATTEMPTS = 1000  # arenas drawn before giving up
 CANDIDATES = 12  # drawn for each obstacle; the first that fits stays
 POINTS = 64  # drawn at once for start, goal and moving obstacles
-CORNERS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (0.0, 0.0)])  # in half edges
 MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the start
+
+# Of k obstacles in the plane
+Candidates = tuple[Array, Array, Array]  # positions (k, 2), sizes (k, 1 or 2), yaws (k,)
+Outlines = tuple[Array, Array, Array, Array]  # as of `Shapes`: center (k, 2), axes (k, 2, 2), half (k, 2), rho (k,)
 
 
 def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
@@ -108,7 +111,7 @@ def _fleet_ends(
         if (np.linalg.norm(starts - goals, axis=1) < kind.goal_distance).any():
             return None
     for points, least in ((starts, apart), (goals, apart + 2.0 * kind.goal_radius)):
-        if (shapes.distance(points).min(axis=0) < clear).any():
+        if (nearest_distances(shapes, points) < clear).any():
             return None
         between = np.linalg.norm(points[:, None] - points, axis=-1) + np.diag(np.full(size, np.inf))
         if between.min() < (least if kind.ring is None else apart):
@@ -157,16 +160,20 @@ def _rooms(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> Iterator[
 
 def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obstacle, ...] | None:
     """Draw obstacles with gaps between their outlines, then the room's boundary; None if too few obstacles fit."""
-    placed, outlines = list[Obstacle](), Outlines.of(room_boundary(kind.half_width, None))
+    from brakeline.sim.kernels.arena_kernels import first_fitting
+
+    placed = list[Obstacle]()
+    outlines: Outlines = Shapes.of(room_boundary(kind.half_width, None), dim=2).parts[:4]
     least = 2.0 * robot.footprint + kind.gap
     for shape, (few, many) in ((BOX, kind.boxes), (CYLINDER, kind.cylinders), (SPHERE, kind.spheres)):
         for i in range(int(rng.integers(few, many, endpoint=True))):
             candidates = _draw_candidates(shape, kind, least, rng)
-            drawn = Outlines.of(candidates)
-            fitting = np.flatnonzero(drawn.gaps(outlines) >= least)
-            if len(fitting):
-                placed.append(candidates[fitting[0]])
-                outlines = outlines.joined(drawn.take(fitting[:1]))
+            drawn = _outlines(shape, candidates)
+            fitting = first_fitting(*drawn, *outlines, least)
+            if fitting >= 0:
+                position, size, yaw = (values[fitting].tolist() for values in candidates)
+                placed.append(Obstacle(shape, tuple(position), tuple(size), yaw))
+                outlines = _joined(outlines, drawn, fitting)
             elif i < few:
                 return None
     if kind.height is not None:
@@ -174,8 +181,8 @@ def _place(kind: ArenaKind, rng: np.random.Generator, robot: Robot) -> tuple[Obs
     return (*placed, *room_boundary(kind.half_width, kind.height))
 
 
-def _draw_candidates(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> list[Obstacle]:
-    """Draw outlines of obstacles at least `least` m from the walls; corners of boxes may be nearer."""
+def _draw_candidates(shape: str, kind: ArenaKind, least: float, rng: np.random.Generator) -> Candidates:
+    """Draw obstacles in the plane at least `least` m from the walls; corners of boxes may be nearer."""
     low, high = kind.edge if shape == BOX else kind.radius if shape == CYLINDER else kind.ball
     shares = rng.random((CANDIDATES, 5 if shape == BOX else 3))
     sizes = low + (high - low) * shares[:, : 2 if shape == BOX else 1]
@@ -183,9 +190,25 @@ def _draw_candidates(shape: str, kind: ArenaKind, least: float, rng: np.random.G
     if shape == BOX and kind.square:
         sizes[:, 1] = sizes[:, 0]
     within = (kind.half_width - least - sizes.min(axis=1) * (0.5 if shape == BOX else 1.0))[:, None]
-    positions = -within + 2.0 * within * shares[:, -2:]
-    columns = positions.tolist(), sizes.tolist(), yaws.tolist()
-    return [Obstacle(shape, tuple(p), tuple(size), yaw) for p, size, yaw in zip(*columns, strict=True)]
+    return -within + 2.0 * within * shares[:, -2:], sizes, yaws
+
+
+def _outlines(shape: str, candidates: Candidates) -> Outlines:
+    """Return the outlines of candidates."""
+    positions, sizes, yaws = candidates
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    axes = np.stack((cos, -sin, sin, cos), axis=-1).reshape(-1, 2, 2)
+    if shape == BOX:
+        return positions, axes, 0.5 * sizes, np.zeros(len(yaws))
+    return positions, axes, np.zeros_like(positions), sizes[:, 0].copy()
+
+
+def _joined(outlines: Outlines, others: Outlines, row: int) -> Outlines:
+    """Return outlines and one row of others."""
+    center, axes, half, rho = (
+        np.concatenate((before, new[row, None])) for before, new in zip(outlines, others, strict=True)
+    )
+    return center, axes, half, rho
 
 
 def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generator) -> Obstacle:
@@ -198,57 +221,6 @@ def _lift(plan: Obstacle, kind: ArenaKind, height: float, rng: np.random.Generat
     box_height = float(rng.uniform(*kind.tall))
     z = height - 0.5 * box_height if rng.random() < 0.5 else 0.5 * box_height
     return Obstacle(BOX, (*plan.position, z), (*plan.size, box_height), plan.yaw)
-
-
-@dataclass(frozen=True)
-class Outlines:
-    """The plans of k obstacles: rectangles (of a disc: its centre), grown by a radius.
-
-    Attributes:
-        center (k, 2), half (k, 2), radius (k,): m. axes (k, 2, 2): world from local.
-        corners (k, 5, 2): m, the corners and the centre.
-    """
-
-    center: Array
-    axes: Array
-    half: Array
-    radius: Array
-    corners: Array
-
-    @staticmethod
-    def of(obstacles: Sequence[Obstacle]) -> Outlines:
-        """Stack the outlines of obstacles in the plane."""
-        shapes = Shapes.of(obstacles, dim=2)
-        corners = (CORNERS * shapes.half[:, None]) @ shapes.axes.swapaxes(1, 2) + shapes.center[:, None]
-        return Outlines(shapes.center, shapes.axes, shapes.half, shapes.rho, corners)
-
-    def take(self, rows: NDArray[np.intp]) -> Outlines:
-        """Return some of the outlines."""
-        return Outlines(self.center[rows], self.axes[rows], self.half[rows], self.radius[rows], self.corners[rows])
-
-    def joined(self, others: Outlines) -> Outlines:
-        """Return these outlines and others."""
-        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
-        return Outlines(*(np.concatenate(pair) for pair in pairs))
-
-    def gaps(self, others: Outlines) -> Array:
-        """Return the distance (k,) [m] from each outline to the nearest other; overlap: <= 0.
-
-        Two disjoint convex polygons are closest at a corner of one of them, so it measures the corners of each.
-        """
-        between = np.minimum(self._from_corners(others), others._from_corners(self).T)
-        return np.asarray((between - self.radius[:, None] - others.radius).min(axis=1))
-
-    def _from_corners(self, others: Outlines) -> Array:
-        """Return the least distance (k, o) [m] from the corners of each outline to the rectangle of each other."""
-        away = (self.corners[:, None] - others.center[:, None]) @ others.axes
-        beyond = np.maximum(np.abs(away) - others.half[:, None], 0.0)
-        return np.asarray(np.sqrt((beyond * beyond).sum(axis=-1)).min(axis=-1))
-
-
-def gaps(candidates: Sequence[Obstacle], others: Sequence[Obstacle]) -> Array:
-    """Return the distance (k,) [m] from each candidate (in the plane, no wall) to the nearest other; overlap: <= 0."""
-    return Outlines.of(candidates).gaps(Outlines.of(others))
 
 
 def _start_and_goal(
@@ -267,4 +239,4 @@ def _free_points(
     """Draw points in a room; return those (k, d), at most `POINTS`, with a clearance [m] from every shape."""
     low, high = np.array(bounds).T
     points = rng.uniform(low, high, (POINTS, len(low)))
-    return np.asarray(points[shapes.distance(points).min(axis=0) >= clearance])
+    return np.asarray(points[nearest_distances(shapes, points) >= clearance])

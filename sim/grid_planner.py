@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 CELL = {2: 0.05, 3: 0.625}  # m, edge of a cell in the plane and in space
 MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms have larger cells
-LATTICE = 5  # waypoints along x and along y of a room, for paths of two straight lines
-MOST_WAYPOINTS = 10  # tried before the search for a path
-ROUNDING = 1e-6  # m, more than the rounding errors of a distance
 
 
 class ClearanceMap:
@@ -50,7 +47,7 @@ class ClearanceMap:
     @cached_property
     def clearance(self) -> Array:
         """The distances [m], one index per axis, x first."""
-        return nearest_distances(self._shapes, *self._axes).reshape(self.shape)
+        return nearest_distances(self._shapes, self.centres).reshape(self.shape)
 
     @cached_property
     def centres(self) -> Array:
@@ -83,102 +80,20 @@ class ClearanceMap:
         If two cell centres h = cell·√d apart are both at least c from a point, then the line between them is at least
         √(c² − h²/4) from it.
         """
+        from brakeline.sim.kernels.arena_kernels import connected
+
         least = float(np.hypot(clearance, 0.5 * self.cell * np.sqrt(self.dim)))
-        if self._connected_by_lines(start, goal, least):
-            return True
-        free = np.pad(self.clearance >= least, 1)  # outside is solid
-        first, last = np.ravel_multi_index(tuple((self.index(np.array([start, goal])) + 1).T), free.shape)
-        neighbours = np.array(list(product((-1, 0, 1), repeat=self.dim))) @ free.strides  # a cell is a byte
-        to_reach, front = free.ravel(), np.array([first])
-        number = np.zeros(free.size, np.intp)
-        if not (to_reach[first] and to_reach[last]):
-            return False
-        while to_reach[last] and len(front):  # breadth-first search
-            front = (front[:, None] + neighbours).ravel()
-            front = front[to_reach[front]]
-            to_reach[front] = False
-            numbers = np.arange(len(front))
-            number[front] = numbers
-            front = front[number[front] == numbers]  # without duplicates
-        return bool(not to_reach[last])
-
-    def _connected_by_lines(self, start: Sequence[float], goal: Sequence[float], least: float) -> bool:
-        """Return whether the cells along a line, or along two lines that meet at a waypoint, keep a clearance [m].
-
-        The breadth-first search finds such a path too, but it needs the clearance of all cells of the room.
-        """
-        ends = self.index(np.array([start, goal]))
-        if self._line_is_free(ends[0], ends[1], least):
-            return True
-        plan = [np.linspace(0.0, n - 1.0, LATTICE + 2)[1:-1].astype(np.intp) for n in self.shape[:2]]
-        waypoints = np.array([(x, y, *ends[0, 2:]) for x, y in product(*plan)])
-        detour = sum(np.linalg.norm(waypoints - end, axis=1) for end in ends)
-        for waypoint in waypoints[np.argsort(detour, kind="stable")[:MOST_WAYPOINTS]]:
-            if self._line_is_free(ends[0], waypoint, least) and self._line_is_free(waypoint, ends[1], least):
-                return True
-        return False
-
-    def _line_is_free(self, first: NDArray[np.intp], last: NDArray[np.intp], least: float) -> bool:
-        """Return whether the cells of a line keep a clearance [m]; each (d,) is a neighbour of the one before."""
-        steps = max(int(np.abs(last - first).max()), 1)
-        cells = np.floor(first + np.arange(steps + 1)[:, None] * ((last - first) / steps) + 0.5).astype(np.intp)
-        points = np.column_stack([axis[cells[:, i]] for i, axis in enumerate(self._axes)])
-        return bool((_distances(self._shapes, points) >= least + ROUNDING).all())
+        neighbours = np.array([step for step in product((-1, 0, 1), repeat=self.dim) if any(step)])
+        first, last = self.index(np.array([start, goal]))
+        size = np.array(self.shape)
+        return connected(*self._shapes.parts, self.low, self.cell, size, neighbours, first, last, least)
 
 
-def nearest_distances(shapes: Shapes, x: Array, y: Array, heights: Array | None = None) -> Array:
-    """Return the distances (p·q,) or (p·q, r) to the nearest shape from a grid with x (p,), y (q,) and heights (r,).
+def nearest_distances(shapes: Shapes, points: Array) -> Array:
+    """Return the distance (k,) [m] from each point (k, d) to the nearest shape; 0 inside one."""
+    from brakeline.sim.kernels import arena_kernels
 
-    This is `Shapes.distance`, ten times faster for many points: shapes turn about the vertical only, so the distances
-    in the plan are the same for all heights.
-    """
-    cells = len(x) * len(y)
-    least = np.full(cells if heights is None else (cells, len(heights)), np.inf)
-    square = least.copy()  # squared distance to all shapes but balls in space, for one common root
-    scratch = np.empty_like(least)
-    for center, axes, half, rho, rounded in zip(
-        shapes.center, shapes.axes, shapes.half, shapes.rho, shapes.round, strict=True
-    ):
-        along, across = (_beyond(x - center[0], y - center[1], axes[:, i], half[i]) for i in (0, 1))
-        if heights is None:  # only where the shape may be nearer than those before: a root takes the most time
-            nearer = np.flatnonzero(np.maximum(along, across) - rho < least)
-            least[nearer] = np.minimum(least[nearer], np.hypot(along[nearer], across[nearer]) - rho)
-            continue
-        beside = np.hypot(along, across)
-        above = np.maximum(np.abs(heights - center[2]) - half[2], 0.0)
-        ball = rho > 0.0 and rounded[2] > 0.0
-        np.add.outer((beside if ball else np.maximum(beside - rho, 0.0)) ** 2, above**2, out=scratch)
-        if ball:
-            np.minimum(least, np.sqrt(scratch, out=scratch) - rho, out=least)
-        else:
-            np.minimum(square, scratch, out=square)
-    if heights is not None:
-        np.minimum(least, np.sqrt(square), out=least)
-    return np.asarray(np.maximum(least, 0.0))
-
-
-def _distances(shapes: Shapes, points: Array) -> Array:
-    """Return the distances (k,) [m] from points (k, d) to the nearest shape, like `nearest_distances`."""
-    away = points[:, None] - shapes.center
-    x, y = away[..., 0], away[..., 1]
-    beyond = [
-        np.maximum(np.abs(x * shapes.axes[:, 0, i] + y * shapes.axes[:, 1, i]) - shapes.half[:, i], 0.0) for i in (0, 1)
-    ]
-    beside = np.hypot(*beyond)
-    if points.shape[1] == 2:
-        return np.asarray((beside - shapes.rho).min(axis=1))
-    above = np.maximum(np.abs(away[..., 2]) - shapes.half[:, 2], 0.0)
-    ball = (shapes.rho > 0.0) & (shapes.round[:, 2] > 0.0)
-    grown = np.where(ball, 0.0, shapes.rho)
-    return np.asarray((np.hypot(np.maximum(beside - grown, 0.0), above) - (shapes.rho - grown)).min(axis=1))
-
-
-def _beyond(x: Array, y: Array, axis: Array, half: float) -> Array:
-    """Return how far (p·q,) [m] each point of a grid lies beyond a rectangle along one of its axes."""
-    away = np.add.outer(x * axis[0], y * axis[1]).ravel()
-    np.abs(away, out=away)
-    away -= half
-    return np.asarray(np.maximum(away, 0.0, out=away))
+    return arena_kernels.nearest_distances(*shapes.parts, np.ascontiguousarray(points))
 
 
 class Routes:

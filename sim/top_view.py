@@ -31,7 +31,6 @@ class TopView:
         pixel = max(right - left, top - bottom) / PIXELS  # m
         x: Array = left + pixel * (np.arange(round((right - left) / pixel), dtype=np.float64) + 0.5)
         y: Array = top - pixel * (np.arange(round((top - bottom) / pixel), dtype=np.float64) + 0.5)
-        self._axes = x, y
         self._points: Array = np.stack(np.meshgrid(x, y), axis=-1)  # (H, W, 2)
         self._background = self._draw_map(0.0) if arena.dim == 2 else None
 
@@ -60,9 +59,10 @@ class TopView:
         return image
 
     def _paint(self, image: Image, colour: tuple[int, int, int], shapes: Shapes, height: float) -> None:
-        heights = (np.array([height]),) if self._arena.dim == 3 else ()
-        distances = nearest_distances(shapes, *self._axes, *heights)
-        image[distances.reshape(image.shape[1::-1]).T <= 0.0] = colour
+        points = self._points.reshape(-1, 2)
+        if self._arena.dim == 3:
+            points = np.column_stack((points, np.full(len(points), height)))
+        image[nearest_distances(shapes, points).reshape(image.shape[:2]) <= 0.0] = colour
 
     def _distance_to(self, point: Array) -> Array:
         return np.asarray(np.linalg.norm(self._points - point, axis=-1))

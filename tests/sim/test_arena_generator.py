@@ -13,8 +13,9 @@ from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import arena_kind, draw_arena, gaps
+from brakeline.sim.arena_generator import arena_kind, draw_arena
 from tests.robots import GROUND, QUADROTOR, ROBOTS
+from tests.sim.outline_twin import gaps
 
 ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in ROBOTS[robot].task.arenas]
 each_arena = pytest.mark.parametrize(("robot", "name"), ALL, ids=[f"{robot.name}-{name}" for robot, name in ALL])
@@ -145,14 +146,3 @@ def test_an_unknown_arena_is_refused_with_the_names_that_exist() -> None:
         arena("moon", 0)
     with pytest.raises(UnknownName, match="default, dense, tall"):
         arena("open", 0, QUADROTOR)
-
-
-def test_gaps_between_shapes_are_exact() -> None:
-    crate = Obstacle(BOX, (0.0, 0.0), (2.0, 1.0))
-    assert gaps([crate], [pillar(2.0, 0.0, 0.5)])[0] == pytest.approx(0.5)
-    assert gaps([pillar(2.0, 0.0, 0.5)], [crate])[0] == pytest.approx(0.5)
-    turned = Obstacle(BOX, (0.0, 2.0), (1.0, 1.0), yaw=np.pi / 4)
-    assert gaps([crate], [turned])[0] == pytest.approx(1.5 - np.sqrt(0.5))  # a corner over an edge
-    assert gaps([turned], [crate])[0] == pytest.approx(1.5 - np.sqrt(0.5))
-    assert gaps([crate], [crate])[0] <= 0.0
-    assert gaps([crate], [Obstacle(WALL, (3.0, 0.0), yaw=np.pi)])[0] == pytest.approx(2.0)
