@@ -12,14 +12,14 @@ from brakeline.compilation import compiled
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Of one obstacle, as of `Shapes`: axes, half, rho, round; then the ray's start from its center, and its direction
-SHAPE_AND_RAY = "f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f8[::1]"
+# Of one obstacle, as of `Shapes`: axes, half, rho, round; then the ray: its start from the center, direction and length
+SHAPE_AND_RAY = "f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], f8"
 SHAPES = "f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"  # center, axes, half, rho, round: `Shapes`
 
 
 @compiled(f"f8({SHAPE_AND_RAY})")
-def _distance(axes: Array, half: Array, rho: float, rounded: Array, away: Array, beam: Array) -> float:
-    """Return the distance along a unit beam to one obstacle, or infinity.
+def _distance(axes: Array, half: Array, rho: float, rounded: Array, away: Array, beam: Array, far: float) -> float:
+    """Return the distance along a unit beam to one obstacle, or infinity if the beam misses it or is too short.
 
     The obstacle is what is common to a slab along each flat axis and a ball across its rounded axes. From inside it,
     the beam ends where it leaves.
@@ -36,6 +36,8 @@ def _distance(axes: Array, half: Array, rho: float, rounded: Array, away: Array,
         elif way != 0.0:
             a, b = (-half[i] - place) / way, (half[i] - place) / way
             enters, leaves = max(enters, min(a, b)), min(leaves, max(a, b))
+            if leaves < 0.0 or enters > far:
+                return math.inf
         elif abs(place) > half[i]:
             return math.inf
     under = along * along - square * beside
@@ -63,19 +65,18 @@ def cast(
     for n in range(len(rows)):
         row = rows[n]
         for slot in range(count[row]):
-            away = origins[n] - center[row, slot]
-            far, reach = 0.0, rho[row, slot]
+            away, its_half = origins[n] - center[row, slot], half[row, slot]
+            its_axes, its_rho, its_rounded = axes[row, slot], rho[row, slot], rounded[row, slot]
+            square, reach = 0.0, its_rho
             for i in range(d):
-                far += away[i] * away[i]
-                reach = math.hypot(reach, half[row, slot, i])
-            outside = far - reach * reach  # of the ball around the obstacle, if positive
+                square += away[i] * away[i]
+                reach = math.hypot(reach, its_half[i])
+            outside = square - reach * reach  # of the ball around the obstacle, if positive
             for k in range(beams.shape[1]):
                 towards = 0.0
                 for i in range(d):
                     towards -= away[i] * beams[n, k, i]
                 if outside > 0.0 and (towards < 0.0 or towards * towards < outside or towards - reach > ranges[n, k]):
                     continue  # the beam misses the ball, or ends before it
-                distance = _distance(
-                    axes[row, slot], half[row, slot], rho[row, slot], rounded[row, slot], away, beams[n, k]
-                )
+                distance = _distance(its_axes, its_half, its_rho, its_rounded, away, beams[n, k], ranges[n, k])
                 ranges[n, k] = min(ranges[n, k], distance)
