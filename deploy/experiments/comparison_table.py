@@ -29,6 +29,7 @@ NAMES = {name: method.label for name, method in METHODS.items()}
 PAPER = Path(__file__).with_name("paper.json")
 WINDOW = 50  # training episodes per goal rate
 LEARNED = 0.9  # the goal rate that counts as learned
+THIRDS = tuple(f"goal rate, {third} third" for third in ("first", "second", "last"))  # of a training
 TOUCHED = ("run into while moving", "run into while standing")  # the table's names of CONTACTS
 
 
@@ -81,7 +82,21 @@ def training_rows(results: Sequence[Result]) -> Row:
         "interventions": ratio(values["interventions"], values["steps"]),
         "pre-training samples": 0 if model is None else int(model["samples"]),
         "pre-training collisions": 0 if model is None else int(model["collisions"]),
+        **_goals_by_third(trainings),
     }
+
+
+def _goals_by_third(trainings: Sequence[Result]) -> Row:
+    """Return the goal rates of the episodes that ended in each third of the steps, which show where learning ends.
+
+    A rate is None if a training has no episode that ended in this third.
+    """
+    goals: dict[str, list[Array]] = {row: [] for row in THIRDS}
+    for training in trainings:
+        third = np.ceil(3.0 * spans(training["episodes"])[1] / training["steps"])
+        for number, row in enumerate(THIRDS, start=1):
+            goals[row].append(np.array(training["episodes"]["goal"])[np.minimum(third, 3.0) == number])
+    return {row: rate(seeds) if all(map(len, seeds)) else None for row, seeds in goals.items()}
 
 
 def _by_column(trials: Sequence[Result]) -> dict[str, list[list[float]]]:
@@ -143,12 +158,14 @@ def without_times(value: Any) -> Any:
     return value
 
 
-PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED)
+PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED, *THIRDS)
 DIGITS = {"mean speed [m/s]": ".3g", "max speed [m/s]": ".3g", "decision [ms]": ".2f", "its std [ms]": ".2f"}
 
 
 def written(name: str, value: Any) -> str:
     """Format a figure for the table, with its interval in brackets."""
+    if value is None:
+        return "–"
     percent = name in PERCENT
     digits, factor, unit = (".1f", 100.0, " %") if percent else (DIGITS.get(name, ".0f"), 1.0, "")
     if isinstance(value, MeanEstimate):
@@ -197,7 +214,8 @@ def markdown(figures: dict[str, Any]) -> str:
         "",
         "Before training, the methods knew the robot from the recorded periods in the row *pre-training samples*. If "
         f"a seed did not reach 90 % of goals, {figures['steps']} counts as its steps to 90 %. Ours gets obstacles from "
-        "the arena's map, as do CBF-QP and PSF. SAILR and SECAS decide by the rays that the policy observes.",
+        "the arena's map, as do CBF-QP and PSF. SAILR and SECAS decide by the rays that the policy observes. A goal "
+        "rate of a third is of the episodes that ended in this third of the training steps.",
         "",
     ]
     for part, methods in figures["parts"].items():

@@ -19,7 +19,16 @@ from brakeline.deploy.experiments.comparison_cells import (
     quick,
 )
 from brakeline.deploy.experiments.comparison_plots import learning_curves, seeds_as_points
-from brakeline.deploy.experiments.comparison_table import markdown, plain, steps_to_learn, table, without_times
+from brakeline.deploy.experiments.comparison_table import (
+    THIRDS,
+    _goals_by_third,
+    markdown,
+    plain,
+    steps_to_learn,
+    table,
+    without_times,
+    written,
+)
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.learner.learner_config import TD3Config
@@ -267,3 +276,14 @@ def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():
     assert steps_to_learn({"goal": goals, "steps": steps}, 5000) == 10 * (30 + 45)
     assert steps_to_learn({"goal": [0] * 130, "steps": steps}, 5000) == 5000
     assert steps_to_learn({"goal": [1] * 10, "steps": [10] * 10}, 5000) == 5000, "too few episodes to tell"
+
+
+def test_the_goals_of_training_are_counted_in_thirds_of_the_steps():
+    def trained(goals, ends):
+        return {"steps": 300, "episodes": {"goal": goals, "steps": ends, "begin": [0] * len(ends), "end": ends}}
+
+    ends = [100, 101, 200, 250, 308]  # in a batch, the last episode may end after the last step
+    rates = _goals_by_third([trained([0, 1, 0, 1, 1], ends), trained([1, 1, 1, 0, 1], ends)])
+    assert [rates[row].seeds for row in THIRDS] == [(0.0, 1.0), (0.5, 1.0), (1.0, 0.5)]
+    empty = _goals_by_third([trained([1, 1], [10, 120])])
+    assert empty[THIRDS[2]] is None and written(THIRDS[2], None) == "–" and plain(None) is None
