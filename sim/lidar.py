@@ -1,15 +1,14 @@
-"""Simulate a lidar: ranges along a fan of beams, cast at the obstacles of an arena by MuJoCo, with noise."""
+"""Simulate a lidar: ranges along a fan of beams, cast at the obstacles of an arena, with noise."""
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 
-from brakeline.messaging.obstacle import Array, rotate
+from brakeline.messaging.obstacle import Array, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import cut_normal
-from brakeline.sim.mujoco_obstacles import HEIGHT, MoverBodies, map_model
+from brakeline.sim.kernels.ray_kernels import cast
 
 
 class Lidar:
@@ -23,7 +22,7 @@ class Lidar:
     def __init__(
         self, arena: Arena, rays: LidarRays, noise: float = 0.0, rng: np.random.Generator | None = None
     ) -> None:
-        """Build the model of the arena for ray casting.
+        """Mount the lidar, with the moving obstacles at their first positions.
 
         Args:
             rays: directions in the frame of the robot's heading, with the arena's dimension.
@@ -31,19 +30,16 @@ class Lidar:
             rng: the source of the noise. Without it, ranges are exact.
         """
         self.rays, self.max_range, self._noise, self._rng = rays, rays.range, noise, rng
-        beams = np.zeros((len(rays.directions), 3))
-        beams[:, : arena.dim] = rays.directions
-        self._beams = beams
-        self._height = 0.5 * HEIGHT if arena.dim == 2 else None
-        self._model, self._data = map_model(arena)
-        self._movers = MoverBodies(self._model, self._data, arena.crowd)
-        self._hit, self._ranges = np.empty(len(beams), np.int32), np.empty(len(beams))
+        self._arena = arena
+        self._obstacles = [part[None] for part in arena.shapes.parts]  # of one arena, as `cast` takes those of many
+        self.move_obstacles(0.0)
 
     def move_obstacles(self, time: float) -> None:
         """Move the moving obstacles to their positions at a time [s]."""
-        if self._movers:
-            self._movers.place(time)
-            mujoco.mj_kinematics(self._model, self._data)
+        if self._arena.crowd is not None:
+            moving = Shapes.of(self._arena.crowd.obstacles(max(time, 0.0)), self._arena.dim)
+            pairs = zip(self._arena.shapes.parts, moving.parts, strict=True)
+            self._obstacles = [np.concatenate(pair)[None] for pair in pairs]
 
     def cast(self, origin: Array, turn: float | Array = 0.0) -> Array:
         """Return the true ranges (R,) [m] from a point (d,) in free space.
@@ -55,17 +51,17 @@ class Lidar:
             origin: (d,) m.
             turn: from the robot's frame to the world: a heading [rad] or a rotation matrix (3, 3).
         """
+        beams = self.rays.directions
         if isinstance(turn, np.ndarray):
-            beams = self._beams @ turn.T
-        else:
-            beams = rotate(self._beams, turn) if turn else self._beams
-        point = origin if self._height is None else np.array([*origin, self._height])
-        results = (self._hit, self._ranges, None)  # geoms, ranges, no normals
-        # with all groups of geoms, static geoms too, and no body excluded
-        mujoco.mj_multiRay(
-            self._model, self._data, point, beams.ravel(), None, True, -1, *results, len(beams), self.max_range
-        )
-        return np.where((self._hit >= 0) & (self._ranges < self.max_range), self._ranges, self.max_range)
+            beams = beams @ turn.T
+        elif turn:
+            beams = rotate(beams, turn)
+        ranges = np.full((1, len(beams)), self.max_range)
+        center, axes, half, rho, rounded = self._obstacles
+        count, row = np.array([center.shape[1]]), np.zeros(1, np.int64)
+        point, ways = np.array(origin, float)[None], np.ascontiguousarray(beams)[None]
+        cast(center, axes, half, rho, rounded, count, row, point, ways, ranges)
+        return np.asarray(ranges[0])
 
     def ranges(self, origin: Array, turn: float | Array = 0.0) -> Array:
         """Return `cast` with noise, (R,) m in [0, max_range]; beams that hit nothing have none."""

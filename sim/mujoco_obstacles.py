@@ -1,4 +1,4 @@
-"""Add the obstacles of an arena to a MuJoCo model, to collide with and to cast rays at."""
+"""Add the obstacles of an arena to a MuJoCo model, to collide with."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _wall(wall: Obstacle, arena: Arena) -> Geom:
 
 
 def map_model(arena: Arena) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Compile the obstacles of an arena without a robot, to simulate a sensor on."""
+    """Compile the obstacles of an arena without a robot, to compare a lidar with MuJoCo's rays."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, arena)
     model = spec.compile()

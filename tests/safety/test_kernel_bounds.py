@@ -15,7 +15,7 @@ KERNEL_TESTS = (
     *(f"safety/test_{name}_kernels.py" for name in ("filter", "halfspace", "perception", "occlusion")),
     "sim/test_flight_kernels.py",
     "sim/test_arena_kernels.py",
-    "sim/test_batch_env.py::test_ranges_are_those_of_the_lidar_of_mujoco",
+    "sim/test_batch_env.py::test_ranges_are_those_of_mujoco",
 )
 OF_COMPILATION = ("every_kernel_has_a_twin", "refuses_other_types", "prepare_loads_every_kernel")  # no indices in these
 

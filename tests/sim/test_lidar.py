@@ -1,6 +1,5 @@
-"""Ranges agree with the distances to the shapes along the beams, and with MuJoCo's single rays."""
+"""Ranges agree with the distances to the shapes along the beams."""
 
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,9 +8,7 @@ from hypothesis import strategies as st
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.mujoco_obstacles import map_model
 from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
@@ -67,17 +64,6 @@ def test_in_space_beams_end_at_the_first_surface(seed: int, heading: float) -> N
     origin = rng.uniform((-9.0, -9.0, 0.5), (9.0, 9.0, 7.5))
     if arena.shapes.distance(origin).min() > 0.0:
         agree(arena, SPACE, origin, heading)
-
-
-def test_casting_all_rays_at_once_agrees_with_single_rays() -> None:
-    for seed in range(5):
-        arena = draw_arena("dense", np.random.default_rng(seed), QUADROTOR)
-        model, data = map_model(arena)
-        hit = np.zeros(1, np.int32)
-        alone = [
-            mujoco.mj_ray(model, data, np.array(arena.start), ray, None, 1, -1, hit, None) for ray in SPACE.directions
-        ]
-        assert Lidar(arena, SPACE).cast(np.array(arena.start)) == pytest.approx(np.minimum(alone, SPACE.range))
 
 
 def test_ranges_in_the_plane_are_exact() -> None:
