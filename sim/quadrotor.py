@@ -279,8 +279,8 @@ class Quadrotor(SimulatedVehicle):
             mean = np.array(self._wind_process.mean)
             integral = -mean * (self._body.drag_linear + self._body.drag_quadratic * math.hypot(*mean))
         self.controller.hold(self._data.qpos[:3], integral)
-        for _ in range(SETTLE * SAMPLES * self._steps_per_sample // STEPS_OF_TICK):
-            self.advance(STEPS_OF_TICK)
+        for _ in range(SETTLE * SAMPLES):
+            self.advance(self._steps_per_sample)
         self.collided = False
 
     def _note_contacts(self) -> None:
