@@ -61,8 +61,7 @@ class CertifyCommand:
     """Put the model sets to use: write them to the files that the other commands load."""
     accept_bound: options.AcceptBound = None
     publish: bool = False
-    """Replace the model set of running safety services by the first of --certificates, in direct mode unless you
-    give --mode."""
+    """Replace the model set of running safety services by the first one that this command validates."""
     endpoints: options.Unprefixed[options.BusOptions] = field(default_factory=options.BusOptions)
     verbose: options.Verbose = False
     quiet: options.Quiet = False
