@@ -14,10 +14,11 @@ import os
 import sys
 from contextlib import nullcontext
 from copy import copy
-from dataclasses import fields, make_dataclass
+from dataclasses import fields, is_dataclass, make_dataclass
 from importlib.metadata import version
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
+import docstring_parser
 import tyro
 from rich.console import Console
 from rich.markup import escape
@@ -185,13 +186,31 @@ def abridged(command: Any) -> Any:
     return make_dataclass(command.__name__, hidden, bases=(command,), frozen=True)
 
 
+def unwrap_help(options: Any) -> None:
+    """Remove the line breaks of the source from the help of a dataclass and of the dataclasses in its fields.
+
+    tyro prints the line breaks of a field's docstring, but none of an attribute in the docstring of the class. This
+    changes the docstrings of this process, so call it only where the process prints help and ends.
+    """
+    for parent in options.__mro__[:-1]:
+        found = docstring_parser.parse_from_object(parent).params
+        texts = [f"    {text.arg_name}: {' '.join((text.description or '').split())}" for text in found]
+        if texts and "\nAttributes:\n" not in (parent.__doc__ or ""):
+            parent.__doc__ = "\n".join([(parent.__doc__ or "").rstrip(), "", "Attributes:", *texts])
+    for hint in get_type_hints(options).values():
+        if is_dataclass(hint):
+            unwrap_help(hint)
+
+
 def parse(name: str, arguments: list[str]) -> Any:
     """Return the command object for its arguments. Exits with status 0 after --help, with 2 if tyro can't parse."""
     command, (summary, example) = command_class(name), COMMANDS[name]
     description = f"{summary}\n\nExample: {example}"
     words = ["--help" if word == "--help-all" else word for word in arguments]
-    if hasattr(command, "expert") and words == arguments and {"-h", "--help"} & set(words):
-        command, description = abridged(command), f"{description}\n\nAll options: brakeline {name} --help-all"
+    if {"-h", "--help"} & set(words):
+        unwrap_help(command)
+        if hasattr(command, "expert") and words == arguments:
+            command, description = abridged(command), f"{description}\n\nAll options: brakeline {name} --help-all"
     defaults = {"default": command.defaults(words)} if hasattr(command, "defaults") else {}
     return tyro.cli(
         command, **defaults, prog=f"brakeline {name}", description=description, args=words, registry=registry

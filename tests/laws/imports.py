@@ -86,6 +86,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "imageio_ffmpeg": ("deploy.run.episode_render",),
     "rich": ("deploy", "logs"),
     "tyro": ("deploy",),
+    "docstring_parser": ("deploy",),
     "filelock": ("deploy.data",),
 }
 
