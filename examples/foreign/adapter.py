@@ -79,7 +79,12 @@ class Adapter(ABC):
     def actions(self) -> ActionMapping:
         """Return the mapping of an environment whose action is the robot's input, clipped to its bounds."""
         low, high = self.robot.low(), self.robot.high()
-        return ActionMapping(lambda action: np.clip(np.asarray(action, float), low, high), lambda control: control)
+
+        def clipped(action: Any) -> Array:
+            given = np.asarray(action, float)  # the filter must see what is not finite
+            return np.where(np.isfinite(given), np.clip(given, low, high), given)
+
+        return ActionMapping(clipped, lambda control: control)
 
     def action_towards(self, env: Any, target: Any) -> Array:
         """Return the action that drives towards a point."""

@@ -21,6 +21,7 @@ from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from examples.foreign import table, train
+from examples.foreign.adapter import Adapter
 from examples.foreign.distance_field import DistanceField
 from examples.foreign.run import missing_seeds
 from examples.foreign.trained import TrainedPolicy, mean_and_spread
@@ -55,6 +56,13 @@ def test_a_client_and_a_recorder_need_no_solver_and_no_simulator():
     hide = "import sys; sys.modules |= dict.fromkeys(('proxsuite', 'scipy', 'torch', 'mcap'))"
     needed = "import brakeline.safety.service.client, brakeline.safety.gym, brakeline.deploy.data.environment_episodes"
     subprocess.run([sys.executable, "-c", f"{hide}; {needed}"], check=True, cwd=EXAMPLES.parent)
+
+
+def test_an_action_that_is_not_finite_reaches_the_filter():
+    given = np.array([np.inf, np.nan])
+    mapping = Adapter.actions(SimpleNamespace(robot=POINT))
+    assert np.array_equal(mapping.action_to_control(given), given, equal_nan=True)
+    assert (mapping.action_to_control(np.full(2, 99.0)) == POINT.high()).all()
 
 
 @pytest.mark.parametrize(
