@@ -44,33 +44,34 @@ class FlightController:
     def __init__(self) -> None:
         """Start at rest."""
         self.record = controllers_at_rest(1)
+        self._fields = self.record.view(np.ndarray)  # the same, without the slow attributes of a record array
 
     def reset(self, yaw: float = 0.0) -> None:
         """Start at rest with a heading [rad]."""
         self.record[:] = controllers_at_rest(1)
-        self.record["yaw"] = self.record["yaw_goal"] = yaw
+        self._fields["yaw"] = self._fields["yaw_goal"] = yaw
 
     @property
     def setpoint(self) -> Vector:
         """The velocity setpoint [m/s]."""
-        x, y, z = self.record["setpoint"][0].tolist()
+        x, y, z = self._fields["setpoint"][0].tolist()
         return (x, y, z)
 
     @setpoint.setter
     def setpoint(self, velocity: Vector) -> None:
-        self.record["setpoint"] = velocity
+        self._fields["setpoint"] = velocity
 
     def turn_to(self, yaw: float) -> None:
         """Turn the reference of the heading to `yaw` [rad from east]."""
-        self.record["yaw_goal"] = yaw
+        self._fields["yaw_goal"] = yaw
 
     def turn_at(self, yaw_rate: float) -> None:
         """Turn the reference of the heading at a rate [rad/s], until the rate is zero."""
-        self.record["yaw_rate"] = yaw_rate
+        self._fields["yaw_rate"] = yaw_rate
 
     def hold(self, position: Array, integral: Array) -> None:
         """Hold a position (3,) [m] from the start, with an integral term (3,) [m/s²]."""
-        self.record["hold"], self.record["holds"], self.record["integral"] = position, True, integral
+        self._fields["hold"], self._fields["holds"], self._fields["integral"] = position, True, integral
 
     def update(self, qpos: Array, qvel: Array, errors: Array, thrusts: Array) -> None:
         """Write the thrusts (4,) [N] of the rotors for a physics step; see `flight_kernels` for the arguments."""

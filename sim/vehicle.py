@@ -12,6 +12,7 @@ import numpy as np
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena
+from brakeline.sim.grid_planner import nearest_distances
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,9 @@ class SimulatedVehicle:
 
     def clearance(self, states: Array) -> Array:
         """Return the distance [m] from the footprint in states (..., d or more) to the nearest obstacle, or inf."""
-        if not len(self.arena.shapes):
-            return np.full(states.shape[:-1], math.inf)
         positions = states[..., : self.robot.position_dim]
-        return np.asarray(self.arena.shapes.distance(positions).min(axis=0) - self.robot.footprint)
+        distances = nearest_distances(self.arena.shapes, positions.reshape(-1, self.robot.position_dim))
+        return np.asarray(distances.reshape(positions.shape[:-1]) - self.robot.footprint)
 
     def initial_period(self) -> Period:
         """Return the report of a period in which nothing happened, at the present state."""
