@@ -8,8 +8,9 @@ of all blocks. The time of the processor counts, over all threads, so other proc
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from time import process_time
+from time import perf_counter, process_time
 from typing import Any
 
 import gymnasium
@@ -17,6 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from benchmarks.timing import Figures
+from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.policy_loading import POLICY_FOLDER
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -31,6 +33,7 @@ PLOT = Path(__file__).parents[1] / "docs" / "figures" / "batch_simulation.svg"
 SIZES = {"ground": (1, 4, 16, 64, 256, 1024), "quadrotor": (1, 16, 64, 256)}
 STEPS, BLOCKS = 1024, 5  # robot steps of a block, at least two periods of a batch
 PLAIN_SIZES, PEERS = (64, 256), 16
+PROCESSES, LARGE, SECONDS = 2, 256, 20.0  # of the row by the clock
 
 Act = Callable[[], None]  # one period of all robots
 
@@ -49,8 +52,28 @@ def run() -> Figures:
                     size, batch, vector, PEERS
                 )
                 figures[f"{name}, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
+        figures[f"{name}, filtered, {PROCESSES} processes of {LARGE} robots: by the clock"] = by_the_clock(name)
     _draw({size: figures[f"ground, filtered, {size} robots: beside one"] for size in SIZES["ground"]})
     return figures
+
+
+def by_the_clock(name: str) -> dict[str, float]:
+    """Return the filtered robot steps a second of some processes together, each with a batch of its own."""
+    with ProcessPoolExecutor(PROCESSES, spawning()) as pool:
+        rates = list(pool.map(_rate, [name] * PROCESSES))
+    return {"batch steps/s": sum(rates)}
+
+
+def _rate(name: str) -> float:
+    """Return the robot steps a second of one process, by the clock. The others begin within a second or two."""
+    act = _filtered(robot_with_task(name), LARGE)
+    for _ in range(5):
+        act()
+    started, periods = perf_counter(), 0
+    while perf_counter() - started < SECONDS:
+        act()
+        periods += 1
+    return periods * LARGE / (perf_counter() - started)
 
 
 def _draw(rows: dict[int, dict[str, float]]) -> None:

@@ -263,9 +263,9 @@ def main(arguments: list[str] | None = None) -> int:
         errors.print(f"[red]brakeline {name}:[/] {escape(str(missing))}", soft_wrap=True)
         return 1
     except Exception as error:
-        from brakeline.errors import BusError, LogError
+        from brakeline.errors import BusError, LogError, MissingExtra
 
-        if not isinstance(error, BusError | LogError | ValueError | OSError | RuntimeError):
+        if not isinstance(error, BusError | LogError | MissingExtra | ValueError | OSError | RuntimeError):
             raise  # the message of another exception does not tell the user enough
         errors.print(f"[red]brakeline {name}:[/] {escape(reason(error))}", soft_wrap=True)
         return 1

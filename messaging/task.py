@@ -23,6 +23,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from brakeline.errors import UnknownTask
+from brakeline.extras import missing_extra
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import (
     FORMER_LAYOUTS,
@@ -163,6 +164,7 @@ class Task:
         """Import the object at `module:name`, or at `file.py:name` beside the task's file.
 
         Raises:
+            MissingExtra: the object needs a package that an extra brings.
             UnknownTask: the object cannot be imported.
         """
         module, _, name = FORMER_PLACES.get(place, place).partition(":")
@@ -171,6 +173,8 @@ class Task:
                 return getattr(_module_in(self.folder / module), name)
             return getattr(importlib.import_module(module), name)
         except (ImportError, AttributeError, OSError) as error:
+            if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
+                raise missing from error
             raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
 
 

@@ -37,7 +37,7 @@ def test_every_page_is_in_the_menu(site: Path) -> None:
 
 def test_the_start_page_shows_what_the_readme_shows(site: Path) -> None:
     start = (site / "index.html").read_text()
-    assert "Three uses" in start and "quadrotor, after 40,000 steps" in start
+    assert "Three uses" in start and "quadrotor, after 120,000 steps" in start
     assert "data:image/png;base64" in (site / "a_decision.html").read_text(), "the notebook has its picture"
     assert "<!-- README" not in start and 'href="results_scans.html"' in start
 

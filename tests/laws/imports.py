@@ -29,7 +29,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "logs": ("messaging", "errors", "safety.perception.displayed_map"),
     "safety": ("messaging", "errors", "compilation"),
     "sim": ("messaging", "errors", "compilation"),
-    "messaging": ("errors",),
+    "messaging": ("errors", "extras"),
     "errors": ("messaging.brakeline_pb2",),  # for its types alone
     "compilation": (),
     "envs": ("sim.registration",),
