@@ -22,8 +22,10 @@ OUTLINES = "f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1]"  # obstacles in the plan
 
 @compiled(f"f8({SHAPES}, f8[::1])")
 def nearest_distance(center: Array, axes: Array, half: Array, rho: Array, rounded: Array, point: Array) -> float:
-    """Return the distance [m] from a point (d,) to the nearest obstacle; 0 inside one, inf without any."""
+    """Return the distance [m] from a point (d,) to the nearest obstacle; 0 inside one, inf without any, NaN for NaN."""
     nearest, d = math.inf, len(point)
+    if np.isnan(point).any():
+        return math.nan  # no comparison holds for NaN, so each obstacle would count as far away
     for n in range(len(rho)):
         across, along = 0.0, 0.0  # squared, beyond the box: in the rounded axes, and in the others
         for i in range(d):
@@ -35,7 +37,7 @@ def nearest_distance(center: Array, axes: Array, half: Array, rho: Array, rounde
                 across += beyond * beyond
             else:
                 along += beyond * beyond
-        # the root is the slowest part: without it where another obstacle is certainly nearer
+        # The root takes the most time. It is only computed where this obstacle may be nearer than those before.
         if across + along < (nearest + rho[n]) ** 2:
             beside = max(math.sqrt(across) - rho[n], 0.0)
             nearest = min(nearest, math.sqrt(beside * beside + along))
@@ -69,9 +71,9 @@ def connected(
     """
     seen = np.zeros(np.prod(size), np.bool_)
     cells, number = np.empty((len(seen), len(size)), np.int64), 0
-    queue = [(math.inf, 0)]
-    queue.clear()
-    here, neighbours = first, np.zeros((1, len(size)), np.int64)  # first of all, the cell itself
+    queue = [(math.inf, 0)]  # squared distance to the last cell, place in `cells`
+    queue.clear()  # Numba takes the type of the list from the entry above
+    here, neighbours = first, np.zeros((1, len(size)), np.int64)  # at first, only the cell itself
     while True:
         for s in range(len(neighbours)):
             index = here + neighbours[s]

@@ -50,6 +50,12 @@ def test_connected_cells_are_those_of_one_label(rng: np.random.Generator, dim: i
     assert way == (regions[tuple(first)] == regions[tuple(last)] > 0)
 
 
+def test_the_distance_of_a_point_that_is_not_a_number_is_none() -> None:
+    parts = Shapes.of([*room_boundary(2.0, None)], dim=2).parts
+    points = np.array([[np.nan, 0.0], [0.0, np.nan], [0.0, 0.0]])
+    assert nearest_distances(*parts, points) == pytest.approx([np.nan, np.nan, 2.0], nan_ok=True)
+
+
 def first_that_fits(candidates: list[Obstacle], others: list[Obstacle], gap: float) -> int:
     """Call the kernel."""
     return first_fitting(*Shapes.of(candidates, 2).parts[:4], *Shapes.of(others, 2).parts[:4], gap)
