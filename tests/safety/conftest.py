@@ -1,5 +1,7 @@
 """One recording of the kinematic robot, and the model sets made from it."""
 
+from pathlib import Path
+
 import pytest
 
 from brakeline.safety.filter.filter import Filter
@@ -20,19 +22,22 @@ def held_out() -> Dataset:
 
 
 class Made(dict[tuple[str, str], ModelSet]):
-    """Model sets by certificate and mode, each made when it is first asked for."""
+    """Model sets by certificate and mode, each made once for all processes that test, when it is first asked for."""
 
-    def __init__(self, data: Dataset) -> None:
-        self._data = data
+    def __init__(self, data: Dataset, folder: Path) -> None:
+        self._data, self._folder = data, folder
 
     def __missing__(self, model_config: tuple[str, str]) -> ModelSet:
-        self[model_config] = fit_model_set(self._data, ModelConfig(*model_config))
+        path = self._folder / f"{'-'.join(model_config)}.safetensors"
+        if not path.exists():
+            fit_model_set(self._data, ModelConfig(*model_config)).save(path)
+        self[model_config] = ModelSet.load(path)
         return self[model_config]
 
 
 @pytest.fixture(scope="session")
-def models(data: Dataset) -> Made:
-    return Made(data)
+def models(data: Dataset, shared_folder: Path) -> Made:
+    return Made(data, shared_folder / "unicycle")
 
 
 @pytest.fixture(scope="session")

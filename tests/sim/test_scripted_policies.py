@@ -54,7 +54,7 @@ class Episodes:
 @each_robot
 @pytest.mark.parametrize(("arena", "least"), [("default", 0.40), ("dense", 0.65)])
 def test_the_greedy_policy_collides_in_many_episodes(robot: RobotWithTask, arena: str, least: float) -> None:
-    episodes = Episodes(robot, "greedy", arena, 30)
+    episodes = Episodes(robot, "greedy", arena, 20)
     assert least <= episodes.share("collision") <= 0.9
     if robot is QUADROTOR:
         assert episodes.share("collision") + episodes.share("at_goal") == 1.0
@@ -62,7 +62,7 @@ def test_the_greedy_policy_collides_in_many_episodes(robot: RobotWithTask, arena
 
 
 def test_the_ground_route_policy_reaches_every_goal_with_clearance() -> None:
-    episodes = Episodes(GROUND, "astar", "default", 25)
+    episodes = Episodes(GROUND, "astar", "default", 12)
     assert episodes.share("at_goal") == 1.0 and episodes.share("collision") == 0.0 and episodes.outside == 0
     assert sorted(episodes.least)[1] > 0.08
     assert (np.array(episodes.clearances) < 0.04).mean() <= 0.01
@@ -71,10 +71,10 @@ def test_the_ground_route_policy_reaches_every_goal_with_clearance() -> None:
 @pytest.mark.parametrize(
     ("policy", "arena", "episodes", "goals", "mean_speed", "top_speed", "clearance"),
     [
-        ("astar", "default", 20, 1.0, 4.0, 6.5, 0.2),
-        ("astar", "dense", 15, 0.91, 0.0, 0.0, 0.0),
-        ("astar", "tall", 10, 1.0, 0.0, 8.0, 0.0),  # fast on all axes at once
-        ("careful", "dense", 15, 1.0, 3.5, 0.0, 0.0),
+        ("astar", "default", 10, 1.0, 4.0, 6.5, 0.2),
+        ("astar", "dense", 10, 0.9, 0.0, 0.0, 0.0),
+        ("astar", "tall", 6, 1.0, 0.0, 8.0, 0.0),  # fast on all axes at once
+        ("careful", "dense", 8, 1.0, 3.5, 0.0, 0.0),
     ],
 )
 def test_the_quadrotors_route_policies_reach_their_goals(
@@ -87,7 +87,7 @@ def test_the_quadrotors_route_policies_reach_their_goals(
 
 @pytest.mark.parametrize(("robot", "most_steps"), [(GROUND, 60), (QUADROTOR, 15)], ids=["ground", "quadrotor"])
 def test_the_adversary_collides_in_every_episode_and_soon(robot: RobotWithTask, most_steps: int) -> None:
-    episodes = Episodes(robot, "adversary", "default", 20)
+    episodes = Episodes(robot, "adversary", "default", 12)
     assert episodes.share("collision") == 1.0
     assert np.mean(episodes.steps) < most_steps
 

@@ -7,6 +7,8 @@ import json
 import shutil
 import signal
 
+import pytest
+
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.accepting import WORDS
@@ -18,6 +20,7 @@ BEFORE, DURING, AFTER = 800, 2400, 600
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
+@pytest.mark.long  # each part is in a test of its own
 def test_a_set_from_a_run_is_published_into_the_run_by_hand(data_folder, tmp_path):
     """That a set of a changed robot holds: the next test, and `tests/deploy/run/test_adaptation.py`."""
     practice = ("--learner.td3.warmup", ENDLESS, "--practice", 0.15)  # for the stops

@@ -109,6 +109,7 @@ def test_it_flies_in_time_and_hits_nothing(
     _read_by_mavutil(tlog, frames)
 
 
+@pytest.mark.long  # `make test` has two at once in tests/system/test_real_autopilots.py
 def test_two_at_once_ask_one_service(tmp_path: Path) -> None:
     periods = 30
     how = ("--vehicles", 2, "--minutes", periods * QUADROTOR.period / 60.0, "--policy", "adversary")

@@ -13,14 +13,14 @@ KINDS = ("ground", "quadrotor")
 
 
 def test_two_of_each_learn_and_all_stop_when_the_service_dies(flight_folder: Path, tmp_path: Path) -> None:
-    with Run(tmp_path / "run", "--steps", 400, "--actors", 2, "--mavlink", *WORDS, command=MIXED) as run:
-        run.until_steps(250)
+    with Run(tmp_path / "run", "--steps", 250, "--actors", 2, "--mavlink", *WORDS, command=MIXED) as run:
+        run.until_steps(150)
         run.kill("safety-0")
         figures = run.end()
         assert run.popen.returncode == 0, run.errors.read_text()
     assert figures["finished"] and figures["collisions"] == 0
     assert figures["restarts"] == {"safety-0": 1}
-    assert {name: learner["steps"] for name, learner in figures["learners"].items()} == dict.fromkeys(KINDS, 400)
+    assert {name: learner["steps"] for name, learner in figures["learners"].items()} == dict.fromkeys(KINDS, 250)
     assert all(learner["weights_version"] > 1 for learner in figures["learners"].values()), "both learned something"
     assert set(figures["actors"]) == {f"actor-{kind}-{i}" for kind in KINDS for i in (0, 1)}
 

@@ -1,5 +1,5 @@
 """ArduCopter and PX4 as they are, where there are any (tests/real.py): from switching on to flying and to landing, and
-a minute behind the filter, all at once, in which their actors die."""
+half a minute behind the filter, all at once, in which their actors die."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DEGREE = 111_319.5  # m, of latitude
 TRUTH = {"ardupilot": "SIMSTATE", "px4": "HIL_STATE_QUATERNION"}  # what its own simulator knows
 LAND = {"ardupilot": (9, 0), "px4": (4, 6)}  # DO_SET_MODE
 USED = {"ardupilot": {"ATTITUDE", "SCALED_IMU", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"}}
-BEFORE, AFTER = 100, 200  # periods until its actor dies, and from then on: a minute
+BEFORE, AFTER = 60, 90  # periods until its actor dies, and from then on: half a minute
 OFF = 1.5  # m that an estimate may be off after a few metres: it is made of a simulated GPS
 
 
@@ -115,7 +115,7 @@ def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_co
 
 
 @pytest.mark.usefixtures("flight_folder")
-def test_all_fly_a_minute_behind_one_filter_and_hover_when_their_actors_die(tmp_path: Path) -> None:
+def test_all_fly_behind_one_filter_and_hover_when_their_actors_die(tmp_path: Path) -> None:
     """By the embedded vehicle's model set, which is not theirs: nothing is said of how they get on."""
     with ExitStack() as stack:
         there = [stack.enter_context(vehicle) for vehicle in autopilots(tmp_path)]
