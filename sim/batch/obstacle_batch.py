@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
+from brakeline.sim.kernels.arena_kernels import distances_in_arenas
 from brakeline.sim.kernels.ray_kernels import cast
 
 Rows = NDArray[np.intp]
@@ -39,22 +40,18 @@ class ObstacleBatch:
 
     def clearance(self, rows: Rows, points: Array) -> Array:
         """Return the distance (rows, P) [m] from points (rows, P, d) to the nearest obstacle; 0 inside one."""
-        names = ("center", "axes", "half", "rho", "round")
-        center, axes, half, rho, rounded = (self.shapes[name][rows][:, None] for name in names)
-        away = points[:, :, None] - center
-        rest = np.maximum(np.abs((away[..., None, :] @ axes)[..., 0, :]) - half, 0.0)
-        square = rest * rest
-        across = np.maximum(np.sqrt((square * rounded).sum(axis=-1)) - rho, 0.0)
-        distance = np.sqrt(across * across + (square * (1.0 - rounded)).sum(axis=-1))
-        unused = np.arange(rho.shape[-1]) >= self.count[rows, None]
-        return np.asarray(np.where(unused[:, None], np.inf, distance).min(axis=-1))
+        return distances_in_arenas(*self._parts(), self.count, rows, np.ascontiguousarray(points))
 
     def cast(self, rows: Rows, origins: Array, beams: Array, far: float) -> Array:
         """Return the range (rows, R) [m] of unit beams (rows, R, d) from points (rows, d), at most `far`.
 
         This is `Lidar.cast` for all rows.
         """
-        shapes, ranges = self.shapes, np.full(beams.shape[:2], far)
-        parts = shapes["center"], shapes["axes"], shapes["half"], shapes["rho"], shapes["round"]
-        cast(*parts, self.count, rows, np.ascontiguousarray(origins), np.ascontiguousarray(beams), ranges)
+        ranges = np.full(beams.shape[:2], far)
+        cast(*self._parts(), self.count, rows, np.ascontiguousarray(origins), np.ascontiguousarray(beams), ranges)
         return ranges
+
+    def _parts(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the arrays that compiled code takes, as `Shapes.parts`."""
+        shapes = self.shapes
+        return shapes["center"], shapes["axes"], shapes["half"], shapes["rho"], shapes["round"]

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SHAPES = "f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1]"
+ARENAS = "f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"  # of many arenas, each with spare places
 OUTLINES = "f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1]"  # obstacles in the plane: center, axes, half, rho
 
 
@@ -50,6 +51,20 @@ def nearest_distances(center: Array, axes: Array, half: Array, rho: Array, round
     distances = np.empty(len(points))
     for k in range(len(points)):
         distances[k] = nearest_distance(center, axes, half, rho, rounded, points[k])
+    return distances
+
+
+@compiled(f"f8[:,::1]({ARENAS}, i8[::1], i8[::1], f8[:,:,::1])")
+def distances_in_arenas(
+    center: Array, axes: Array, half: Array, rho: Array, rounded: Array, count: Index, rows: Index, points: Array
+) -> Array:
+    """Return the distance (R, P) [m] from points (R, P, d) to the nearest of the obstacles of each row's arena."""
+    distances = np.empty(points.shape[:2])
+    for r in range(len(rows)):
+        row, n = rows[r], count[rows[r]]
+        parts = center[row, :n], axes[row, :n], half[row, :n], rho[row, :n], rounded[row, :n]
+        for p in range(points.shape[1]):
+            distances[r, p] = nearest_distance(*parts, points[r, p])
     return distances
 
 

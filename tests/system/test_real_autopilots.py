@@ -30,7 +30,7 @@ DEGREE = 111_319.5  # m, of latitude
 TRUTH = {"ardupilot": "SIMSTATE", "px4": "HIL_STATE_QUATERNION"}  # what its own simulator knows
 LAND = {"ardupilot": (9, 0), "px4": (4, 6)}  # DO_SET_MODE
 USED = {"ardupilot": {"ATTITUDE", "SCALED_IMU", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"}}
-BEFORE, AFTER = 60, 90  # periods until its actor dies, and from then on: half a minute
+BEFORE, AFTER = 40, 150  # periods until its actor dies, and from then on: half a minute
 OFF = 1.5  # m that an estimate may be off after a few metres: it is made of a simulated GPS
 
 
