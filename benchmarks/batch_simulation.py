@@ -53,7 +53,7 @@ def run() -> Figures:
                 )
                 figures[f"{name}, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
         figures[f"{name}, filtered, {PROCESSES} processes of {LARGE} robots: by the clock"] = by_the_clock(name)
-    _draw({size: figures[f"ground, filtered, {size} robots: beside one"] for size in SIZES["ground"]})
+    _draw({name: {n: figures[f"{name}, filtered, {n} robots: beside one"] for n in SIZES[name]} for name in SIZES})
     return figures
 
 
@@ -76,19 +76,19 @@ def _rate(name: str) -> float:
     return periods * LARGE / (perf_counter() - started)
 
 
-def _draw(rows: dict[int, dict[str, float]]) -> None:
+def _draw(rows: dict[str, dict[int, dict[str, float]]]) -> None:
     """Draw the filtered steps for each second of processor time against the number of robots, beside one robot."""
     from matplotlib import pyplot
 
     pyplot.rcParams["svg.hashsalt"] = PLOT.name  # the same figures give the same file
     figure, axes = pyplot.subplots(figsize=(6.0, 3.2), layout="constrained")
-    for name, label, style in (
-        ("batch steps/s", "BatchSafetyWrapper(BatchNavigationEnv)", "o-"),
-        ("peer steps/s", "SafetyWrapper(NavigationEnv), one robot", "s--"),
-    ):
-        axes.plot(list(rows), [row[name] for row in rows.values()], style, label=label)
+    for number, (robot, sizes) in enumerate(rows.items()):
+        for name, label, style in (("batch steps/s", "many at once", "o-"), ("peer steps/s", "one at a time", "s--")):
+            steps = [row[name] for row in sizes.values()]
+            axes.plot(list(sizes), steps, style, color=f"C{number}", label=f"{robot}, {label}")
     axes.set_xscale("log", base=2)
-    axes.set_xticks(list(rows), list(map(str, rows)))
+    ticks = sorted({size for sizes in rows.values() for size in sizes})
+    axes.set_xticks(ticks, list(map(str, ticks)))
     axes.set(ylim=(0.0, None), xlabel="robots in the batch", ylabel="filtered steps for each\nsecond of processor time")
     axes.grid(alpha=0.3)
     axes.legend()
