@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.compilation import compiled
+from brakeline.sim.kernels.ray_kernels import ARENAS
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SHAPES = "f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1]"
-ARENAS = "f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"  # of many arenas, each with spare places
 OUTLINES = "f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1]"  # obstacles in the plane: center, axes, half, rho
 
 
@@ -58,7 +58,10 @@ def nearest_distances(center: Array, axes: Array, half: Array, rho: Array, round
 def distances_in_arenas(
     center: Array, axes: Array, half: Array, rho: Array, rounded: Array, count: Index, rows: Index, points: Array
 ) -> Array:
-    """Return the distance (R, P) [m] from points (R, P, d) to the nearest of the obstacles of each row's arena."""
+    """Return the distance (R, P) [m] from points (R, P, d) to the nearest obstacle of each row's arena.
+
+    A row's arena has `count` obstacles; the places after them are not in use.
+    """
     distances = np.empty(points.shape[:2])
     for r in range(len(rows)):
         row, n = rows[r], count[rows[r]]

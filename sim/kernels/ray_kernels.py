@@ -14,7 +14,7 @@ Index = NDArray[np.int64]
 
 # Of one obstacle, as of `Shapes`: axes, half, rho, round; then the ray: its start from the center, direction and length
 SHAPE_AND_RAY = "f8[:,::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], f8"
-SHAPES = "f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"  # center, axes, half, rho, round: `Shapes`
+ARENAS = "f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,:,::1]"  # `Shapes.parts` of many arenas
 
 
 @compiled(f"f8({SHAPE_AND_RAY})")
@@ -51,7 +51,7 @@ def _distance(axes: Array, half: Array, rho: float, rounded: Array, away: Array,
     return enters if enters >= 0.0 else leaves
 
 
-@compiled(f"void({SHAPES}, i8[::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1])")
+@compiled(f"void({ARENAS}, i8[::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1])")
 def cast(
     center: Array, axes: Array, half: Array, rho: Array, rounded: Array, count: Index,
     rows: Index, origins: Array, beams: Array, ranges: Array,

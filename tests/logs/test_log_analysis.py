@@ -184,11 +184,11 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     """Five times the messages need little more memory, for new bins of sketches. For gigabytes of messages, run
     `python -m benchmarks logs-2gb`."""
     held = []
-    for name, rounds in (("short", 20), ("long", 100)):
+    for name, rounds in (("short", 35), ("long", 175)):
         writer = Writer(3, losses=0.0)
         for number in range(rounds):
             writer.episode("actor-0", number)
-            if number % 20 == 19:
+            if number % 35 == 34:
                 writer.write(tmp_path / name / "run.mcap")
         tracemalloc.start()
         analysis = analyse_runs(tmp_path / name, AnalysisOptions(pictures=True))
