@@ -24,6 +24,7 @@ PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.a
 RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
 PERSISTENCE = 40  # scans that one thing is rammed for, or driven away from
 PAUSE = 0.02  # s between raw commands
+FASTEST_TURN = 0.498  # rad/s; with what tells commands apart it stays within the base's limit, and comes out unchanged
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -49,7 +50,7 @@ class Driver:
         self.scans = self.heard = 0
         self.wanted = (0.0, 0.0)
         self.aim = 0.0  # rad in the scan's frame, of what is rammed
-        self.asked: tuple[float, float] | None = None  # when a turn rate was asked for, and which
+        self.sent: dict[float, float] = {}  # when each turn rate [1e-8 rad/s] was asked for that has not come out
         self.delays: list[float] = []
         self.lock = threading.Lock()
 
@@ -67,7 +68,7 @@ class Driver:
             target = angles[np.argmax(np.where(off < 1.5, room, 0.0))]
         else:  # the nearest thing where it looks; it keeps aiming at it as it turns
             target = angles[np.argmin(np.where(off < 0.6, ranges, 99.0))]
-        turn = max(-0.5, min(0.5, 2.0 * target))
+        turn = max(-FASTEST_TURN, min(FASTEST_TURN, 2.0 * target))
         self.aim = target - 0.2 * turn
         with self.lock:
             self.wanted = (0.25 if abs(target) < 0.5 else 0.0, turn)
@@ -76,9 +77,9 @@ class Driver:
         twist = message.twist if STAMPED else message
         with self.lock:
             self.heard += 1
-            if self.asked is not None and abs(twist.angular.z - self.asked[1]) < 1e-9:
-                self.delays.append(time.monotonic() - self.asked[0])
-                self.asked = None
+            sent = self.sent.pop(round(twist.angular.z, 8), None)
+            if sent is not None:
+                self.delays.append(time.monotonic() - sent)
 
 
 def main() -> None:
@@ -107,8 +108,7 @@ def main() -> None:
         with driver.lock:
             speed, turn = driver.wanted
             turn += 1e-6 * (number % 1000)  # each command can be told from the others
-            if driver.asked is None or time.monotonic() - driver.asked[0] > 2.0:
-                driver.asked = (time.monotonic(), turn)
+            driver.sent[round(turn, 8)] = time.monotonic()
         linear, angular = vector(x=speed, y=0.0, z=0.0), vector(x=0.0, y=0.0, z=turn)
         if STAMPED:
             header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]

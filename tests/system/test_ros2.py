@@ -160,7 +160,12 @@ def test_a_bag_is_one_to_readers_of_bags(run: Any) -> None:
 
 def test_it_is_seen_in_the_graph_and_stops_when_it_is_killed(late_folder: Path, tmp_path: Path) -> None:
     with Bench(tmp_path, *STEADY, "--seed", 2, node=("--sim-time",)) as bench:
-        until(lambda: bench.said("driver").get("delays"), f"a raw command goes through: {bench.errors('filter')}")
+        until(
+            lambda: bench.said("driver").get("delays"),
+            lambda: (
+                f"a raw command goes through: {bench.said('driver')} {bench.said('filter')} {bench.errors('filter')}"
+            ),
+        )
         graph = bench.start("graph", sys.executable, "-c", GRAPH, bench.port)
         assert graph.wait(PATIENCE) == 0, bench.errors("graph")
         listed = bench.said("graph")

@@ -65,11 +65,15 @@ class Robot:
     def drives(self):
         """Check that a command is executed from now on."""
         del self.speeds[:]
-        until(lambda: self.speeds and self.speeds[-1] == 0.2, f"driving again: {self.reasons[-3:]}", 30.0)
+        until(lambda: self.speeds and self.speeds[-1] == 0.2, lambda: f"driving again: {self.reasons[-3:]}", 30.0)
 
     def stops(self, because):
         until(lambda: self.speeds and self.speeds[-1] == 0.0, f"a stop: {because}", 30.0)
-        until(lambda: any(because in reason for reason in self.reasons), f"{because}, not {self.reasons[-3:]}", 30.0)
+        until(
+            lambda: any(because in reason for reason in self.reasons),
+            lambda: f"{because}, not {self.reasons[-3:]}",
+            30.0,
+        )
         del self.speeds[:]
         until(lambda: len(self.speeds) > 2, "more commands", 30.0)
         assert set(self.speeds) == {0.0}
