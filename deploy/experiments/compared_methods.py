@@ -9,6 +9,7 @@ from typing import Any
 from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 
 NONE = "none"
+EVERY, BATCHES, UNICYCLES = "every", "batches", "unicycles"
 MAP, RAYS, NOTHING = "the arena's map", "the observed rays", "–"
 TD3_LEARNER, SAC_LEARNER = "TD3", "SAC"
 SAC_SETTINGS = {"actor_rate": 3e-3}  # by the tuning that results/README.md lists
@@ -27,7 +28,8 @@ class ComparedMethod:
         learner: TD3 is our own; SAC is Stable-Baselines3's.
         td3: settings of the learner that differ from the others'.
         tuned: the setting that was tuned; empty: none.
-        unicycles_alone: compared on robots alone that batches simulate and whose inputs are speed and turn rate.
+        robots: on which it is compared: all, those that batches simulate, or of these the unicycles, whose inputs are
+            speed and turn rate.
     """
 
     label: str
@@ -38,45 +40,48 @@ class ComparedMethod:
     learner: str = TD3_LEARNER
     td3: Mapping[str, Any] = field(default_factory=dict)
     tuned: str = ""
-    unicycles_alone: bool = True
+    robots: str = EVERY
 
 
 METHODS: dict[str, ComparedMethod] = {
-    DDPC: ComparedMethod(
-        "ours", DDPC, MAP, "sets from recorded driving", "Selim et al. 2022; docs/method.md", unicycles_alone=False
-    ),
+    DDPC: ComparedMethod("ours", DDPC, MAP, "sets from recorded driving", "Selim et al. 2022; docs/method.md"),
     SAILR: ComparedMethod(
         *("SAILR", SAILR, RAYS, "critics of braking, from recorded driving", "Wagener et al. 2021"),
         tuned="threshold η",
-        unicycles_alone=False,
     ),
     SECAS: ComparedMethod(
         *("SECAS", SECAS, RAYS, "linear constraints, from recorded driving", "Dalal et al. 2018"),
         tuned="margin [m]",
-        unicycles_alone=False,
     ),
-    NONE: ComparedMethod("TD3", NONE, NOTHING, NOTHING, "Fujimoto et al. 2018", unicycles_alone=False),
+    NONE: ComparedMethod("TD3", NONE, NOTHING, NOTHING, "Fujimoto et al. 2018"),
     "lagrange": ComparedMethod(
         *("TD3-Lagrange", NONE, NOTHING, NOTHING, "Ray et al. 2019; Tessler et al. 2019"),
         td3={"cost_limit": 0.01},
         tuned="multiplier_rate",
+        robots=BATCHES,
     ),
     CBF: ComparedMethod(
-        *("CBF-QP", CBF, MAP, "a unicycle by hand, without lag", "Ames et al. 2019"), tuned="rate α [1/s]"
+        *("CBF-QP", CBF, MAP, "a unicycle by hand, without lag", "Ames et al. 2019"),
+        tuned="rate α [1/s]",
+        robots=UNICYCLES,
     ),
     PSF: ComparedMethod(
-        *("PSF", PSF, MAP, "a unicycle by hand, with a lag", "Wabersich and Zeilinger 2021"), tuned="margin [m]"
+        *("PSF", PSF, MAP, "a unicycle by hand, with a lag", "Wabersich and Zeilinger 2021"),
+        tuned="margin [m]",
+        robots=UNICYCLES,
     ),
     "sac": ComparedMethod(
         *("SAC", NONE, NOTHING, NOTHING, "Haarnoja et al. 2018; Stable-Baselines3"),
         learner=SAC_LEARNER,
         td3=SAC_SETTINGS,
         tuned="learning rate",
+        robots=BATCHES,
     ),
     "sac-ddpc": ComparedMethod(
         *("SAC, our filter", DDPC, MAP, "sets from recorded driving", "Haarnoja et al. 2018; Stable-Baselines3"),
         learner=SAC_LEARNER,
         td3=SAC_SETTINGS,
         tuned="learning rate",
+        robots=BATCHES,
     ),
 }

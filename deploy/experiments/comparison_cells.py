@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, UNICYCLES
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, ModelConfig
@@ -124,8 +124,10 @@ def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
     """Return the methods that are compared on a robot in these arenas."""
     from brakeline.messaging.task import robot_with_task
 
-    every = backend_for(robot, arenas) == "batch" and robot_with_task(robot).heading is not None
-    return tuple(name for name, method in METHODS.items() if every or not method.unicycles_alone)
+    kinds = {EVERY}
+    if backend_for(robot, arenas) == "batch":
+        kinds |= {BATCHES} if robot_with_task(robot).heading is None else {BATCHES, UNICYCLES}
+    return tuple(name for name, method in METHODS.items() if method.robots in kinds)
 
 
 def quick(cell: CellConfig) -> CellConfig:
