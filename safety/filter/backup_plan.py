@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,12 +40,21 @@ class Prediction:
 
     def contains(self, robot: Robot, state: Array) -> bool:
         """Return whether the measured state (n,) lies in the set."""
+        return all(off <= most + SAME_SET for off, most in self._errors(robot, state))
+
+    def used(self, robot: Robot, state: Array) -> float:
+        """Return how much of the set the measured state (n,) uses: the largest ratio of an error to its half-width."""
+        shares = [off / most if most > 0.0 else math.inf for off, most in self._errors(robot, state) if off != 0.0]
+        return max(shares, default=0.0) if not any(map(math.isnan, shares)) else math.inf
+
+    def _errors(self, robot: Robot, state: Array) -> Iterator[tuple[float, float]]:
+        """Return the distance from the center and the half-width of each coordinate."""
         away = (state - self.center).tolist()  # a few numbers: a loop is faster than NumPy
         if robot.heading is not None:
             cos, sin = math.cos(self.heading), math.sin(self.heading)
             away[0], away[1] = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
             away[robot.heading] = (away[robot.heading] + math.pi) % math.tau - math.pi
-        return all(abs(off) <= most + SAME_SET for off, most in zip(away, self.half_width.tolist(), strict=True))
+        return zip(map(abs, away), self.half_width.tolist(), strict=True)
 
 
 NO_PREDICTION = Prediction(np.zeros(0), np.zeros(0), 0.0)  # of a method that predicts nothing
@@ -132,7 +141,7 @@ class BackupPlan:
         Args:
             plan, model, predicted, verified, plan_tokens, reservation: those of the decision.
             score: the score of the window that ended with the request, if the filter gave one.
-            judges: whether the filter can score a window; if not, `past` gives none.
+            judges: whether the filter can score a window. If not, `past` gives none, and the last period is scored.
         """
         self._judged = judges
         if verified and model != self._scored_by:  # scores are relative to the sets of one model set
@@ -140,6 +149,8 @@ class BackupPlan:
             self._scored_by = model
         elif score is not None:
             self.widening.judge(score)
+        elif not judges and self._compare and self.predicted is not None:
+            self.widening.judge_period(self.predicted.used(self.robot, self.seen))
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED

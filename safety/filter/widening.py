@@ -3,6 +3,7 @@
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
+A filter whose model set predicts nothing but plans scores no window; then the client scores each period by itself.
 """
 
 from __future__ import annotations
@@ -88,8 +89,20 @@ class Widening:
     def judge(self, score: float) -> None:
         """Add the score of a window that has ended. A score that is no number counts as infinite."""
         score = score if score == score else np.inf
+        self._add(score, bool(self._factors) and score > self._factors[0])
+
+    def judge_period(self, used: float) -> None:
+        """Add the last period alone, for a model set that cannot score windows: how much of its widened set was used.
+
+        Such a set predicts plans, and a robot that drives freely follows each plan for its first period only. If the
+        state is outside after this period, the plan has left its tube.
+        """
+        if self._factors:
+            self._add(used * self._factors[-1], used > 1.0)
+
+    def _add(self, score: float, left: bool) -> None:
         if self._factors and self._uncounted >= self.robot.horizon:
-            self.left.append(score > self._factors[0])
+            self.left.append(left)
             self._uncounted = 0
         self._count += 1
         while self._scores and self._scores[-1][1] <= score:

@@ -7,6 +7,7 @@ import pytest
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
+from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening
@@ -104,6 +105,37 @@ def test_every_set_grows_by_the_factor_and_the_margin_falls(of):
     assert wide.margin < stated.margin
     moving = replace(ask, state=np.array([0.0, 0.0, 0.0, 0.1, 0.0]), input_in_force=np.array([0.1, 0.0]))
     assert not safety.decide(replace(moving, widening=1e3)).verified
+
+
+def test_a_model_set_that_scores_no_windows_is_widened_by_what_each_period_uses():
+    plan, widening = BackupPlan(GROUND), []
+
+    def period(used, **decided):
+        """Measure a state that uses a share of its predicted set. The next decision's sets are as wide as asked."""
+        half = np.array([0.01, 0.02, 0.03, 0.04, 0.05])
+        before = plan.predicted or Prediction(np.zeros(5), half, 0.0)
+        plan.measured(before.center + before.half_width * [0.0, 0.0, 0.0, -used, 0.5 * used])
+        predicted = Prediction(np.full(5, 0.1), half * plan.widening.factor, 0.3)
+        plan.accept(np.zeros((GROUND.horizon, 2)), "one", predicted, True, **decided)
+        widening.append(plan.widening.factor)
+
+    for used in (0.0, 0.5, 2.0, 0.8, 1.2, 0.1):
+        period(used)
+    assert widening == pytest.approx([1.0, 1.0, 2.0 * RESERVE, 2.0 * RESERVE, 2.4 * RESERVE**2, 2.4 * RESERVE**2])
+    period(5.0, judges=True)
+    assert widening[-1] == widening[-2], "this filter scores windows itself"
+    assert list(plan.widening.left) == [False], "one of so few periods counts as a plan: they overlap"
+    plan.reset()
+    period(9.0)
+    assert widening[-1] == widening[-2], "an episode has begun: nothing was predicted"
+
+
+@pytest.mark.parametrize("state", [[1.0, 0.0], [np.nan, 0.0]])
+def test_a_set_without_width_or_a_number_is_used_up(state):
+    robot = ROBOT
+    center = np.pad(np.array(state), (0, 3))
+    assert Prediction(center, np.zeros(5), 0.0).used(robot, np.zeros(5)) == np.inf
+    assert Prediction(np.zeros(5), np.zeros(5), 0.0).used(robot, np.zeros(5)) == 0.0
 
 
 def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_scores():

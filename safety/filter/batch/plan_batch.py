@@ -82,7 +82,7 @@ class BackupPlanBatch:
         self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
-        self._judged = False
+        self._judged, self._widened = False, np.ones(size)  # factor of the predicted sets
         self._scores, self._place = np.zeros((size, WINDOWS)), np.zeros(size, dtype=np.int64)
         self._scored = np.zeros(size, dtype=bool)
         self.reset(np.ones(size, dtype=bool))
@@ -143,13 +143,25 @@ class BackupPlanBatch:
 
     def contains(self, states: Array) -> Flags:
         """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""
+        sets = self.predicted
+        return np.asarray(sets.given & (self._errors(states) <= sets.half_width + SAME_SET).all(axis=1))
+
+    def _errors(self, states: Array) -> Array:
+        """Return the distances (B, n) of measured states from the centers of the predicted sets."""
         sets, away = self.predicted, states - self.predicted.center
         if (heading := self.robot.heading) is not None:
             cos, sin = np.cos(sets.heading), np.sin(sets.heading)
             x, y = away[:, 0].copy(), away[:, 1].copy()
             away[:, 0], away[:, 1] = cos * x + sin * y, cos * y - sin * x
             away[:, heading] = (away[:, heading] + math.pi) % math.tau - math.pi
-        return np.asarray(sets.given & (np.abs(away) <= sets.half_width + SAME_SET).all(axis=1))
+        return np.asarray(np.abs(away))
+
+    def _used(self, states: Array) -> Array:
+        """Return how much of their predicted sets measured states (B, n) use: `Prediction.used` for each row."""
+        errors = self._errors(states)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.where(errors == 0.0, 0.0, errors / self.predicted.half_width)
+        return np.asarray(shares.max(axis=1))  # `_judge` takes NaN as infinite
 
     def _is_possible(self, answers: DecisionArrays) -> Flags:
         """Return which plans the robot can follow: within the bounds and the slew, and to a stop."""
@@ -165,14 +177,17 @@ class BackupPlanBatch:
         self._status[~decided & outside] = OPEN
         self.predicted.given[~decided] = False
         if answers is not None:
-            self._accept(decided, answers)
+            self._accept(states, decided, answers)
         return self._advance(states)
 
-    def _accept(self, rows: Flags, answers: DecisionArrays) -> None:
-        self._judged = answers.judges
+    def _accept(self, states: Array, rows: Flags, answers: DecisionArrays) -> None:
+        self._judged, asked = answers.judges, self.widening
         first = rows & answers.verified & ~self._scored
         self._scored |= first
         self._judge(rows & ~first & answers.scored, answers.score)
+        if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
+            self._judge(rows & ~first & self.predicted.given, self._used(states) * self._widened)
+        self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
         sets = self.predicted
