@@ -195,6 +195,8 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
     if plans.get("scored"):
         wide = f"{_share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
         yield "windows outside the stated sets", f"{_share(plans['beyond'], plans['scored'])}; {wide}"
+    elif plans.get("widening", 1.0) > 1.0:
+        yield "sets widened", f"by up to {plans['widening']:.3g} times"
     if plans.get("slowed"):
         yield "slowed down", f"{_share(plans['slowed'], figures['steps'])} of the steps, {plans['slow_downs']} times"
     for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):

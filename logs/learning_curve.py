@@ -43,15 +43,16 @@ class Bin(Counter[str]):
     def sets(self) -> Figures:
         """Return how much of their sets the windows in the bin used, and how wide the tubes were.
 
-        None: no window; of `slowed`, no limited proposal (`brakeline.actors.slow_down`).
+        None: no window, and no widened request; of `slowed`, no limited proposal (`brakeline.actors.slow_down`).
         """
         scored, tubes = self["scored"], self["tubes"]
+        adapts = scored or self.widening > 1.0
         return {
             "beyond": self["beyond"] / scored if scored else None,
             "beyond_widened": self["beyond_widened"] / scored if scored else None,
-            "widening": self.widening if scored else None,
-            "half_width": self.half_width / tubes if tubes and scored else None,
-            "slowed": self["slowed"] / scored if self["slowed"] else None,
+            "widening": self.widening if adapts else None,
+            "half_width": self.half_width / tubes if tubes and adapts else None,
+            "slowed": self["slowed"] / self["exchanges"] if self["slowed"] else None,
         }
 
 
@@ -115,12 +116,13 @@ class LearningCurve:
     def exchange(self, exchange: pb.Exchange) -> None:
         """Add an exchange of one of the actors with the safety service (docs/method.md §15)."""
         now, decision, widening = self._bin(), exchange.reply.decision, max(exchange.request.widening, 1.0)
+        now["exchanges"] += 1
+        now["slowed"] += exchange.request.slow > 0.0
+        now.widening = max(now.widening, widening)
         if decision.HasField("score"):
             now["scored"] += 1
             now["beyond"] += not decision.score <= 1.0
             now["beyond_widened"] += not decision.score <= widening
-            now.widening = max(now.widening, widening)
-            now["slowed"] += exchange.request.slow > 0.0
         if decision.tube_half_width:
             now["tubes"] += 1
             now.half_width += max(decision.tube_half_width)

@@ -22,7 +22,7 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
-from brakeline.safety.model.windows import FREE, windows
+from brakeline.safety.model.windows import FREE, PLAN, windows
 
 WIDENING, REQUESTS = 1.3, 100  # a robot has changed if its last 100 requests, or more, were widened by more than 1.3
 FEWEST_MINUTES = 4.0  # of driving after the change
@@ -229,15 +229,23 @@ class Adaptation:
 
 def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -> str:
     """Return why a model set must not replace the one in use, which the robots widen; empty if it may."""
-    if in_use.one_step is None:
-        return f"the model set in use, {in_use.version}, is not of mode {ONE_STEP}, so nothing follows a change"
     ranges = np.ptp(in_use.domain, axis=0)
     covered = float((np.ptp(model.domain, axis=0) / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
     if covered < DOMAIN:
         return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
-    z = windows(data, data.robot.horizon, FREE).z
-    d = data.robot.position_dim
-    new, old = (float(m.steps[-1].half_widths(z)[:, :d].mean()) for m in (model, in_use))
+    new, old = (_mean_half_width(m, data) for m in (model, in_use))
     if new > TIGHTER * widening * old:
         return f"its sets are {new / (widening * old):.2g} times as wide as those in use, as widened"
     return ""
+
+
+def _mean_half_width(model: ModelSet, data: Dataset) -> float:
+    """Return the mean half-width of the position at the end of the driven windows [m].
+
+    A model set that predicts nothing but plans is asked about the plans that begin like these windows.
+    """
+    robot = data.robot
+    z = windows(data, robot.horizon, FREE).z
+    if model.model_config.windows == PLAN:
+        z = z[:, : robot.regressor_dim + robot.free_steps * robot.action_dim]
+    return float(model.steps[-1].half_widths(z)[:, : robot.position_dim].mean())

@@ -119,9 +119,9 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     ]
     if plans["flown"]:
         rows.append(("plans outside tube", f"{share(plans['outside'], plans['flown'])}; {stated(plans)}", "", ""))
-    if plans["scored"]:
-        widest = f"{plans['widening']:.3g} times"
-        rows.append(("windows outside sets", share(plans["beyond"], plans["scored"]), "widened by up to", widest))
+    if plans["scored"] or plans["widening"] > 1.0:
+        widest, windows = f"{plans['widening']:.3g} times", share(plans["beyond"], plans["scored"])
+        rows.append(("windows outside sets", windows if plans["scored"] else "-", "widened by up to", widest))
     if plans["slowed"]:
         rows.append(("slowed down", share(plans["slowed"], steps), "began", f"{plans['slow_downs']} times"))
     notes = {name: note for process in figures["processes"].values() for name, note in process["notes"].items()}

@@ -60,7 +60,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         DamagedPart: the checkpoint of the run to resume is lost in part.
         BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
-        ValueError: the run adapts, and a model set is not of mode one-step.
+        ValueError: the run adapts, and a model set is of mode recursion or of a rival.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")

@@ -11,7 +11,7 @@ from brakeline.errors import Untrusted
 from brakeline.messaging.bus.certificate_authority import Authority
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import Model, archive_path, load
-from brakeline.safety.model.model_set import ONE_STEP, ModelSet
+from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelSet
 from brakeline.safety.service.plan_token import write_key
 from brakeline.safety.service.signature import KEY, ModelSigner, TrustedSigners, write_signer
 
@@ -60,9 +60,9 @@ def check_signer(keys: Path | None) -> None:
 
 
 def check_adaptable(model: Model) -> None:
-    """Check that requests can widen the sets of a model set, so that a change is noticed. Raises ValueError."""
-    if not isinstance(model, ModelSet) or model.one_step is None:
+    """Check that a model set states sets of whole plans, with which new sets can be compared. Raises ValueError."""
+    if not isinstance(model, ModelSet) or model.model_config.mode == RECURSION:
         raise ValueError(
-            f"--adapt needs a model set of mode {ONE_STEP}, for {model.robot.name} another one is in use: give --mode "
-            f"{ONE_STEP}, or certify with `brakeline certify {model.robot.kind} --use`"
+            f"--adapt needs a model set of mode {ONE_STEP} or {DIRECT}, for {model.robot.name} another one is in use: "
+            f"give --mode {ONE_STEP}, or certify with `brakeline certify {model.robot.kind} --use`"
         )

@@ -17,7 +17,8 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
-from brakeline.safety.model.model_set import ONE_STEP, ModelConfig
+from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig
+from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
 from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
 from tests.safety.unicycle import Unicycle
@@ -96,6 +97,21 @@ def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(ki
     outside = certify(fresh, ModelConfig(mode=ONE_STEP))[0]
     ratio = [m.steps[-1].w[:2].mean() for m in (model, outside)]
     assert 0.5 < ratio[0] / ratio[1] < 2.0, "as if the changed robot had been recorded"
+
+
+def test_a_set_that_predicts_plans_is_compared_on_plans_that_begin_as_the_driving():
+    data = Dataset(ROBOT, driven(2, 7, slip=-0.15))
+    free, stops = certify(record(1, 6), ModelConfig(mode=DIRECT, windows=FREE))[0], plan_regressor_map(ROBOT)
+    plans = replace(
+        free, steps=tuple(step.through(stops) for step in free.steps), model_config=ModelConfig(mode=DIRECT)
+    )
+    begun = windows(data, ROBOT.horizon, FREE).z[:, : stops.shape[1]]
+    expected = free.steps[-1].half_widths(begun @ stops.T)[:, :2].mean()
+    assert adaptation._mean_half_width(plans, data) == pytest.approx(expected)
+    new = certify(data, ModelConfig(mode=ONE_STEP))[0]
+    assert adaptation._looser(new, plans, 8.0, data) == ""
+    assert "times as wide as those in use" in adaptation._looser(new, plans, 0.01, data)
+    check_adaptable(plans)
 
 
 def test_the_next_attempt_waits_for_more_driving_and_the_new_version_ends_the_change(kind):
@@ -231,14 +247,14 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, pr
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
 
 
-def test_nothing_adapts_without_a_key_to_sign_or_with_sets_that_cannot_widen(tmp_path):
+def test_nothing_adapts_without_a_key_to_sign_or_from_sets_of_no_plans(tmp_path):
     with pytest.raises(Untrusted, match="--adapt needs keys"):
         check_signer(None)
     with pytest.raises(Untrusted, match="no key to sign models with"):
         check_signer(tmp_path)
     check_adaptable(in_use())
     with pytest.raises(ValueError, match="--mode one-step"):
-        check_adaptable(replace(in_use(), one_step=None))
+        check_adaptable(replace(in_use(), model_config=ModelConfig(mode=RECURSION)))
 
 
 def test_a_hundred_requests_make_a_change(kind):
