@@ -16,6 +16,7 @@ FIRST = 2.0  # s until the first line; shorter work prints none
 AGAIN = 10.0  # s between two lines
 PERCENT = 100  # items of one piece of work, of which only the share that is done is known
 UNDER_WAY: list[threading.Event] = []  # nested work that prints lines; only the innermost prints
+PRINTING = threading.Lock()  # no outer work prints after inner work has begun
 T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -87,7 +88,8 @@ def _bar(what: str, total: int | None) -> Iterator[Advance]:
 @contextmanager
 def _lines(what: str, total: int | None) -> Iterator[Advance]:
     start, ended = time.monotonic(), threading.Event()
-    UNDER_WAY.append(ended)
+    with PRINTING:
+        UNDER_WAY.append(ended)
     current, done = what, 0
 
     def advance(by: int = 1, what: str | None = None) -> None:
@@ -97,8 +99,9 @@ def _lines(what: str, total: int | None) -> Iterator[Advance]:
     def print_lines() -> None:
         wait = FIRST
         while not ended.wait(wait):
-            if UNDER_WAY[-1] is ended:
-                console.print(line(current, done, total, time.monotonic() - start), markup=False)
+            with PRINTING:
+                if UNDER_WAY[-1] is ended:
+                    console.print(line(current, done, total, time.monotonic() - start), markup=False)
             wait = AGAIN
 
     printer = threading.Thread(target=print_lines, name="progress", daemon=True)

@@ -29,6 +29,7 @@ from brakeline.safety import methods
 from brakeline.safety.model import model_config
 from brakeline.safety.model.validation import ValidationReport
 from tests.deploy.data.porter import FILE, drive, write_csv
+from tests.waiting import until
 
 SHARED = {
     *("episodes", "goals", "collisions", "timeouts", "steps", "interventions", "failsafes", "mean_speed", "max_speed"),
@@ -283,16 +284,24 @@ def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, caps
     monkeypatch.setattr(progress, "FIRST", 0.01)
     monkeypatch.setattr(progress, "AGAIN", 0.01)
     monkeypatch.setattr(progress, "console", Console(stderr=True, force_terminal=False))
+    output = ""
+
+    def printed(word):
+        nonlocal output
+        output += capsys.readouterr().err
+        return word in output
+
     with progress.under_way("driving", 3), progress.under_way("recording"):
+        until(lambda: printed("recording"))
         time.sleep(0.1)
-    output = capsys.readouterr().err
-    _, innermost, after = output.partition("recording")
-    assert innermost and "driving" not in after
+        printed("")
+    assert "driving" not in output.partition("recording")[2]
     with progress.under_way("driving", 3), progress.under_way("recording"):
         pass
+    output = ""
     with progress.under_way("driving", 3):
-        time.sleep(0.1)
-    assert "driving: 0 of 3" in capsys.readouterr().err and not progress.UNDER_WAY
+        until(lambda: printed("driving: 0 of 3"))
+    assert not progress.UNDER_WAY
 
 
 def test_a_plan_is_shown_with_its_tube_and_without_one_if_there_is_none():

@@ -24,8 +24,9 @@ def run_kernel_tests(environment, *options):
     """Run the tests of the kernels in another interpreter."""
     files = [str(TESTS / name) for name in KERNEL_TESTS]
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", *options, *files]
-    there = {"PYTHONPATH": str(TESTS.parent)} | environment
-    run = subprocess.run(command, env=os.environ | there, capture_output=True, text=True, check=False)
+    there = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}  # it is alone
+    there |= {"PYTHONPATH": str(TESTS.parent)} | environment
+    run = subprocess.run(command, env=there, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
 
 
