@@ -48,6 +48,7 @@ class BatchRobots:
         accept_bound: float | None = None,
         conditions: Conditions | None = None,
         ends_on_intervention: bool = False,
+        independent: bool = False,
     ) -> None:
         """Begin the first episode of every robot.
 
@@ -56,7 +57,7 @@ class BatchRobots:
             next_episode: gives number and seed of the episode that a robot begins.
             seed_key, arena, conditions: see `BatchNavigationEnv`.
             penalty, accept_bound: see `BatchSafetyWrapper`.
-            ends_on_intervention: see `EpisodeRunner`.
+            ends_on_intervention: see `EpisodeRunner`. independent: see `BackupPlanBatch`.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -74,6 +75,7 @@ class BatchRobots:
         if safety is not None:
             aside = robot.task.turn_aside
             self._filtered = BatchSafetyWrapper(self._env, safety, penalty, accept_bound, turn_aside=aside)
+            self._filtered.plans.independent = independent
         self.observations: NDArray[np.float32]
         self.observations, self._infos = self._env.reset() if self._filtered is None else self._filtered.reset()
 

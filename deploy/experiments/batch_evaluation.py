@@ -32,9 +32,16 @@ ONE_BY_ONE = "evaluate without --backend batch"
 
 
 def drive_batch(
-    robot: RobotWithTask, what: Evaluation, first: int, episodes: int, take: Callable[[pb.Step], object]
+    robot: RobotWithTask,
+    what: Evaluation,
+    first: int,
+    episodes: int,
+    take: Callable[[pb.Step], object],
+    independent: bool = False,
 ) -> None:
     """Drive the episodes of an evaluation: see `drive_episodes`.
+
+    independent: each episode begins without a widening, as a robot's first one does.
 
     Raises:
         NoBatch: this robot, policy, method, arena or fleet can only be evaluated one by one.
@@ -44,6 +51,7 @@ def drive_batch(
 
     safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
     others: dict[str, Any] = {"accept_bound": what.accept_bound, "conditions": what.conditions}
+    others["independent"] = independent
     drive_episodes(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take, **others)
 
 
@@ -65,7 +73,7 @@ def drive_episodes(
     Args:
         take: called with each step of these episodes. The steps of a robot (`step.actor`) come in order.
         begin: called with the description of each of these episodes, before its first step.
-        others: accept_bound, conditions: see `BatchRobots`.
+        others: accept_bound, conditions, independent: see `BatchRobots`.
 
     Raises:
         NoBatch, TooLoose: see `BatchRobots`.

@@ -146,7 +146,7 @@ class CampaignDriver:
                 rows[step.episode] = table.pop()
                 each()
 
-        drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take)
+        drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take, independent=True)
         return [rows[number] for number in range(first, first + episodes)]
 
 

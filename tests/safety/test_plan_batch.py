@@ -58,6 +58,11 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
         for row in np.flatnonzero(ended):
             singles[row].backup_plan.reset()
     assert plans.widening[1] > 1.5 and plans.widening[[0, 2, 3]].max() < 1.3
+    plans.reset(np.arange(size) == 1)
+    assert plans.widening[1] > 1.5, "it is the same robot in another episode"
+    plans.independent = True
+    plans.reset(np.arange(size) == 1)
+    assert plans.widening[1] == 1.0
     env.close()
 
 

@@ -62,6 +62,7 @@ class BackupPlanBatch:
     Attributes:
         plan (B, N, m), input_in_force (B, m): see `BackupPlan`.
         predicted: the sets of the next measured states.
+        independent: a robot whose episode begins anew forgets its scores, as if it were another one.
     """
 
     def __init__(self, safety: BatchMethod, size: int, turn_aside: bool = False) -> None:
@@ -74,6 +75,7 @@ class BackupPlanBatch:
         if robot.late or robot.feedback or not robot.position_dim:
             raise ValueError(f"{robot.name} keeps no plans in batches: decide with BackupPlan, one robot at a time")
         N, n, m = robot.horizon, robot.state_dim, robot.action_dim
+        self.independent = False
         self.safety, self.robot, self._size, self._turn_aside = safety, robot, size, turn_aside
         self.plan, self.input_in_force = np.zeros((size, N, m)), np.zeros((size, m))
         self.predicted = PredictionArrays(
@@ -88,11 +90,13 @@ class BackupPlanBatch:
         self.reset(np.ones(size, dtype=bool))
 
     def reset(self, which: Flags) -> None:
-        """Begin an episode of some robots (B,): they stand. Their scores stay."""
+        """Begin an episode of some robots (B,): they stand. Their scores stay, unless episodes are independent."""
         zero = self.robot.zero_input()
         self.input_in_force[which], self.plan[which], self._inputs[which] = zero, zero, zero
         self._status[which], self._still[which], self._periods[which] = STANDING, self.robot.horizon, 0
         self.predicted.given[which] = False
+        if self.independent:
+            self._scores[which], self._scored[which] = 0.0, False
 
     @property
     def widening(self) -> Array:
