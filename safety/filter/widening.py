@@ -95,10 +95,12 @@ class Widening:
         """Add the last period alone, for a model set that cannot score windows: how much of its widened set was used.
 
         Such a set predicts plans, and a robot that drives freely follows each plan for its first period only. If the
-        state is outside after this period, the plan has left its tube.
+        state is outside after this period, the plan has left its tube. A period within its stated set counts as
+        nothing, so these sets stay as narrow as they were measured until the robot leaves one.
         """
         if self._factors:
-            self._add(used * self._factors[-1], used > 1.0)
+            score = used * self._factors[-1]
+            self._add(score if score > 1.0 else 0.0, used > 1.0)
 
     def _add(self, score: float, left: bool) -> None:
         if self._factors and self._uncounted >= self.robot.horizon:

@@ -119,7 +119,7 @@ def test_a_model_set_that_scores_no_windows_is_widened_by_what_each_period_uses(
         plan.accept(np.zeros((GROUND.horizon, 2)), "one", predicted, True, **decided)
         widening.append(plan.widening.factor)
 
-    for used in (0.0, 0.5, 2.0, 0.8, 1.2, 0.1):
+    for used in (0.0, 0.99, 2.0, 0.8, 1.2, 0.1):
         period(used)
     assert widening == pytest.approx([1.0, 1.0, 2.0 * RESERVE, 2.0 * RESERVE, 2.4 * RESERVE**2, 2.4 * RESERVE**2])
     period(5.0, judges=True)

@@ -190,7 +190,8 @@ class BackupPlanBatch:
         self._scored |= first
         self._judge(rows & ~first & answers.scored, answers.score)
         if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
-            self._judge(rows & ~first & self.predicted.given, self._used(states) * self._widened)
+            used = self._used(states) * self._widened
+            self._judge(rows & ~first & self.predicted.given, np.where(used <= 1.0, 0.0, used))
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
