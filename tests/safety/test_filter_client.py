@@ -39,9 +39,9 @@ def test_an_answer_in_process_is_the_answer_of_a_service(model):
     alone, asked = InProcess(Filter(model), accept_bound=1.0), ServiceClient(model)
     kinds = set()
     for action, away in (([0.1, 0.1], 3.0), ([float("nan"), 0.0], 3.0), ([0.25, 0.0], 0.4), ([0.25, 0.0], 0.3)):
-        one, other = (client.decide(np.zeros(5), action, [cylinder(away, 0.0)]) for client in (alone, asked))
-        for client in (alone, asked):
-            client.backup_plan.reset()  # it has not moved
+        predicted = alone.backup_plan.predicted
+        state = np.zeros(5) if predicted is None else predicted.center
+        one, other = (client.decide(state, action, [cylinder(away, 0.0)]) for client in (alone, asked))
         assert type(one) is Answer and same(one, other), (one, other)
         kinds.add(one.kind)
     assert kinds == {"allowed", "adjusted", "failsafe"}
