@@ -16,7 +16,7 @@ FIRST = 2.0  # s until the first line; shorter work prints none
 AGAIN = 10.0  # s between two lines
 PERCENT = 100  # items of one piece of work, of which only the share that is done is known
 UNDER_WAY: list[threading.Event] = []  # nested work that prints lines; only the innermost prints
-PRINTING = threading.Lock()  # no outer work prints after inner work has begun
+PRINTING = threading.Lock()  # outer work must not print after inner work has begun
 T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)

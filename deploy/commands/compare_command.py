@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from rich.markdown import Markdown
 from brakeline.deploy import progress
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import (
     RESULTS,
     RUNS,
@@ -118,6 +119,8 @@ class CompareCommand:
         methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
         if unknown := [name for name in methods if name not in METHODS]:
             raise ValueError(f"no method is called {unknown[0]!r}; there are: {', '.join(METHODS)}")
+        if any(METHODS[name].learner == SAC_LEARNER for name in methods):
+            import_module("stable_baselines3")  # a missing extra is told before hours of other trainings
         return methods
 
     def _jobs(self, robot: str) -> list[Job]:

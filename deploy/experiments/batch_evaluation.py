@@ -41,7 +41,7 @@ def drive_batch(
 ) -> None:
     """Drive the episodes of an evaluation: see `drive_episodes`.
 
-    independent: each episode begins without a widening, as a robot's first one does.
+    independent: each episode begins without a widening. Otherwise a robot keeps it from one episode to the next.
 
     Raises:
         NoBatch: this robot, policy, method, arena or fleet can only be evaluated one by one.
@@ -50,8 +50,11 @@ def drive_batch(
     from brakeline.deploy.experiments.evaluate import FRESH
 
     safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
-    others: dict[str, Any] = {"accept_bound": what.accept_bound, "conditions": what.conditions}
-    others["independent"] = independent
+    others: dict[str, Any] = {
+        "accept_bound": what.accept_bound,
+        "conditions": what.conditions,
+        "independent": independent,
+    }
     drive_episodes(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take, **others)
 
 

@@ -28,8 +28,8 @@ class ComparedMethod:
         learner: TD3 is our own; SAC is Stable-Baselines3's.
         td3: settings of the learner that differ from the others'.
         tuned: the setting that was tuned; empty: none.
-        robots: on which it is compared: all, those that batches simulate, or of these the unicycles, whose inputs are
-            speed and turn rate.
+        robots: on which it is compared. EVERY: all. BATCHES: those that batches simulate. UNICYCLES: of these, the ones
+            whose inputs are speed and turn rate.
     """
 
     label: str

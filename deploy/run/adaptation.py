@@ -240,9 +240,9 @@ def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -
 
 
 def _mean_half_width(model: ModelSet, data: Dataset) -> float:
-    """Return the mean half-width of the position at the end of the driven windows [m].
+    """Return the mean half-width of the position at the end of the windows in the data [m].
 
-    A model set that predicts nothing but plans is asked about the plans that begin like these windows.
+    For a model set that predicts plans only, these are the plans with the first inputs of the windows.
     """
     robot = data.robot
     z = windows(data, robot.horizon, FREE).z

@@ -42,13 +42,16 @@ class Prediction:
         """Return whether the measured state (n,) lies in the set."""
         return all(off <= most + SAME_SET for off, most in self._errors(robot, state))
 
-    def used(self, robot: Robot, state: Array) -> float:
-        """Return how much of the set the measured state (n,) uses: the largest ratio of an error to its half-width."""
+    def share_used(self, robot: Robot, state: Array) -> float:
+        """Return the share of the set that the measured state (n,) uses.
+
+        It is the largest ratio of an error to its half-width. Above 1, the state is outside; NaN gives infinity.
+        """
         shares = [off / most if most > 0.0 else math.inf for off, most in self._errors(robot, state) if off != 0.0]
-        return max(shares, default=0.0) if not any(map(math.isnan, shares)) else math.inf
+        return math.inf if any(map(math.isnan, shares)) else max(shares, default=0.0)
 
     def _errors(self, robot: Robot, state: Array) -> Iterator[tuple[float, float]]:
-        """Return the distance from the center and the half-width of each coordinate."""
+        """Yield the distance from the center and the half-width of each coordinate."""
         away = (state - self.center).tolist()  # a few numbers: a loop is faster than NumPy
         if robot.heading is not None:
             cos, sin = math.cos(self.heading), math.sin(self.heading)
@@ -150,7 +153,7 @@ class BackupPlan:
         elif score is not None:
             self.widening.judge(score)
         elif not judges and self._compare and self.predicted is not None:
-            self.widening.judge_period(self.predicted.used(self.robot, self.seen))
+            self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED

@@ -3,7 +3,7 @@
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
-A filter whose model set predicts nothing but plans scores no window; then the client scores each period by itself.
+Some model sets predict plans only, so the filter cannot score windows. Then the client scores each period itself.
 """
 
 from __future__ import annotations
@@ -91,16 +91,19 @@ class Widening:
         score = score if score == score else np.inf
         self._add(score, bool(self._factors) and score > self._factors[0])
 
-    def judge_period(self, used: float) -> None:
-        """Add the last period alone, for a model set that cannot score windows: how much of its widened set was used.
+    def judge_period(self, share_used: float) -> None:
+        """Add the score of the last period, for a model set that cannot score windows.
 
-        Such a set predicts plans, and a robot that drives freely follows each plan for its first period only. If the
-        state is outside after this period, the plan has left its tube. A period within its stated set counts as
-        nothing, so these sets stay as narrow as they were measured until the robot leaves one.
+        Such a set predicts plans only, and a robot that drives freely follows each plan for one period. If the state is
+        outside after this period, the plan has left its tube. A score of at most 1 counts as 0: the sets keep their
+        stated widths until the robot leaves one.
+
+        Args:
+            share_used: share of the predicted set, as it was widened, that the measured state used.
         """
         if self._factors:
-            score = used * self._factors[-1]
-            self._add(score if score > 1.0 else 0.0, used > 1.0)
+            score = share_used * self._factors[-1]
+            self._add(score if score > 1.0 else 0.0, share_used > 1.0)
 
     def _add(self, score: float, left: bool) -> None:
         if self._factors and self._uncounted >= self.robot.horizon:

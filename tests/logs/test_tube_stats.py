@@ -140,6 +140,19 @@ def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_w
     assert "3 (75.0%); 2 (50.0%) as widened, by up to 3.3 times" in shown
 
 
+def test_the_widening_is_shown_where_no_window_was_scored():
+    """A model set that predicts plans only."""
+    exchanges, curve = [asked(k, pb.ALLOWED) for k in range(3)], LearningCurve()
+    for exchange, widening in zip(exchanges, (1.0, 2.5, 2.0), strict=True):
+        exchange.request.widening, exchange.reply.decision.tube_half_width[:] = widening, [0.1]
+        curve.exchange(exchange)
+    curve.step(pb.Step(actor="a"))
+    shown = printed(show(closed_loop([]) | {"plans": figures([of(*exchanges)])}))
+    assert "sets widened" in shown and "by up to 2.5 times" in shown and "windows outside" not in shown
+    (row,) = curve.figures()["bins"]
+    assert (row["widening"], row["half_width"], row["beyond"]) == (2.5, pytest.approx(0.1), None)
+
+
 def test_the_table_of_a_run_shows_both():
     shown = printed(show(closed_loop([]) | {"plans": left(0.26)}))
     assert "1, left their tube: 1 (100.0%); stated: at most 26 %, at 99 % confidence" in shown

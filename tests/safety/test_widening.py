@@ -132,10 +132,9 @@ def test_a_model_set_that_scores_no_windows_is_widened_by_what_each_period_uses(
 
 @pytest.mark.parametrize("state", [[1.0, 0.0], [np.nan, 0.0]])
 def test_a_set_without_width_or_a_number_is_used_up(state):
-    robot = ROBOT
     center = np.pad(np.array(state), (0, 3))
-    assert Prediction(center, np.zeros(5), 0.0).used(robot, np.zeros(5)) == np.inf
-    assert Prediction(np.zeros(5), np.zeros(5), 0.0).used(robot, np.zeros(5)) == 0.0
+    assert Prediction(center, np.zeros(5), 0.0).share_used(ROBOT, np.zeros(5)) == np.inf
+    assert Prediction(np.zeros(5), np.zeros(5), 0.0).share_used(ROBOT, np.zeros(5)) == 0.0
 
 
 def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_scores():

@@ -24,7 +24,7 @@ PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.a
 RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
 PERSISTENCE = 40  # scans that one thing is rammed for, or driven away from
 PAUSE = 0.02  # s between raw commands
-FASTEST_TURN = 0.498  # rad/s; with what tells commands apart it stays within the base's limit, and comes out unchanged
+FASTEST_TURN = 0.498  # rad/s; each command adds up to 0.001 of its own, and the filter clips commands above 0.5
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -50,7 +50,7 @@ class Driver:
         self.scans = self.heard = 0
         self.wanted = (0.0, 0.0)
         self.aim = 0.0  # rad in the scan's frame, of what is rammed
-        self.sent: dict[float, float] = {}  # when each turn rate [1e-8 rad/s] was asked for that has not come out
+        self.sent: dict[float, float] = {}  # by turn rate, rounded: when a raw command was sent that has not come out
         self.delays: list[float] = []
         self.lock = threading.Lock()
 

@@ -62,7 +62,7 @@ class BackupPlanBatch:
     Attributes:
         plan (B, N, m), input_in_force (B, m): see `BackupPlan`.
         predicted: the sets of the next measured states.
-        independent: a robot whose episode begins anew forgets its scores, as if it were another one.
+        independent: a robot forgets its scores when an episode begins, so no episode depends on another.
     """
 
     def __init__(self, safety: BatchMethod, size: int, turn_aside: bool = False) -> None:
@@ -84,7 +84,7 @@ class BackupPlanBatch:
         self._status, self._still = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int64)
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
-        self._judged, self._widened = False, np.ones(size)  # factor of the predicted sets
+        self._judged, self._widened = False, np.ones(size)  # factors by which the predicted sets were widened
         self._scores, self._place = np.zeros((size, WINDOWS)), np.zeros(size, dtype=np.int64)
         self._scored = np.zeros(size, dtype=bool)
         self.reset(np.ones(size, dtype=bool))
@@ -160,8 +160,8 @@ class BackupPlanBatch:
             away[:, heading] = (away[:, heading] + math.pi) % math.tau - math.pi
         return np.asarray(np.abs(away))
 
-    def _used(self, states: Array) -> Array:
-        """Return how much of their predicted sets measured states (B, n) use: `Prediction.used` for each row."""
+    def _shares_used(self, states: Array) -> Array:
+        """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
         errors = self._errors(states)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(errors == 0.0, 0.0, errors / self.predicted.half_width)
@@ -190,8 +190,8 @@ class BackupPlanBatch:
         self._scored |= first
         self._judge(rows & ~first & answers.scored, answers.score)
         if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
-            used = self._used(states) * self._widened
-            self._judge(rows & ~first & self.predicted.given, np.where(used <= 1.0, 0.0, used))
+            scores = self._shares_used(states) * self._widened
+            self._judge(rows & ~first & self.predicted.given, np.where(scores <= 1.0, 0.0, scores))
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)

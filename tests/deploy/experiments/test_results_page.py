@@ -1,6 +1,7 @@
 """The results page: every figure follows from the stored cells, and cells of different conditions are not mixed."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -114,3 +115,10 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(tmp_path):
 def test_the_best_learner_has_the_fewest_collisions_of_those_that_reach_the_goal():
     rows = [{"goals": g, "collisions": c, "episodes": 120} for g, c in ((110, 4), (108, 1), (90, 0), (112, 1))]
     assert best_learner(rows) is rows[3]
+
+
+def test_a_missing_extra_of_a_method_is_told_before_any_training(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(ModuleNotFoundError, match="stable_baselines3"):
+        CompareCommand(("ground",), methods=("none", "sac"), results=tmp_path, runs=tmp_path, quiet=True).run()
+    assert not list(tmp_path.iterdir())

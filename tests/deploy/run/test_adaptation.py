@@ -99,7 +99,7 @@ def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(ki
     assert 0.5 < ratio[0] / ratio[1] < 2.0, "as if the changed robot had been recorded"
 
 
-def test_a_set_that_predicts_plans_is_compared_on_plans_that_begin_as_the_driving():
+def test_a_set_that_predicts_plans_only_is_compared_on_plans_with_the_first_driven_inputs():
     data = Dataset(ROBOT, driven(2, 7, slip=-0.15))
     free, stops = certify(record(1, 6), ModelConfig(mode=DIRECT, windows=FREE))[0], plan_regressor_map(ROBOT)
     plans = replace(
@@ -247,7 +247,7 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, pr
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
 
 
-def test_nothing_adapts_without_a_key_to_sign_or_from_sets_of_no_plans(tmp_path):
+def test_nothing_adapts_without_a_key_to_sign_or_with_a_set_of_mode_recursion(tmp_path):
     with pytest.raises(Untrusted, match="--adapt needs keys"):
         check_signer(None)
     with pytest.raises(Untrusted, match="no key to sign models with"):
