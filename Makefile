@@ -5,7 +5,8 @@ STAMP := .venv/.installed
 
 # Compiles all loops (Numba), if their code has changed. Otherwise the first command or each test would wait for it.
 define COMPILE
-$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels' & \
+$(BIN)/python -c 'import brakeline.safety.filter.filter, brakeline.safety.filter.kernels.window_kernels, \
+		brakeline.safety.filter.kernels.window_rollout_kernels' & \
 	$(BIN)/python -c 'import brakeline.safety.perception.occluded_regions as regions; regions.prepare(); \
 		import brakeline.sim.kernels.flight_kernels as flight; flight.prepare(); \
 		import brakeline.sim.kernels.arena_kernels, brakeline.sim.kernels.ray_kernels' && wait $$!

@@ -25,7 +25,7 @@ from scipy.optimize import linprog
 
 from brakeline.compilation import compiled
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.error_bounds import envelope, least_squares, whitening
+from brakeline.safety.model.error_bounds import envelopes, least_squares, whitening
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features
 from brakeline.safety.model.one_step_fitting import Samples
@@ -51,13 +51,12 @@ class Noise:
 
     @staticmethod
     def of(features: Features, s: Samples) -> Noise:
-        """Return the envelope of the out-of-fold errors, scaled to the quantile of the one-step form."""
+        """Return the envelopes of the out-of-fold errors, scaled to the quantile of the one-step form."""
         phi, off = features(s.v), np.empty_like(s.y)
         for fold in np.unique(s.period_fold):
             held = s.period_fold == fold
             off[held] = s.y[held] - phi[held] @ least_squares(phi[~held], s.y[~held]).T
-        bounds = [envelope(np.abs(s.v), np.abs(column), 1.0) for column in off.T]
-        noise = Noise(np.array([kappa for kappa, _ in bounds]), np.array([w for _, w in bounds]))
+        noise = Noise(*envelopes(np.abs(s.v), np.abs(off), 1.0))
         scores = np.sort((np.abs(off) / noise.sizes(s.v)).max(1))
         factor = scores[min(math.ceil((len(scores) + 1) * (1.0 - ModelConfig.outside)), len(scores)) - 1]
         return Noise(factor * noise.kappa, factor * noise.w)

@@ -94,20 +94,34 @@ def whitening(z: Array) -> Array:
         raise ErrorBoundError("the regressors do not span their space: record more varied inputs") from None
 
 
-def envelope(features: Array, values: Array, inflation: float, typical: Array | None = None) -> tuple[Array, float]:
-    """Return the envelope (κ, w) with κ f + w >= v for all samples, times `inflation` (docs/method.md §1c).
+def envelopes(features: Array, values: Array, inflation: float, typical: Array | None = None) -> tuple[Array, Array]:
+    """Return the envelopes (κ, w) with κ_i f + w_i >= v_i for all samples, times `inflation` (docs/method.md §1c).
 
-    A linear program minimises the mean of the bound over features f (T, q) >= 0 with values v (T,) >= 0, or over the
-    features `typical` (T', q). It starts from
-    few samples and adds violated ones until there are none. What its tolerance leaves violated is added to w.
+    A linear program minimises the mean of each bound, or the bound at `typical` features. It starts from few samples
+    and adds violated ones until there are none. What its tolerance leaves violated is added to w.
+
+    Args:
+        features (T, q), values (T, n): samples, none negative.
+        inflation: factor on the bounds.
+        typical (q,): features for which the bounds are tightest; by default the samples' mean.
+
+    Returns:
+        κ (n, q) and w (n,).
     """
-    from scipy.optimize import linprog  # here: it takes half a second to load, and a service does not need it
-
     if not len(values):
         raise ErrorBoundError("no sample to bound")
-    cost = np.append((features if typical is None else typical).mean(0), 1.0)
+    cost = np.append(features.mean(0) if typical is None else typical, 1.0)
     rows = np.column_stack([features, np.ones(len(features))])
-    active = np.unique(np.concatenate([np.argsort(values)[-ROWS_A_ROUND:], rows.argmax(0)]))
+    farthest = rows.argmax(0)
+    found = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v in values.T]) * inflation
+    return found[:, :-1], found[:, -1]
+
+
+def _envelope(rows: Array, values: Array, cost: Array, active: NDArray[np.int64]) -> Array:
+    """Return the bound [κ, w] (q + 1,) of one coordinate. active: some samples to start from, besides the largest."""
+    from scipy.optimize import linprog  # here: it takes half a second to load, and a service does not need it
+
+    active = np.union1d(_largest(values), active)
     scale = float(values.max()) or 1.0
     while True:
         found = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
@@ -115,21 +129,24 @@ def envelope(features: Array, values: Array, inflation: float, typical: Array | 
             raise ErrorBoundError(f"no envelope of the residuals: {found.message}")
         bound = np.maximum(found.x, 0.0)
         short = values / scale - rows @ bound
-        worst = np.argsort(short)[-ROWS_A_ROUND:]
+        worst = _largest(short)
         more = np.union1d(active, worst[short[worst] > 1e-7])
         if len(more) == len(active):
             bound[-1] += max(float(short.max()), 0.0) + 1e-9
-            bound *= scale * inflation
-            return bound[:-1], float(bound[-1])
+            return np.asarray(bound * scale)
         active = more
+
+
+def _largest(values: Array) -> NDArray[np.int64]:
+    """Return the indices of the `ROWS_A_ROUND` largest values (T,), in no order."""
+    return np.argpartition(values, -min(ROWS_A_ROUND, len(values)))[-ROWS_A_ROUND:]
 
 
 def residual(z: Array, y: Array, C: Array, inflation: float = 1.0) -> ErrorBound:
     """Return bound (c): the predictor C (n, nz), and an envelope of its residual over z (T, nz), y (T, n)."""
     n, nz = C.shape
     rest = np.abs(y - z @ C.T)
-    bounds = [envelope(np.abs(z), rest[:, j], inflation) for j in range(n)]
-    kappa, w = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
+    kappa, w = envelopes(np.abs(z), rest, inflation)
     return ErrorBound(C, np.zeros((0, nz)), np.zeros((n, 0)), kappa, w, np.eye(n))
 
 

@@ -131,15 +131,15 @@ class OneStep:
 
     def rollouts(self, robot: Robot, z: Array) -> Array:
         """Return the outputs (T, N, n + d·discs) for windows z (T, r + N·m), as `predicted_outputs` has them."""
-        from brakeline.safety.filter.kernels import rollout_kernels
+        from brakeline.safety.filter.kernels import window_rollout_kernels
 
-        return rollout_kernels.rollouts(self.arguments(robot), np.ascontiguousarray(z))
+        return window_rollout_kernels.rollouts(self.arguments(robot), np.ascontiguousarray(z))
 
     def stretches(self, robot: Robot, z: Array) -> Array:
         """Return the factors on the sets (T, N) of windows z (T, r + N·m), at least 1: sqrt(1 + weight · leverage)."""
-        from brakeline.safety.filter.kernels import rollout_kernels
+        from brakeline.safety.filter.kernels import window_rollout_kernels
 
-        return rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
+        return window_rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
 
     def leverages(self, robot: Robot, z: Array) -> Array:
         """Return the leverages (T, N) of windows z (T, r + N·m), with which the sets grow."""

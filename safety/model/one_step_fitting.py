@@ -311,7 +311,7 @@ def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> 
     largest = stopping_distance_of_stops(data, model_config)
     ended = ~np.isnan(s.stops)
     if int(ended.sum()) < FEWEST_ENDS:
-        spread = np.zeros((data.robot.horizon, 1, spread_features(data.robot, s.z[:1], 1).shape[1]))
+        spread = np.zeros((data.robot.horizon, 1, spread_features(data.robot, s.z[:1]).shape[2]))
         shape = Shape(spread, np.full((data.robot.horizon, 1), largest))
     else:
         ways_on = np.repeat(s.stops[ended, None, None], data.robot.horizon, axis=1)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.error_bounds import ErrorBound, envelope
+from brakeline.safety.model.error_bounds import ErrorBound, envelopes
 from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
@@ -16,21 +17,31 @@ Array = NDArray[np.float64]
 FULL_SPEED = 0.1  # weight of a stop from full speed among the plans for which a shape is tightest
 RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
+MOST_TYPICAL = 5_000  # windows from whose starts the typical plans begin: more hardly change their mean
 CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 
 
-def spread_features(robot: Robot, z: Array, k: int) -> Array:
-    """Return the features (T, q) with which half-widths grow after k periods, for regressors z (T, r + m + N·m).
+def spread_features(robot: Robot, z: Array, last: bool = False) -> Array:
+    """Return the features (N, T, q) with which half-widths grow in each period, for regressors z (T, r + m + N·m).
 
-    These are the speeds, the input in force, and the means of the k inputs and of their jumps, each without its sign:
-    with a slope for each input, minutes of driving would not determine a half-width. A jump is the first change, or the
-    difference of a change from the one before: a steady ramp, such as braking, does not jump.
+    These are the speeds, the input in force, and the means of the inputs so far and of their jumps, each without its
+    sign: with a slope for each input, minutes of driving would not determine a half-width. A jump is the first change,
+    or the difference of a change from the one before: a steady ramp, such as braking, does not jump.
+    last: of the last period alone (1, T, q).
     """
     known, m = robot.regressor_dim, robot.action_dim
-    inputs = z[:, known - m :].reshape(len(z), -1, m)[:, : k + 1]  # from the input in force on
-    jumps = np.diff(np.diff(inputs, axis=1), axis=1, prepend=0.0)
-    return np.hstack([np.abs(z[:, :known]), np.abs(inputs[:, 1:]).mean(1), np.abs(jumps).mean(1)])
+    inputs = np.moveaxis(z[:, known - m :].reshape(len(z), -1, m), 1, 0)  # from the input in force on
+    changes = np.diff(inputs, axis=0)
+    driven = np.concatenate([inputs[1:], np.diff(changes, axis=0, prepend=0.0)], axis=2)
+    driven = np.abs(driven, out=driven)
+    if last:
+        means = driven.sum(0, keepdims=True) / len(driven)
+    else:
+        means = driven.cumsum(0)
+        means /= np.arange(1.0, len(driven) + 1.0)[:, None, None]
+    speeds = np.broadcast_to(np.abs(z[:, :known]), (len(means), len(z), known))
+    return np.concatenate([speeds, means], axis=2)
 
 
 def plans_from(robot: Robot, z: Array) -> Array:
@@ -68,9 +79,8 @@ class Shape:
 
     def widths(self, robot: Robot, z: Array, last: bool = False) -> Array:
         """Return half-widths (T, N, n') for regressors z (T, nz). last: of a shape of the last period alone."""
-        first = robot.horizon if last else 1
-        parts = [spread_features(robot, z, first + k) @ slopes.T for k, slopes in enumerate(self.slopes)]
-        return np.asarray(np.stack(parts, axis=1) + self.w)
+        grown = spread_features(robot, z, last) @ np.swapaxes(self.slopes, 1, 2)
+        return np.ascontiguousarray(np.moveaxis(grown, 0, 1) + self.w)
 
     def scores(self, robot: Robot, z: Array, errors: Array, last: bool = False) -> Array:
         """Return the largest ratio (T,) of the errors (T, N, n') to the half-widths."""
@@ -109,19 +119,19 @@ class Shape:
 
     @staticmethod
     def _holding(robot: Robot, z: Array, errors: Array, inflation: float, last: bool, speeds: bool) -> Shape:
-        _, N, n = errors.shape
-        found, plans, full = [], plans_from(robot, z), stop_from_full_speed(robot, z)
-        for k in range(N):
-            period = robot.horizon if last else k + 1
-            used, typical = spread_features(robot, z, period), spread_features(robot, plans, period).mean(0)
-            typical += FULL_SPEED * (spread_features(robot, full, period)[0] - typical)
-            if not speeds:
-                used[:, : len(robot.regressor)] = typical[: len(robot.regressor)] = 0.0
-            found += [envelope(used, np.abs(errors[:, k, i]), inflation, typical[None]) for i in range(n)]
+        measured, shape = len(robot.regressor), errors.shape[1:]
+        used = spread_features(robot, z, last)
+        some = z[:: math.ceil(len(z) / MOST_TYPICAL)]
+        typical = spread_features(robot, plans_from(robot, some), last).mean(1)
+        typical += FULL_SPEED * (spread_features(robot, stop_from_full_speed(robot, z), last)[:, 0] - typical)
+        if not speeds:
+            used[..., :measured] = typical[:, :measured] = 0.0
+        each = zip(used, np.moveaxis(np.abs(errors), 1, 0), typical, strict=True)
+        found = [envelopes(features, values, inflation, some) for features, values, some in each]
         slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
         if not speeds:
-            slopes[:, : len(robot.regressor)] = 0.0
-        return Shape(slopes.reshape(N, n, -1), w.reshape(N, n))
+            slopes[..., :measured] = 0.0
+        return Shape(slopes.reshape(*shape, -1), w.reshape(shape))
 
     def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
         """Return the error bound of some coordinates after k periods, each times its factor; without a predictor.

@@ -131,8 +131,18 @@ def regressors_of_braking(z_0, braking, action):
     return np.concatenate([z_0, (braking * action).ravel()])
 
 
+def rollout(predictor, window):
+    """`rollout_kernels.rollout`."""
+    return rollouts(predictor, window[None])[0]
+
+
+def stretch(predictor, root, weight, window):
+    """`rollout_kernels.stretch`."""
+    return stretches(predictor, root, weight, window[None])[0]
+
+
 def rollouts(predictor, z):
-    """`rollout_kernels.rollouts`."""
+    """`window_rollout_kernels.rollouts`."""
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     r, found = len(others), []
     for window in z:
@@ -155,7 +165,7 @@ def rollouts(predictor, z):
 
 
 def stretches(predictor, root, weight, z):
-    """`rollout_kernels.stretches`."""
+    """`window_rollout_kernels.stretches`."""
     C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, found = len(others), []
     for window in z:

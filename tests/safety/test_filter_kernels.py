@@ -12,6 +12,7 @@ from brakeline.safety.filter.kernels import (
     shape_kernels,
     tube_kernels,
     window_kernels,
+    window_rollout_kernels,
 )
 from tests.safety import kernel_twins
 
@@ -25,6 +26,7 @@ MODULES = (
     rollout_kernels,
     shape_kernels,
     window_kernels,
+    window_rollout_kernels,
 )
 
 
@@ -115,6 +117,8 @@ def cases(rng, d):
         "sets": (*tube, z, start, turn, measured),
         "extent": (*tube, z, 0.105),
         "next_state": (*step, z, rng.normal(size=9), widening, start, turn),
+        "rollout": (predictor, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
+        "stretch": (predictor, *leverage, 0.5 * rng.normal(size=2 + 2 + 2 * N)),
         "rollouts": (predictor, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
         "stretches": (predictor, *leverage, 0.5 * rng.normal(size=(5, 2 + 2 + 2 * N))),
         "affine": (predictor, *plan, np.array([d + 1, d])),

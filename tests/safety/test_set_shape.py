@@ -18,7 +18,7 @@ def windows(count, seed=0):
 def test_a_steady_ramp_does_not_jump_beyond_its_first_change():
     ramp = np.arange(N + 1.0)[:, None] * np.ones(M)
     z = np.concatenate([np.zeros(KNOWN - M), ramp.ravel()])[None]
-    assert spread_features(ROBOT, z, N)[0, -M:] == pytest.approx(np.full(M, 1.0 / N))
+    assert spread_features(ROBOT, z)[-1, 0, -M:] == pytest.approx(np.full(M, 1.0 / N))
 
 
 def test_the_error_bounds_of_a_shape_have_its_half_widths():

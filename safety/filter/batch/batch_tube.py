@@ -109,7 +109,7 @@ class RolloutBatch:
     def _periods(self, window: Array) -> Any:
         """Yield, for each period: its index, the features, the primitives, the outputs y (n, B), and a row of outputs.
 
-        The row (n + D·d) is a list of arrays (B,): see `rollout_kernels.rollouts`.
+        The row (n + D·d) is a list of arrays (B,): see `rollout_kernels.rollout`.
         """
         xp, r, m, d = self._xp, len(self._others), self._inputs, self._d
         nothing = xp.zeros_like(window[0])

@@ -138,60 +138,58 @@ def _write(
                 slope[at + 1, c] += east * dpose[0, c]
 
 
-@compiled(f"f8[:,:,::1]({PREDICTOR}, f8[:,::1])")
-def rollouts(predictor: Predictor, z: Array) -> Array:
-    """Return the outputs (T, N, n + D·d) after each period, in the frame of the start, for windows z (T, r + m + N·m).
+@compiled(f"f8[:,::1]({PREDICTOR}, f8[::1])")
+def rollout(predictor: Predictor, z: Array) -> Array:
+    """Return the outputs (N, n + D·d) after each period, in the frame of the start, for a window z (r + m + N·m,).
 
     The outputs are the displacement, the change of heading and the other coordinates, as in `Windows.y`, then the
     displacements of the discs at `arms`.
     """
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r = len(C), len(others)
-    N = (z.shape[1] - r) // inputs - 1
-    found, v, y = np.zeros((len(z), N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
+    N = (len(z) - r) // inputs - 1
+    found, v, y = np.zeros((N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
     p, total = np.empty(1 + len(v) + len(saturations)), np.zeros(len(terms))
-    pose, flat = np.empty(1 + d), np.empty((found.shape[2], 0))  # no gradient
-    for t in range(len(z)):
-        pose[:], v[:r] = 0.0, z[t, :r]
-        for k in range(N):
-            now = r + (k + 1) * inputs
-            v[r : r + inputs], v[r + inputs :] = z[t, now : now + inputs], z[t, now - inputs : now]
-            _predict(C, scale, saturations, terms, v, p, total, y)
-            _move(y, flat[:n], pose, flat[: 1 + d], heading)
-            _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, found[t, k], flat)
-            for i in range(r):
-                v[i] = y[others[i]]
+    pose, flat = np.zeros(1 + d), np.empty((found.shape[1], 0))  # no gradient
+    v[:r] = z[:r]
+    for k in range(N):
+        now = r + (k + 1) * inputs
+        v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
+        _predict(C, scale, saturations, terms, v, p, total, y)
+        _move(y, flat[:n], pose, flat[: 1 + d], heading)
+        _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, found[k], flat)
+        for i in range(r):
+            v[i] = y[others[i]]
     return found
 
 
-@compiled(f"f8[:,::1]({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
-def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
-    """Return the factors sqrt(1 + weight h_k) (T, N) on the sets of windows z (T, r + m + N·m).
+@compiled(f"f8[::1]({PREDICTOR}, f8[:,::1], f8, f8[::1])")
+def stretch(predictor: Predictor, root: Array, weight: float, z: Array) -> Array:
+    """Return the factors sqrt(1 + weight h_k) (N,) on the sets of a window z (r + m + N·m,).
 
     h_k = |root Σ_{j<k} φ_j|² / k is the leverage of the first k periods (docs/method.md §14).
     """
     C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, F = len(others), len(terms)
-    N = (z.shape[1] - r) // inputs - 1
-    found, v, y = np.empty((len(z), N)), np.empty(r + 2 * inputs), np.empty(len(C))
-    p, total, along = np.empty(1 + len(v) + len(saturations)), np.empty(F), np.empty(F)
+    N = (len(z) - r) // inputs - 1
+    found, v, y = np.empty(N), np.empty(r + 2 * inputs), np.empty(len(C))
+    p, total, along = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty(F)
     across = root.T.copy()  # so that the inner loop runs along memory, and is vectorized
-    for t in range(len(z)):
-        total[:], v[:r] = 0.0, z[t, :r]
-        for k in range(N):
-            now = r + (k + 1) * inputs
-            v[r : r + inputs], v[r + inputs :] = z[t, now : now + inputs], z[t, now - inputs : now]
-            _predict(C, scale, saturations, terms, v, p, total, y)
-            along[:], square = 0.0, 0.0
-            for j in range(F):
-                column, sums = across[j, j:], along[j:]
-                for i in range(len(column)):
-                    sums[i] += column[i] * total[j]
-            for i in range(F):
-                square += along[i] * along[i]
-            found[t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
-            for i in range(r):
-                v[i] = y[others[i]]
+    v[:r] = z[:r]
+    for k in range(N):
+        now = r + (k + 1) * inputs
+        v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
+        _predict(C, scale, saturations, terms, v, p, total, y)
+        along[:], square = 0.0, 0.0
+        for j in range(F):
+            column, sums = across[j, j:], along[j:]
+            for i in range(len(column)):
+                sums[i] += column[i] * total[j]
+        for i in range(F):
+            square += along[i] * along[i]
+        found[k] = math.sqrt(1.0 + weight * (square / (k + 1)))
+        for i in range(r):
+            v[i] = y[others[i]]
     return found
 
 
@@ -273,11 +271,11 @@ def sets_around(
         Positions (N, d) and their generators (N, d, L), the same of the kept coordinates, all coordinates after one
         period (n,), and the factors (N,) that the generators hold.
     """
-    window = np.zeros((1, len(T)))
+    window = np.zeros(len(T))
     for i in range(len(T)):
         for j in range(len(z)):
-            window[0, i] += T[i, j] * z[j]
-    outputs, stretch = rollouts(predictor, window)[0], stretches(predictor, root, weight, window)[0].copy()
+            window[i] += T[i, j] * z[j]
+    outputs, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
     (N, d, _), k = directions.shape, len(kept)
     centers, wide, more, more_wide = (
         np.empty((N, d)),
@@ -287,8 +285,8 @@ def sets_around(
     )
     for i in range(N):
         for axis in range(d):
-            centers[i, axis], wide[i, axis] = outputs[i, axis], stretch[i] * directions[i, axis]
+            centers[i, axis], wide[i, axis] = outputs[i, axis], wider[i] * directions[i, axis]
         for axis in range(k):
             more[i, axis] = outputs[i, kept[axis]]
-        more_wide[i] *= stretch[i]
-    return centers, wide, more, more_wide, outputs[0, : len(predictor[0])].copy(), stretch
+        more_wide[i] *= wider[i]
+    return centers, wide, more, more_wide, outputs[0, : len(predictor[0])].copy(), wider

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from brakeline.compilation import compiled
-from brakeline.safety.filter.kernels.rollout_kernels import PREDICTOR, Array, Index, rollouts, stretches
+from brakeline.safety.filter.kernels.rollout_kernels import PREDICTOR, Array, Index, rollout, stretch
 from brakeline.safety.model.one_step import Predictor
 
 
@@ -35,12 +35,11 @@ def score(
     """
     _, _, _, _, others, heading, _, d, _ = predictor
     r = len(others)
-    z = np.empty((1, r + executed.size))
-    window = z[0]
+    window = np.empty(r + executed.size)
     for i in range(r):
         window[i] = states[0, others[i]]
     window[r:] = executed.ravel()
-    predicted, stretch = rollouts(predictor, z)[0], stretches(predictor, root, weight, z)[0]
+    predicted, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
     atoms, first, largest = np.zeros(len(W)), states[0], 0.0
     for i in range(len(W)):
         for j in range(len(window)):
@@ -62,7 +61,7 @@ def score(
                 width += kappa[k, i, j] * abs(window[j])
             for j in range(len(atoms)):
                 width += M[k, i, j] * atoms[j]
-            share = off / (width * stretch[k]) if off != 0.0 else 0.0
+            share = off / (width * wider[k]) if off != 0.0 else 0.0
             if share != share:
                 return share
             largest = max(largest, share)
