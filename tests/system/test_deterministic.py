@@ -1,4 +1,7 @@
-"""Test `--deterministic`: the weights depend on the seed alone, however fast the run is and however often it stops."""
+"""Test `--deterministic`: the weights depend on the seed alone, however fast the run is and however often it stops.
+
+The run that stops is also the test of how a run ends and is resumed.
+"""
 
 import signal
 from pathlib import Path
@@ -8,6 +11,7 @@ import pytest
 from brakeline.deploy.run.processes import CONFIG
 from brakeline.deploy.run.run_config import load
 from brakeline.learner.checkpoint import exists
+from brakeline.logs.figure_tables import analyse
 from brakeline.logs.reader import read
 from tests.system.runs import Run
 from tests.waiting import until
@@ -41,13 +45,30 @@ def test_the_seed_decides_where_robots_go_and_what_the_learner_draws(uninterrupt
     assert first_goal(folder) != first_goal(logged_run)
 
 
-def test_a_second_run_with_the_seed_gives_the_same_weights_though_interrupted_and_resumed(uninterrupted, tmp_path):
+def test_interrupted_it_ends_in_order_and_resumed_it_gives_the_same_weights(uninterrupted, tmp_path):
     with Run(tmp_path / "run", *SHORT, "--seed", 3) as run:
         run.watch()
         until(lambda: exists(run.folder / "learner" / "checkpoint"), "a checkpoint")
         run.until_steps(30)  # within the second episode
         figures = run.end(signal.SIGINT)
-        assert not figures["finished"] and figures["steps"] < 600
+        assert run.popen.returncode == 130, run.errors.read_text()
+    assert not figures["finished"] and figures["steps"] < 600 and figures["policies"]
+    before = analyse(run.folder)
+    assert (before["cuts"], before["steps"], before["seconds"] > 0) == ([], figures["steps"], True)
+    assert not any(topic["missing"] for topic in before["topics"].values())
+    assert not [name for name, process in before["processes"].items() if process["alive"] and "actor" in name]
+    last = max(record.message.episode for record in read(run.folder) if record.topic == "episode")
+
     with Run(run.folder, fresh=False) as resumed:
-        assert weights(resumed) == uninterrupted[1]
+        figures = resumed.end()
+        assert resumed.popen.returncode == 0, resumed.errors.read_text()
+    assert (run.folder / "learner" / "policy.safetensors").read_bytes() == uninterrupted[1]
     assert first_goal(run.folder) == first_goal(uninterrupted[0])
+    assert figures["finished"] and figures["learners"]["ground"]["steps"] == 600, "whole episodes"
+    after = analyse(run.folder)
+    assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run_0001.mcap"]
+    assert after["steps"] == before["steps"] + figures["steps"]
+    assert not any(topic["missing"] for topic in after["topics"].values())
+    assert after["processes"]["learner"]["starts"] == 2
+    episodes = [record.message.episode for record in read(run.folder / "run_0001.mcap") if record.topic == "episode"]
+    assert episodes and min(episodes) <= last + 1 and max(episodes) >= last, "episodes go on"

@@ -17,7 +17,7 @@ from brakeline.deploy.run.processes import CONFIG
 from brakeline.deploy.run.run_config import EXPERIMENTS, encode
 from brakeline.learner.checkpoint import exists
 from brakeline.logs.figure_tables import analyse
-from brakeline.logs.reader import open_log, read
+from brakeline.logs.reader import open_log
 from tests.robots import GROUND
 from tests.system.runs import Run, alive, brakeline
 from tests.waiting import PATIENCE, until
@@ -75,34 +75,6 @@ def _braked_as_committed(records):
                 plans[step.actor, step.episode, step.step] = before[1:]
     failures = [r for r in records if r.topic == "exchange" and r.message.failure]
     assert len(failures) == fallbacks, "who stands and waits takes no step"
-
-
-def test_interrupted_it_ends_in_order_and_is_resumed(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 500) as run:
-        run.until_steps(180)
-        figures = run.end(signal.SIGINT)
-        assert run.popen.returncode == 130, run.errors.read_text()
-    learned = figures["learners"]["ground"]["steps"]
-    assert not figures["finished"] and 80 < learned < 500
-    assert exists(run.folder / "learner" / "checkpoint") and figures["policies"]
-    before = analyse(run.folder)
-    assert (before["cuts"], before["steps"], before["seconds"] > 0) == ([], figures["steps"], True)
-    assert not any(topic["missing"] for topic in before["topics"].values())
-    assert not [name for name, process in before["processes"].items() if process["alive"] and "actor" in name]
-    last = max(record.message.episode for record in read(run.folder) if record.topic == "episode")
-
-    with Run(run.folder, fresh=False) as resumed:
-        figures = resumed.end()
-        assert resumed.popen.returncode == 0, resumed.errors.read_text()
-    assert figures["finished"] and figures["learners"]["ground"]["steps"] == 500, "--steps is that of the run"
-    assert figures["steps"] < 500 + 64 - learned + 64
-    after = analyse(run.folder)
-    assert [path.rsplit("/", 1)[1] for path in after["log"]] == ["run.mcap", "run_0001.mcap"]
-    assert after["steps"] == before["steps"] + figures["steps"]
-    assert not any(topic["missing"] for topic in after["topics"].values())
-    assert after["processes"]["learner"]["starts"] == 2
-    episodes = [record.message.episode for record in read(run.folder / "run_0001.mcap") if record.topic == "episode"]
-    assert episodes and min(episodes) <= last + 1 and max(episodes) >= last, "episodes go on, they are not repeated"
 
 
 def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
