@@ -25,8 +25,28 @@ from brakeline.sim.wind import Wind
 
 
 def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
-    """Return the function that makes quadrotors behind simulated autopilots. tap: is called with each MAVLink frame."""
-    return partial(embedded_quadrotor, noise=conditions.flight_noise, wind=conditions.wind, tap=tap)
+    """Return the function that makes quadrotors behind simulated autopilots.
+
+    tap: is called with each MAVLink frame. Raises ValueError as `changes_of`.
+    """
+    return partial(
+        embedded_quadrotor,
+        noise=conditions.flight_noise,
+        wind=conditions.wind,
+        tap=tap,
+        changes=changes_of(conditions),
+    )
+
+
+def changes_of(conditions: Conditions) -> dict[str, float]:
+    """Return what `Quadrotor.alter` has to change for these conditions; compiled code flies a quadrotor without any.
+
+    Raises:
+        ValueError: the conditions have something that no quadrotor has.
+    """
+    names = ("payload_kg", "weak_motor")
+    conditions.check(*names, "wind")
+    return {name: getattr(conditions, name) for name in names if name in conditions.unusual}
 
 
 def embedded_quadrotor(
@@ -37,6 +57,7 @@ def embedded_quadrotor(
     rules: str = "px4",
     *,
     tap: FrameTap | None = None,
+    changes: dict[str, float] | None = None,
 ) -> LockstepQuadrotor:
     """Return a quadrotor behind a simulated autopilot, over MAVLink in memory.
 
@@ -45,9 +66,11 @@ def embedded_quadrotor(
     Args:
         rules: px4 or ardupilot.
         tap: is called with each MAVLink frame.
+        changes: of the vehicle's physics, as `Quadrotor.alter` takes them.
     """
     parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
-    autopilot = Autopilot(Quadrotor(arena, rng, noise, wind), rules, parameters=parameters, quiet=True)
+    vehicle = Quadrotor(arena, rng, noise, wind, changes=changes)
+    autopilot = Autopilot(vehicle, rules, parameters=parameters, quiet=True)
     return LockstepQuadrotor(autopilot, QUADROTOR, tap)
 
 
@@ -55,15 +78,16 @@ def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehic
     """Return the function that makes quadrotors behind the real PX4 in `$BRAKELINE_PX4`. It flies all episodes.
 
     Raises:
-        ValueError: the variable is not set.
+        ValueError: the variable is not set, or as `changes_of`.
     """
+    changes = changes_of(conditions)
     folder = os.environ.get("BRAKELINE_PX4")
     if not folder:
         raise ValueError("set BRAKELINE_PX4 to the folder of a PX4 that was built for SITL")
     flight = Px4Flight(Path(folder), SensorNoise(scale=conditions.flight_noise.scale), tap=tap)
 
     def make(arena: Arena, rng: np.random.Generator) -> Px4Vehicle:
-        return Px4Vehicle(flight, Quadrotor(arena, rng, QUIET, conditions.wind), QUADROTOR)
+        return Px4Vehicle(flight, Quadrotor(arena, rng, QUIET, conditions.wind, changes=changes), QUADROTOR)
 
     return make
 

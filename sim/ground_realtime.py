@@ -67,7 +67,7 @@ class RealtimeGroundRobot(GroundRobot):
         """Place the robot at the start of an arena.
 
         Args:
-            physics: `payload_kg`, `floor_friction` and `process_noise`, as for `GroundRobot`.
+            physics: `process_noise`, and what `changes_of` returns, as for `GroundRobot`.
         """
         super().__init__(arena, rng, noise, **physics)
         noise = noise or NoiseLevels()

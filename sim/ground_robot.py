@@ -30,6 +30,7 @@ YAW_RATE = 5  # its index among the speeds
 SAMPLES = 10  # of encoders and gyro in a period
 SAMPLE_TIME = GROUND.period / SAMPLES  # s
 MOST_IN_SAMPLE = 0.03  # m, more than a robot moves in a sample: the fastest one drives 5 mm
+CHANGES = ("payload_kg", "floor_friction", "weak_motor")  # of `Conditions`
 PAYLOAD_GYRATION = 0.05  # m, radius of gyration of the payload
 ONLY = np.zeros(1, dtype=np.intp)  # the rows of disturbances of a single robot
 
@@ -190,11 +191,12 @@ class GroundRobot(TurtleBot):
         payload_kg: float = 0.0,
         floor_friction: float = 1.0,
         process_noise: ProcessNoise | None = None,
+        weak_motor: float = 1.0,
     ) -> None:
         """Place the robot at the start of an arena and let it settle on its wheels."""
         self._physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
         super().__init__(arena, self._physics.model, self._physics.data)
-        self.alter(payload_kg=payload_kg, floor_friction=floor_friction)
+        self.alter(payload_kg=payload_kg, floor_friction=floor_friction, weak_motor=weak_motor)
         self.start_disturbances(process_noise, rng)
         mujoco.mj_forward(self._model, self._physics.data)
         self._room = 0.0  # m, free space around the footprint at the end of the last period; 0: not known
@@ -222,11 +224,16 @@ class GroundRobot(TurtleBot):
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
-    c = conditions
     return partial(
-        GroundRobot,
-        noise=c.noise,
-        payload_kg=c.payload_kg,
-        floor_friction=c.floor_friction,
-        process_noise=c.process_noise,
+        GroundRobot, noise=conditions.noise, process_noise=conditions.process_noise, **changes_of(conditions)
     )
+
+
+def changes_of(conditions: Conditions) -> dict[str, float]:
+    """Return what `TurtleBot.alter` has to change for these conditions.
+
+    Raises:
+        ValueError: the conditions have something that no ground robot has.
+    """
+    conditions.check(*CHANGES, "process_noise")
+    return {name: getattr(conditions, name) for name in CHANGES}

@@ -56,11 +56,13 @@ class Quadrotor(SimulatedVehicle):
         noise: QuadrotorNoise | None = None,
         wind: Wind | None = None,
         floor: float | None = None,
+        changes: dict[str, float] | None = None,
     ) -> None:
         """Place the vehicle at the start of an arena.
 
         Args:
             floor: height of a plane to start from and to land on [m]. Without one, the vehicle starts hovering.
+            changes: of its physics from the start on, as `alter` takes them.
         """
         self.arena = arena
         self._model = arena_model(arena, floor)
@@ -90,6 +92,7 @@ class Quadrotor(SimulatedVehicle):
         self._air = np.zeros(3)  # m/s, the velocity of the wind
         self._acceleration: Vector = (0.0, 0.0, 0.0)
         self.input = np.zeros(QUADROTOR.action_dim)
+        self.alter(**(changes or {}))
         mujoco.mj_forward(self._model, self._data)
         if self.flying:
             self._hover()
@@ -273,7 +276,8 @@ class Quadrotor(SimulatedVehicle):
 
     def _hover(self) -> None:
         """Start in steady hover: rotors at hovering thrust, tilted against the mean wind, holding the start."""
-        self._data.act[:] = 0.25 * self._body.mass * GRAVITY
+        mass = float(self._model.body_mass[self._model.body("base").id])  # a payload included
+        self._data.act[:] = 0.25 * mass * GRAVITY
         integral = np.zeros(3)
         if self._wind_process is not None:
             mean = np.array(self._wind_process.mean)

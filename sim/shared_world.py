@@ -14,7 +14,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena, same_room
 from brakeline.sim.arena_generator import arena_kind, draw_fleet
 from brakeline.sim.floor_physics import place_base
-from brakeline.sim.ground_robot import GROUND, MODEL, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, TurtleBot, prefix
+from brakeline.sim.ground_robot import GROUND, MODEL, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, TurtleBot, changes_of, prefix
 from brakeline.sim.mujoco_obstacles import add_obstacles
 from brakeline.sim.navigation_env import Info, NavigationEnv, StepResult
 from brakeline.sim.sim_conditions import Conditions
@@ -55,8 +55,9 @@ class GroundWorld:
         self._model = _build(arenas)
         self._data = mujoco.MjData(self._model)
         self.robots = [TurtleBot(arena, self._model, self._data, i) for i, arena in enumerate(arenas)]
+        changes = changes_of(conditions)
         for robot, rng in zip(self.robots, rngs, strict=True):
-            robot.alter(payload_kg=conditions.payload_kg, floor_friction=conditions.floor_friction)
+            robot.alter(**changes)
             robot.start_disturbances(conditions.process_noise, rng)
         self._owner = _owners(self._model, len(arenas))
         self._physics_steps = round(SAMPLE_TIME / self._model.opt.timestep)

@@ -123,9 +123,19 @@ class Perception:
             raise ValueError("tracks need scans: add --perception scan")
 
 
+# What not every simulator has, in the words of a message.
+OPTIONAL = {
+    "payload_kg": "payload",
+    "floor_friction": "friction of a floor",
+    "weak_motor": "weak motor",
+    "wind": "wind",
+    "process_noise": "disturbances of the motion",
+}
+
+
 @dataclass(frozen=True)
 class Conditions:
-    """All conditions, of every kind of robot."""
+    """All conditions, of every kind of robot. weak_motor: share of its force that one motor keeps."""
 
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     payload_kg: float = 0.0
@@ -134,10 +144,38 @@ class Conditions:
     wind: Wind = field(default_factory=Wind)
     perception: Perception = field(default_factory=Perception)
     process_noise: ProcessNoise = field(default_factory=ProcessNoise)
+    weak_motor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.payload_kg) and self.payload_kg >= 0.0):
+            raise ValueError(f"a payload has 0 kg or more, not {self.payload_kg:g}")
+        if not (math.isfinite(self.floor_friction) and self.floor_friction > 0.0):
+            raise ValueError(f"the friction of a floor is above 0, not {self.floor_friction:g}")
+        if not 0.0 < self.weak_motor <= 1.0:
+            raise ValueError(f"a weak motor keeps more than 0 and at most 1 of its force, not {self.weak_motor:g}")
+
+    @property
+    def unusual(self) -> tuple[str, ...]:
+        """The names of the optional conditions that differ from their defaults."""
+        usual = Conditions()
+        return tuple(name for name in OPTIONAL if getattr(self, name) != getattr(usual, name))
+
+    def check(self, *simulated: str) -> None:
+        """Refuse what a simulator would ignore, so that nobody takes a calm flight for one in wind.
+
+        Args:
+            simulated: names of the optional conditions (`OPTIONAL`) that the simulator has.
+
+        Raises:
+            ValueError: another one differs from its default.
+        """
+        if ignored := [OPTIONAL[name] for name in self.unusual if name not in simulated]:
+            raise ValueError(f"the simulator of this robot has no {' and no '.join(ignored)}")
 
     def describe(self) -> dict[str, str]:
         """Return every condition with its value, for metadata and printed results."""
         values = asdict(self.noise) | {"payload_kg": self.payload_kg, "floor_friction": self.floor_friction}
+        values["weak_motor"] = self.weak_motor
         values |= {f"process_{name}": value for name, value in asdict(self.process_noise).items()}
         values |= {f"flight_{name}": value for name, value in asdict(self.flight_noise).items()}
         values |= {f"wind_{name}": value for name, value in asdict(self.wind).items()}

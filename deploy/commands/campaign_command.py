@@ -33,8 +33,8 @@ class CampaignCommand:
     """Filter with these model sets: auto (the one in use), one-step, residual, set-membership or matrix-zonotope (in
     the mode direct), or none for no filter."""
     perturbations: tuple[str, ...] = ("as-recorded",)
-    """Change the robot like this: as-recorded, noisy, payload, slippery, uneven (ground robots), wind (in the air),
-    scan or faulty-scan."""
+    """Change the robot like this: as-recorded, noisy, payload, weak-motor, slippery, uneven (ground robots), wind (in
+    the air), scan or faulty-scan."""
     episodes: int = 1000
     """Drive this many episodes of each cell. A later campaign with more of them goes on after these."""
     search: int = 0
@@ -74,7 +74,7 @@ class CampaignCommand:
         cells = [
             CampaignPart(address(name), arena, policy, model_set, perturbation, near, 0, 1, self.accept_bound)
             for arena, policy, model_set, perturbation in product(
-                self.arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim == 3)
+                self.arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim)
             )
         ]
         for cell in cells:  # a mistyped name ends the campaign before it begins; models are made once
@@ -96,15 +96,15 @@ class CampaignCommand:
             console.print(f"[dim]{self.results}: {robot.name}.md, {robot.name}.json[/]")
         return table
 
-    def _perturbations(self, flies: bool) -> list[str]:
+    def _perturbations(self, dimensions: int) -> list[str]:
         """Return the perturbations that this kind of robot has. Raises ValueError for an unknown one."""
-        from brakeline.deploy.experiments.campaign import AIR_ONLY, GROUND_ONLY, PERTURBATIONS
+        from brakeline.deploy.experiments.campaign import perturbations
 
+        mine, every = perturbations(dimensions), perturbations(2) | perturbations(3)
         for name in self.perturbations:
-            if name not in PERTURBATIONS:
-                raise ValueError(f"no perturbation is called {name!r}; there are: {', '.join(PERTURBATIONS)}")
-        others = GROUND_ONLY if flies else AIR_ONLY
-        return [name for name in self.perturbations if name not in others]
+            if name not in every:
+                raise ValueError(f"no perturbation is called {name!r}; there are: {', '.join(every)}")
+        return [name for name in self.perturbations if name in mine]
 
     def _prepare(self, robot: Any, cell: Any) -> None:
         """Check the names of a cell, and make the model set that it needs."""

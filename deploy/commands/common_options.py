@@ -127,7 +127,9 @@ class PhysicsOptions:
     """Set how the simulated robot differs from the robot that was recorded."""
 
     payload: float = 0.0
-    """Put this mass on top of the robot [kg]."""
+    """Add this mass to the robot [kg]."""
+    weak_motor: float = 1.0
+    """Leave one motor (of the left wheel, or of the first rotor) this share of its force."""
     friction: float = 1.0
     """Set the friction coefficient of the wheels on the floor."""
     noise: float = 1.0
@@ -165,6 +167,7 @@ class PhysicsOptions:
             Wind(self.wind, gust=self.gust),
             Perception(self.perception, faults, self.tracks),
             ProcessNoise(scale=self.process_noise),
+            self.weak_motor,
         )
 
 

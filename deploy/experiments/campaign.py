@@ -28,15 +28,26 @@ NEAR = 0.05  # of the footprint: an episode that comes nearer is kept
 PERTURBATIONS = {
     "as-recorded": PhysicsOptions(),
     "noisy": PhysicsOptions(noise=1.5),
-    "payload": PhysicsOptions(payload=1.0),
-    "slippery": PhysicsOptions(friction=0.3),
-    "uneven": PhysicsOptions(process_noise=2.0),
-    "wind": PhysicsOptions(wind=2.0, gust=0.5),
     "scan": PhysicsOptions(perception="scan"),
     "faulty-scan": PhysicsOptions(perception="scan", dropped=0.1, ghosts=0.01),
 }
-GROUND_ONLY, AIR_ONLY = ("payload", "slippery", "uneven"), ("wind",)
+ON_THE_GROUND = {
+    "payload": PhysicsOptions(payload=1.0),
+    "weak-motor": PhysicsOptions(weak_motor=0.6),
+    "slippery": PhysicsOptions(friction=0.3),
+    "uneven": PhysicsOptions(process_noise=2.0),
+}
+IN_THE_AIR = {
+    "payload": PhysicsOptions(payload=0.2),
+    "weak-motor": PhysicsOptions(weak_motor=0.9),
+    "wind": PhysicsOptions(wind=2.0, gust=0.5),
+}
 MODEL_SETS = ("auto", "one-step", *KINDS)  # the mode one-step, or an error bound in the mode direct
+
+
+def perturbations(dimensions: int) -> dict[str, PhysicsOptions]:
+    """Return the perturbations of a robot by their names, for the number of its position coordinates."""
+    return PERTURBATIONS | (IN_THE_AIR if dimensions == 3 else ON_THE_GROUND)
 
 
 def model_config_of(name: str) -> ModelConfig:
@@ -54,7 +65,7 @@ class CampaignPart:
         robot: name, or the path of a description.
         arena, policy: names.
         model_set: see `MODEL_SETS`; "none" drives without a filter.
-        perturbation: see `PERTURBATIONS`.
+        perturbation: see `perturbations`.
         near: distance [m] below which an episode's log is kept.
         first, episodes: number of the first episode, and how many there are.
     """
@@ -82,14 +93,16 @@ class CampaignPart:
     def evaluation(self) -> Evaluation:
         """Return the settings of the cell. Raises ValueError for an unknown model set."""
         from brakeline.deploy.experiments.evaluate import Evaluation
+        from brakeline.messaging.robot import robot_named
 
+        physics = perturbations(robot_named(self.robot).position_dim)[self.perturbation]
         filtered = self.model_set != "none"
         return Evaluation(
             policy=self.policy,
             method="ddpc" if filtered else "none",
             model_config=model_config_of(self.model_set) if filtered else ModelConfig(),
             arena=self.arena,
-            conditions=PERTURBATIONS[self.perturbation].conditions(),
+            conditions=physics.conditions(),
             accept_bound=self.accept_bound,
         )
 

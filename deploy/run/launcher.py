@@ -32,6 +32,7 @@ from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import RejectedMessages, headline
 from brakeline.messaging.robot import robot_named
+from brakeline.messaging.task import robot_with_task
 from brakeline.messaging.topics import HEALTH, RECORDED
 from brakeline.messaging.topics import LOG as LOG_LINES
 from brakeline.safety.methods import Model
@@ -60,7 +61,8 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         DamagedPart: the checkpoint of the run to resume is lost in part.
         BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
-        ValueError: the run adapts, and a model set is of mode recursion or of a rival.
+        ValueError: the run adapts, and a model set is of mode recursion or of a rival. Or a robot's simulator does not
+            have one of the conditions.
     """
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
@@ -73,8 +75,18 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         config, models = models_of_new_run(config, folder)
     for model in models if config.adapt else ():
         check_adaptable(model)
+    if config.conditions.unusual and not config.flights:
+        _check_conditions(config)
     folder.mkdir(parents=True, exist_ok=True)
     return config
+
+
+def _check_conditions(config: RunConfig) -> None:
+    """Raise ValueError if the simulator of a robot would ignore one of the conditions."""
+    from brakeline.sim.delayed_vehicle import simulated_vehicle  # brings the simulator: only where it is asked
+
+    for robot in config.robots:
+        simulated_vehicle(robot_with_task(robot), config.conditions)
 
 
 def _check_resumable(config: RunConfig, folder: Path) -> None:

@@ -37,7 +37,7 @@ from brakeline.messaging.ros2.cdr_messages import (
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import RealtimeGroundRobot, SpinningLidar
-from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES
+from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, changes_of
 from brakeline.sim.sim_conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -93,8 +93,7 @@ class Bridge:
         rng = np.random.default_rng((settings.seed, 11))
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
-        physics = {"payload_kg": c.payload_kg, "floor_friction": c.floor_friction, "process_noise": c.process_noise}
-        self.robot = RealtimeGroundRobot(arena, rng, c.noise, **physics)
+        self.robot = RealtimeGroundRobot(arena, rng, c.noise, process_noise=c.process_noise, **changes_of(c))
         self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
         self._start_time = 1.0 if settings.sim_time else time.time()  # s, the robot's time at the first sample
         self._samples = 0

@@ -59,6 +59,7 @@ def _tan(angle: float) -> float:
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return the function that makes the task's vehicles, see `brakeline.messaging.task.Task.simulator`."""
+    conditions.check()  # refuses what it does not simulate
     return partial(Car, noise=conditions.noise)
 
 

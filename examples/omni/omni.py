@@ -44,6 +44,7 @@ class Omni(PlanarRobot):
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return the function that makes the task's vehicles, see `brakeline.messaging.task.Task.simulator`."""
+    conditions.check()  # refuses what it does not simulate
     return partial(Omni, noise=conditions.noise)
 
 

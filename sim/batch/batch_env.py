@@ -293,3 +293,5 @@ def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> Non
         raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {advice}")
     if robot.position_dim == 3 and not conditions.wind.calm:
         raise NoBatch(f"a batch of quadrotors flies in calm air (--wind 0 --gust 0): {advice}")
+    if robot.position_dim == 3 and {"payload_kg", "weak_motor"} & {*conditions.unusual}:
+        raise NoBatch(f"a batch of quadrotors has no payload and no weak motors: {advice}")

@@ -35,6 +35,7 @@ from brakeline.sim.ground_robot import (
     WHEELS,
     YAW_RATE,
     TurtleBot,
+    changes_of,
     weight,
     wheel_speeds,
 )
@@ -173,7 +174,7 @@ class GroundBatch:
         """Compile the robot in an arena, under the conditions."""
         physics = FloorPhysics(MODEL, WHEEL_RADIUS, arena, SAMPLE_TIME, GROUND.period)
         robot = TurtleBot(arena, physics.model, physics.data)
-        robot.alter(payload_kg=self._conditions.payload_kg, floor_friction=self._conditions.floor_friction)
+        robot.alter(**changes_of(self._conditions))
         return physics
 
     def _disturbed(self, rows: Rows) -> tuple[Array, Array]:

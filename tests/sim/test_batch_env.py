@@ -143,6 +143,7 @@ def test_what_only_single_environments_simulate_is_refused() -> None:
         ("ground", "default", Conditions(perception=Perception("scan"))),
         ("quadrotor", "traffic", Conditions()),
         ("quadrotor", "default", Conditions(wind=Wind(speed=1.0))),
+        ("quadrotor", "default", Conditions(payload_kg=0.1)),
     ):
         with pytest.raises(NoBatch, match="NavigationEnv"):
             BatchNavigationEnv(robot_with_task(robot), 2, arena, conditions=conditions)

@@ -1,0 +1,51 @@
+"""No simulator ignores a condition in silence."""
+
+import numpy as np
+import pytest
+
+from brakeline.deploy import cli
+from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
+from brakeline.sim.sim_conditions import Conditions, ProcessNoise, Wind
+from tests.robots import GROUND, QUADROTOR
+
+IN_WIND = Conditions(wind=Wind(speed=3.0))
+
+
+@pytest.mark.parametrize(
+    ("robot", "conditions", "words"),
+    [
+        (GROUND, IN_WIND, "no wind"),
+        (QUADROTOR, Conditions(floor_friction=0.5), "no friction of a floor"),
+        (QUADROTOR, Conditions(process_noise=ProcessNoise(scale=2.0)), "no disturbances of the motion"),
+        (QUADROTOR.in_real_time(), Conditions(floor_friction=0.5, process_noise=ProcessNoise(scale=0.0)), "and no"),
+    ],
+)
+def test_a_condition_that_a_simulator_does_not_have_is_refused(robot, conditions, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        vehicle_in_empty_arena(robot, np.random.default_rng(0), conditions)
+
+
+@pytest.mark.parametrize("words", ["evaluate ground --episodes 1", "train ground --steps 100", "collect ground"])
+def test_a_command_refuses_it_before_it_begins(words, capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
+    out = ("--out", str(tmp_path / "run")) if words.startswith("train") else ()
+    assert cli.main([*words.split(), "--wind", "3", *out]) == 1
+    assert "simulator of this robot has no wind" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("name", "value"), [("payload_kg", -1.0), ("floor_friction", 0.0), ("weak_motor", 1.1)])
+def test_a_condition_that_cannot_be_is_refused(name, value) -> None:
+    with pytest.raises(ValueError, match=f"not {value:g}"):
+        Conditions(**{name: value})
+
+
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.kind)
+@pytest.mark.parametrize("changed", [Conditions(payload_kg=0.3), Conditions(weak_motor=0.5)], ids=["payload", "motor"])
+def test_a_payload_and_a_weak_motor_change_how_a_vehicle_moves(robot, changed) -> None:
+    ways = []
+    for conditions in (Conditions(), Conditions(), changed):
+        vehicle = vehicle_in_empty_arena(robot, np.random.default_rng(0), conditions)
+        for _ in range(5):
+            vehicle.step(np.asarray(robot.high()))
+        ways.append(vehicle.true.copy())
+    assert (ways[0] == ways[1]).all() and np.abs(ways[2] - ways[0]).max() > 1e-3
