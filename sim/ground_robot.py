@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -224,12 +225,11 @@ class GroundRobot(TurtleBot):
 
 def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
-    return partial(
-        GroundRobot, noise=conditions.noise, process_noise=conditions.process_noise, **changes_of(conditions)
-    )
+    changes = changes_of(conditions)
+    return partial(GroundRobot, noise=conditions.noise, process_noise=conditions.process_noise, **changes)
 
 
-def changes_of(conditions: Conditions) -> dict[str, float]:
+def changes_of(conditions: Conditions) -> dict[str, Any]:
     """Return what `TurtleBot.alter` has to change for these conditions.
 
     Raises:

@@ -68,6 +68,8 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if resume and not config.policy and not config.from_logs:
         _check_resumable(config, folder)
+    if config.conditions.unusual and not config.flights:
+        _check_conditions(config)
     models: list[Model] = []
     if config.filtered and resume:
         models = models_of_resumed_run(config, folder)
@@ -75,8 +77,6 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         config, models = models_of_new_run(config, folder)
     for model in models if config.adapt else ():
         check_adaptable(model)
-    if config.conditions.unusual and not config.flights:
-        _check_conditions(config)
     folder.mkdir(parents=True, exist_ok=True)
     return config
 

@@ -111,6 +111,21 @@ def test_a_collision_behind_the_filter_is_an_exit_status(driven, monkeypatch, tm
     assert cell["collisions"] == 1
 
 
+def test_the_same_perturbation_is_another_change_in_the_air_and_none_where_a_robot_has_no_such_thing():
+    command = CampaignCommand(perturbations=("as-recorded", "payload", "wind", "uneven"))
+    assert command._perturbations(3) == ["as-recorded", "payload", "wind"]
+    assert command._perturbations(2) == ["as-recorded", "payload", "uneven"]
+    cell = replace(CELL, perturbation="payload")
+    assert cell.evaluation().conditions.payload_kg == 1.0  # on a robot of 1 kg
+    assert replace(cell, robot="quadrotor").evaluation().conditions.payload_kg == 0.2  # on one of 1.2 kg
+
+
+def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path, caplog):
+    changed = CampaignPart("quadrotor", "default", "trained", "auto", "payload", NEAR, 0, 1)
+    result = changed.run(tmp_path / "part", lambda text: None)
+    assert sum(result["episodes"]["violations"]) > 0 and not caplog.records
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [({"perturbations": ("earthquake",)}, "no perturbation"), ({"model_sets": ("hope",)}, "no model set"),
