@@ -37,7 +37,9 @@ class AutopilotSettings:
     seed: int = 0
     airborne: bool = False  # start armed and hovering at the arena's start, instead of on the ground below it
     setpoint_timeout: float | None = None  # s without a setpoint after which it brakes; None: the rules' parameter
+    noise: QuadrotorNoise = field(default_factory=QuadrotorNoise)
     wind: Wind = field(default_factory=Wind)
+    changes: dict[str, float] = field(default_factory=dict)  # of the vehicles' physics, as `Quadrotor.alter` takes them
     truth: str = "127.0.0.1:14600"  # HOST:PORT that gets states and collisions, as JSON in UDP; empty: none
     seconds: float = 0.0  # duration; 0: until SIGINT or SIGTERM
     at_once: bool = False  # follow setpoints at once, as the recorded vehicle does; else with the delivered limits
@@ -61,7 +63,8 @@ def fly(settings: AutopilotSettings, on_start: Callable[[Arena], Any] = lambda a
 def vehicle(settings: AutopilotSettings, arena: Arena, system: int) -> Autopilot:
     """Return the MAVLink endpoint of one vehicle."""
     rng = np.random.default_rng((settings.seed, system))
-    quadrotor = Quadrotor(arena, rng, QuadrotorNoise(), settings.wind, floor=None if settings.airborne else PAD)
+    floor = None if settings.airborne else PAD
+    quadrotor = Quadrotor(arena, rng, settings.noise, settings.wind, floor, settings.changes)
     timeout = settings.setpoint_timeout
     parameters = dict(AT_ONCE[settings.rules]) if settings.at_once else {}
     if timeout is not None:

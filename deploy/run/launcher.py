@@ -68,7 +68,7 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if resume and not config.policy and not config.from_logs:
         _check_resumable(config, folder)
-    if config.conditions.unusual and not config.flights:
+    if config.conditions.unusual:
         _check_conditions(config)
     models: list[Model] = []
     if config.filtered and resume:
@@ -83,6 +83,8 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
 
 def _check_conditions(config: RunConfig) -> None:
     """Raise ValueError if the simulator of a robot would ignore one of the conditions."""
+    if config.flights and config.autopilot is None:
+        config.conditions.check()  # nothing of a vehicle behind a link is simulated here
     from brakeline.sim.delayed_vehicle import simulated_vehicle  # brings the simulator: only where it is asked
 
     for robot in config.robots:

@@ -118,6 +118,7 @@ def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings)
 
 
 def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+    from brakeline.deploy.quadrotor_vehicles import changes_of
     from brakeline.deploy.run.autopilot_run import AutopilotSettings, fly
 
     assert config.autopilot is not None
@@ -131,7 +132,9 @@ def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetti
             airborne=True,
             at_once=True,
             setpoint_timeout=config.autopilot.setpoint_timeout,
+            noise=config.conditions.flight_noise,
             wind=config.conditions.wind,
+            changes=changes_of(config.conditions),
             truth=f"127.0.0.1:{flight.truth}",
         )
     )

@@ -1,11 +1,15 @@
 """No simulator ignores a condition in silence."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from brakeline.deploy import cli
-from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
-from brakeline.sim.sim_conditions import Conditions, ProcessNoise, Wind
+from brakeline.deploy.run.autopilot_run import AutopilotSettings, vehicle
+from brakeline.deploy.run.launcher import prepare
+from brakeline.deploy.vehicle_factory import empty_arena, vehicle_in_empty_arena
+from brakeline.sim.sim_conditions import Conditions, ProcessNoise, QuadrotorNoise, Wind
 from tests.robots import GROUND, QUADROTOR
 
 IN_WIND = Conditions(wind=Wind(speed=3.0))
@@ -49,3 +53,12 @@ def test_a_payload_and_a_weak_motor_change_how_a_vehicle_moves(robot, changed) -
             vehicle.step(np.asarray(robot.high()))
         ways.append(vehicle.true.copy())
     assert (ways[0] == ways[1]).all() and np.abs(ways[2] - ways[0]).max() > 1e-3
+
+
+def test_a_flight_has_the_conditions_of_its_simulated_vehicle_and_none_behind_a_link(tmp_path) -> None:
+    flight = cli.parse("fly", ["--url", "udpin:127.0.0.1:14999", "--payload", "0.2"]).config()
+    with pytest.raises(ValueError, match="no payload"):
+        prepare(flight, tmp_path / "run", resume=False)
+    settings = AutopilotSettings("", noise=QuadrotorNoise(scale=0.0), changes={"payload_kg": 0.3}, airborne=True)
+    heavy, light = (vehicle(one, empty_arena(QUADROTOR), 1) for one in (settings, replace(settings, changes={})))
+    assert heavy.vehicle._model.body_mass.sum() == pytest.approx(light.vehicle._model.body_mass.sum() + 0.3)
