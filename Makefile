@@ -2,6 +2,10 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.installed
+PINNED := --quiet --constraint constraints.txt
+# pip finds a build of torch for the processor alone. All else is installed by uv, in a tenth of the time. It does not know
+# your settings of pip: where it finds no package, pip goes on.
+PIP := $(BIN)/pip install --disable-pip-version-check $(PINNED)
 
 # Compiles all loops (Numba), if their code has changed. Otherwise the first command or each test would wait for it.
 define COMPILE
@@ -21,8 +25,9 @@ setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv || python3 -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch==2.13.0
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(PIP) torch==2.13.0 uv
+	VIRTUAL_ENV=.venv $(BIN)/uv pip install --system-certs --compile-bytecode $(PINNED) --editable '.[dev]' || \
+		$(PIP) --editable '.[dev]'
 	$(COMPILE)
 	touch $(STAMP)
 
