@@ -24,6 +24,7 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import ReservationRows, reservation_half_spaces
 from brakeline.safety.filter.state_limits import StateLimits, stack_rows
 from brakeline.safety.filter.tube_extent import stays, widest_extent
+from brakeline.safety.model.model_config import DIRECT
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
@@ -76,6 +77,24 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     return found
 
 
+MOST_GROWTH = 2.0  # what a payload, a weak rotor and wind took of the quadrotor's plans was at most 1.9 times as much
+
+
+def growth_of(model: ModelSet) -> float:
+    """Return the further factor on the sets of plans, once the set of the next state is widened (docs/method.md §15).
+
+    A set of mode direct is widened by what single periods show. An error that repeats in each of k periods adds up to k
+    times itself, and one of a random sign to √k times itself. So it takes more of a position's set after k periods than
+    of the first one if that set is hardly wider. This is the factor for random signs, at most `MOST_GROWTH`.
+    """
+    d = model.robot.position_dim
+    if model.model_config.mode != DIRECT or not d:
+        return 1.0
+    half = np.array([step.half_widths(np.zeros(step.C.shape[1]))[:d] for step in model.steps])  # at rest
+    times = np.arange(1.0, len(half) + 1.0)[:, None]
+    return min(max(1.0, math.sqrt(float((times * half[0] / half).max()))), MOST_GROWTH)
+
+
 class TubeConstraints:
     """A tube, and the rows that the surroundings of a robot add to it.
 
@@ -86,6 +105,7 @@ class TubeConstraints:
         far: a tube may leave the sensor's range, so every candidate is checked against it.
         stays: a robot that stands stays where it stands (it does not drift).
         stands: number of periods after which a plan has brought the robot to a stand.
+        growth: see `growth_of`.
     """
 
     def __init__(
@@ -108,7 +128,7 @@ class TubeConstraints:
         robot = model.robot
         if robot.position_dim == 3:
             shades.prepare()
-        self.robot, self.stands = robot, model.moving
+        self.robot, self.stands, self.growth = robot, model.moving, growth_of(model)
         whole = np.ascontiguousarray
         self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0
         first, n = model.first, robot.state_dim
@@ -158,6 +178,10 @@ class TubeConstraints:
             other.far = self.far or widening > 1.0  # the reach is that of tubes without it
         return other
 
+    def plan_widening(self, asked: float) -> float:
+        """Return the factor on the sets of a plan, for the factor that a request asks for (docs/method.md §15)."""
+        return asked * self.growth if asked > 1.0 else 1.0
+
     def _reach_for(self, widening: float) -> float:
         """Return the radius [m] of local maps for tubes that are wider by a factor; no plan leaves it unnoticed."""
         return min(self.reach * widening, max(self.robot.sight, self.reach))
@@ -170,13 +194,13 @@ class TubeConstraints:
 
     def local_map(self, request: Request, z_0: Array, inputs: tuple[Array, Array]) -> LocalMap:
         """Return the map of a request. inputs: center and half-widths of a plan's free inputs after z_0."""
-        robot, occluded = self.robot, None
+        robot, occluded, widening = self.robot, None, self.plan_widening(request.widening)
         turn = self.turn(float(request.state[robot.heading]) if robot.heading is not None else 0.0)
         if isinstance(request.scan, RangeImage):
             start = np.ascontiguousarray(request.state[: robot.position_dim])
-            room = self._room(z_0, inputs, start, turn, request.widening)
+            room = self._room(z_0, inputs, start, turn, widening)
             occluded = shades.occluded_regions(request.scan, room, self.body, start)
-        return local_map(robot, request, self._reach_for(request.widening), turn, occluded)
+        return local_map(robot, request, widening, self._reach_for(widening), turn, occluded)
 
     def turn(self, heading: float) -> Array:
         """Return the rotation (d, d) from the robot's frame to the world."""
@@ -220,7 +244,7 @@ class TubeConstraints:
             *self._next,
             self._regressor(z),
             first,
-            self.widening * stretch,
+            local_map.asked * stretch,
             np.ascontiguousarray(local_map.start),
             local_map.turn,
         )

@@ -31,7 +31,8 @@ class LocalMap:
         near: obstacles within reach. moving: moving obstacles that may come within reach.
         beyond [m]: the distance below which the request names no further obstacle, at most the sensor's range.
         unseen: space that a scan does not show to be free. other_reservations: those of other robots.
-        widening: factor that the request puts on every set (docs/method.md §15).
+        widening: factor on every set of a plan (docs/method.md §15).
+        asked: factor that the request puts on the set of the next state; `widening` is never smaller.
     """
 
     start: Array
@@ -43,6 +44,7 @@ class LocalMap:
     unseen: OccupiedCells | OccludedRegions | None = None
     other_reservations: OtherReservations | None = None
     widening: float = 1.0
+    asked: float = 1.0
 
     @property
     def parked(self) -> LocalMap:
@@ -64,11 +66,14 @@ class LocalMap:
         return not len(self.near) and self.moving is None and self.unseen is None and self.other_reservations is None
 
 
-def local_map(robot: Robot, request: Request, reach: float, turn: Array, occluded: OccludedRegions | None) -> LocalMap:
+def local_map(
+    robot: Robot, request: Request, widening: float, reach: float, turn: Array, occluded: OccludedRegions | None
+) -> LocalMap:
     """Return the map of a request.
 
     Args:
         robot: the robot. request: its request.
+        widening: factor on every set of a plan.
         reach [m]: radius of the map. turn (d, d): rotation from the robot's frame to the world.
         occluded: the shadows of the request's range image, if it has one.
     """
@@ -91,7 +96,7 @@ def local_map(robot: Robot, request: Request, reach: float, turn: Array, occlude
     unseen: OccupiedCells | OccludedRegions | None = occluded
     if isinstance(request.scan, Scan):
         unseen = _unseen(request.scan, start, reach, whole_plan)
-    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, request.widening)
+    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, widening, request.widening)
 
 
 @cache

@@ -24,8 +24,9 @@ class SceneBatch:
         start: per axis (B,), world. turn: the rotations from the robots' frames to the world.
         near: the obstacles within reach.
         beyond (B,) [m]: the distance below which the request names no further obstacle, at most the sensor's range.
-        widening, reach (B,): factor on every set, and radius of the map [m].
+        widening, reach (B,): factor on every set of a plan, and radius of the map [m].
         far (B,): a tube may leave the sensor's range.
+        asked (B,): factor on the set of the next state.
     """
 
     start: Axes
@@ -35,13 +36,14 @@ class SceneBatch:
     widening: Array
     reach: Array
     far: Array
+    asked: Array
 
     def take(self, xp: Any, lanes: Array) -> SceneBatch:
         def picked(part: Array) -> Array:
             return xp.take(part, lanes, axis=-1)
 
         start, turn = [picked(axis) for axis in self.start], self.turn.take(xp, lanes)
-        rest = (picked(part) for part in (self.beyond, self.widening, self.reach, self.far))
+        rest = (picked(part) for part in (self.beyond, self.widening, self.reach, self.far, self.asked))
         return SceneBatch(start, turn, self.near.take(xp, lanes), *rest)
 
 

@@ -42,7 +42,7 @@ class LaneDecisions:
         self._search = SearchBatch(safety, constant, xp)
         self._constraints = self._search.constraints
         self._clearance, self._reach = safety.clearance_margin, base.reach
-        self._start = safety.start
+        self._start, self._growth = safety.start, safety.constraints.growth
         self._speed = robot.translates.index(True) if may_turn_aside(robot) else None
         self._furthest = max(robot.sight, base.reach)
         self._regressor = constant(np.array(robot.regressor))
@@ -115,14 +115,15 @@ class LaneDecisions:
         given = robot.committed_steps * m
         z_0 = xp.concat([xp.take(state, self._regressor, axis=0), before, plan[:given]])
         proposal = self._search.limited(action, z_0[z_0.shape[0] - m :])
-        widening = self._widening(requests, rows)
+        asked = self._widening(requests, rows)
+        widening = xp.where(asked > 1.0, asked * self._growth, asked)
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
         obstacles = ObstacleArrays(*(xp.take(part, rows, axis=0) for part in vars(requests.obstacles).values()))
         near, beyond = within_reach(xp, obstacles, start, reach)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
-        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far)
+        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, asked)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
 
     def _widening(self, requests: RequestArrays, rows: Array) -> Array:
@@ -341,7 +342,7 @@ class _NextState:
         xp, d = self._xp, self._d
         window = self._regressor @ plan.z
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
-        half = (self._widths @ sizes) * (scene.widening * plan.path.stretch[0])
+        half = (self._widths @ sizes) * (scene.asked * plan.path.stretch[0])
         center = plan.path.first + self._C @ window
         moved = scene.turn.to_world([center[i] for i in range(d)])
         center[:d] = xp.stack([a + b for a, b in zip(scene.start, moved, strict=True)])

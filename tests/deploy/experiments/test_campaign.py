@@ -121,9 +121,12 @@ def test_the_same_perturbation_is_another_change_in_the_air_and_none_where_a_rob
 
 
 def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path, caplog):
-    changed = CampaignPart("quadrotor", "default", "trained", "auto", "payload", NEAR, 0, 1)
+    """Also a case that was near: with a payload this dive ended 45 mm within the distance that the footprint needs,
+    while all sets of a plan were widened by no more than single periods showed (docs/method.md §15)."""
+    changed = CampaignPart("quadrotor", "default", "random", "auto", "payload", NEAR, 51, 1)
     result = changed.run(tmp_path / "part", lambda text: None)
     assert sum(result["episodes"]["violations"]) > 0 and not caplog.records
+    assert min(result["episodes"]["closest"]) > NEAR
 
 
 @pytest.mark.parametrize(
