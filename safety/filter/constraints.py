@@ -77,22 +77,19 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     return found
 
 
-MOST_GROWTH = 2.0  # what a payload, a weak rotor and wind took of the quadrotor's plans was at most 1.9 times as much
-
-
 def growth_of(model: ModelSet) -> float:
     """Return the further factor on the sets of plans, once the set of the next state is widened (docs/method.md §15).
 
     A set of mode direct is widened by what single periods show. An error that repeats in each of k periods adds up to k
     times itself, and one of a random sign to √k times itself. So it takes more of a position's set after k periods than
-    of the first one if that set is hardly wider. This is the factor for random signs, at most `MOST_GROWTH`.
+    of the first one if that set is hardly wider. The factor is that for random signs.
     """
     d = model.robot.position_dim
     if model.model_config.mode != DIRECT or not d:
         return 1.0
     half = np.array([step.half_widths(np.zeros(step.C.shape[1]))[:d] for step in model.steps])  # at rest
     times = np.arange(1.0, len(half) + 1.0)[:, None]
-    return min(max(1.0, math.sqrt(float((times * half[0] / half).max()))), MOST_GROWTH)
+    return max(1.0, math.sqrt(float((times * half[0] / half).max())))
 
 
 class TubeConstraints:
