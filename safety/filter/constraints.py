@@ -77,19 +77,22 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     return found
 
 
-def growth_of(model: ModelSet) -> float:
+def growth_of(model: ModelSet, tube: Tube) -> float:
     """Return the further factor on the sets of plans, once the set of the next state is widened (docs/method.md §15).
 
-    A set of mode direct is widened by what single periods show. An error that repeats in each of k periods adds up to k
-    times itself, and one of a random sign to √k times itself. So it takes more of a position's set after k periods than
-    of the first one if that set is hardly wider. The factor is that for random signs.
+    A set of mode direct is widened by what single periods show. An error of random sign adds up to √k times itself in k
+    periods. So it takes more of a position's set after k periods than of the first one if that set is hardly wider. The
+    factor is by how much more, at rest or in a stop from full speed: the smaller of both.
     """
-    d = model.robot.position_dim
-    if model.model_config.mode != DIRECT or not d:
+    robot = model.robot
+    if model.model_config.mode != DIRECT or not robot.position_dim:
         return 1.0
-    half = np.array([step.half_widths(np.zeros(step.C.shape[1]))[:d] for step in model.steps])  # at rest
-    times = np.arange(1.0, len(half) + 1.0)[:, None]
-    return max(1.0, math.sqrt(float((times * half[0] / half).max())))
+    high = np.asarray(robot.high())
+    speeds = robot.state_at_inputs(high)[list(robot.regressor)]
+    fast = np.concatenate([speeds, high, np.tile(high, robot.free_steps)])
+    half = np.stack([tube.half_widths(z) for z in (0.0 * fast, fast)])  # (2, N, d)
+    times = np.sqrt(np.arange(1.0, half.shape[1] + 1.0))[:, None]
+    return max(1.0, float((times * half[:, :1] / half).max((1, 2)).min()))
 
 
 class TubeConstraints:
@@ -125,7 +128,7 @@ class TubeConstraints:
         robot = model.robot
         if robot.position_dim == 3:
             shades.prepare()
-        self.robot, self.stands, self.growth = robot, model.moving, growth_of(model)
+        self.robot, self.stands, self.growth = robot, model.moving, growth_of(model, tube)
         whole = np.ascontiguousarray
         self._sized = whole(tube.W.T), whole(tube.M.T), tube.m_0
         first, n = model.first, robot.state_dim

@@ -120,12 +120,14 @@ def test_the_same_perturbation_is_another_change_in_the_air_and_none_where_a_rob
     assert replace(cell, robot="quadrotor").evaluation().conditions.payload_kg == 0.2  # on one of 1.2 kg
 
 
-def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path, caplog):
+def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path, caplog, monkeypatch):
     """Also a case that was near: with a payload this dive ended 45 mm within the distance that the footprint needs,
     while all sets of a plan were widened by no more than single periods showed (docs/method.md §15)."""
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))  # the shipped model set
     changed = CampaignPart("quadrotor", "default", "random", "auto", "payload", NEAR, 51, 1)
     result = changed.run(tmp_path / "part", lambda text: None)
-    assert sum(result["episodes"]["violations"]) > 0 and not caplog.records
+    assert sum(result["episodes"]["violations"]) > 0
+    assert not [record for record in caplog.records if "outside" in record.getMessage()]
     assert min(result["episodes"]["closest"]) > NEAR
 
 
