@@ -36,8 +36,10 @@ function show(place) {
 function remember(place, episode, step) {
   if (!document.documentElement.dataset.drawn) return;
   const words = new URLSearchParams({ actor: episode.actor, step, ...(data.length > 1 ? { run: place } : {}) });
+  const from = location.hash; // not over an address that somebody enters meanwhile
+  const write = () => location.hash === from && history.replaceState(null, "", `#episode-${episode.episode}&${words}`);
   clearTimeout(remembered);
-  remembered = setTimeout(() => history.replaceState(null, "", `#episode-${episode.episode}&${words}`), 250);
+  remembered = setTimeout(write, 250);
 }
 
 /** Show the run, the episode and the step of the address. */
