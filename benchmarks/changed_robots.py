@@ -1,4 +1,4 @@
-"""What a changed robot takes of the shipped sets of plans, beside what single periods show of it (docs/method.md §15).
+"""How much of the shipped sets of plans a changed robot uses, beside what single periods show (docs/method.md §15).
 
     python -m benchmarks changed
 

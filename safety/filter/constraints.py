@@ -81,8 +81,8 @@ def growth_of(model: ModelSet, tube: Tube) -> float:
     """Return the further factor on the sets of plans, once the set of the next state is widened (docs/method.md §15).
 
     A set of mode direct is widened by what single periods show. An error of random sign adds up to √k times itself in k
-    periods. So it takes more of a position's set after k periods than of the first one if that set is hardly wider. The
-    factor is by how much more, at rest or in a stop from full speed: the smaller of both.
+    periods. So it uses more of a position's set after k periods than of the first one if that set is hardly wider. The
+    factor says how much more. It is the smaller of two: at rest, and in a stop from full speed.
     """
     robot = model.robot
     if model.model_config.mode != DIRECT or not robot.position_dim:

@@ -69,7 +69,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         for part in (seen, rest):
             check_regressors(part.z[:, columns], f"windows of {k} periods", model_config.fewest)
         every = windows(data, k, kind)  # chord deviations have no predictor, so both halves bound them
-        chord_deviations.append(_envelope(every.z, every.chord_deviation, model_config.inflation))
+        chord_deviations.append(_length_envelope(every.z, every.chord_deviation, model_config.inflation))
         if model_config.mode == DIRECT:
             after, later = predicted_outputs(robot, seen.y), predicted_outputs(robot, rest.y)
             steps.append(_error_bound(seen.z, after, rest.z, later, model_config, columns, MOST_ATOMS // horizon))
@@ -149,10 +149,10 @@ def _stopping_distance_of_plans(whole: Windows, model_config: ModelConfig) -> tu
     still = ~np.isnan(whole.stopping_distance)
     if not still.any():
         raise BadData("no plan's stop was recorded: let the robot stand after braking")
-    return _envelope(whole.z[still], whole.stopping_distance[still], model_config.inflation)
+    return _length_envelope(whole.z[still], whole.stopping_distance[still], model_config.inflation)
 
 
-def _envelope(z: Array, lengths: Array, inflation: float) -> tuple[Array, float]:
+def _length_envelope(z: Array, lengths: Array, inflation: float) -> tuple[Array, float]:
     """Return the envelope (κ, w) of lengths (T,) for regressors z (T, nz)."""
     kappa, w = envelopes(np.abs(z), lengths[:, None], inflation)
     return kappa[0], float(w[0])
