@@ -3,7 +3,8 @@
 The simulator judges whether the robot hits anything.
 """
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -25,28 +26,29 @@ KEEP_IN = [
     for axis in ("x", "y")
     for sign in ("+", "-")
 ]
-ROBOTS = {
-    "hold": car("toy-hold"),
-    "profile": car("toy-profile", stop=([0.7, 0.2, 0.0], "ramp")),
-    "discs": car("toy-discs", body=LONG),
-    "feedback": puck("toy-feedback"),
-    "boxed car": car("toy-boxed", limit=[*KEEP_IN, {"name": "slow", "weights": {"speed": 1.0}, "most": 0.35}]),
-    "boxed puck": puck(
-        "toy-boxed-puck", limit=[*KEEP_IN, {"name": "slow", "weights": {"vx": 0.6, "vy": 0.8}, "most": 0.4}]
-    ),
+SLOW = {
+    "car": {"name": "slow", "weights": {"speed": 1.0}, "most": 0.35},
+    "puck": {"name": "slow", "weights": {"vx": 0.6, "vy": 0.8}, "most": 0.4},
 }
+KINDS = {"car": partial(car, stop=([0.7, 0.2, 0.0], "hold"), body=LONG), "puck": puck}
+ROBOTS = {name: kind(f"toy-{name}") for name, kind in KINDS.items()}
+LIMITED = {name: kind(f"toy-{name}", limit=[*KEEP_IN, SLOW[name]]) for name, kind in KINDS.items()}
+CAPSULES = {"car": (LONG[0][0], LONG[1][0], 0.12), "puck": ((0.0, 0.0), (0.0, 0.0), 0.1)}
 
 
 @cache
 def ready(name):
     robot = ROBOTS[name]
-    periods, held = (9000, 6) if robot.feedback else (6000, 5)
-    env = Toy(robot, steps=10_000)
+    env, periods, held = Toy(robot, steps=10_000), *((4500, 6) if robot.feedback else (3000, 5))
     data = collect(env, robot, periods, held=held, state=seen, actions=normalised(robot), shown=False)
     return Filter(fit_model_set(data, ModelConfig()))
 
 
-def drive(env, filter, episodes=8, target=None):
+def limited(name, **options):
+    return Filter(replace(ready(name).model, robot=LIMITED[name]), **options)
+
+
+def drive(env, filter, episodes=5, target=None):
     """Drive at the obstacles in turn, or at targets. Return the decisions' kinds and the largest distance."""
     robot, kinds, farthest = filter.robot, [], 0.0
     for episode in range(episodes):
@@ -72,29 +74,28 @@ def filtered(env, filter):
     return SafetyWrapper(env, filter, accept_bound=1.0, state=seen, obstacles=near, actions=normalised(filter.robot))
 
 
-@pytest.mark.parametrize("name", ["hold", "profile", "discs", "feedback"])
+@pytest.mark.parametrize("name", ROBOTS)
 def test_an_adversary_hits_nothing_with_any_stop_rule_and_body(name):
-    capsule = (LONG[0][0], LONG[1][0], 0.12) if name == "discs" else ((0.0, 0.0), (0.0, 0.0), 0.1)
-    bare = Toy(ROBOTS[name], discs(), capsule)
+    bare = Toy(ROBOTS[name], discs(), CAPSULES[name])
     drive(bare, ready(name), 3)
     assert bare.worst < 0.0, "without the filter, it hits"
-    env = Toy(ROBOTS[name], discs(), capsule)
+    env = Toy(ROBOTS[name], discs(), CAPSULES[name])
     kinds, farthest = drive(filtered(env, ready(name)), ready(name))
     assert 0.0 < env.worst < 0.15, "it comes near and does not hit"
     assert farthest > 0.3
     assert {"allowed", "adjusted"} <= set(kinds)
 
 
-@pytest.mark.parametrize("name", ["boxed car", "boxed puck"])
+@pytest.mark.parametrize("name", ROBOTS)
 def test_limits_hold_between_periods_and_in_the_stop(name):
-    robot = ROBOTS[name]
+    robot, filter = LIMITED[name], limited(name)
     corners = [(3.0, 0.0), (3.0, 3.0), (0.0, -3.0), (-3.0, 1.0)]
     weights, most = np.array([one.weights for one in robot.limits]), np.array([one.most for one in robot.limits])
     bare = Toy(robot)
-    drive(bare, ready(name), 4, corners)
+    drive(bare, filter, 4, corners)
     assert ((np.array(bare.trace) @ weights.T - most).max(0)[[0, -1]] > 0.05).all(), "without the filter it leaves"
     env = Toy(robot)
-    _, farthest = drive(filtered(env, ready(name)), ready(name), 4, corners)
+    _, farthest = drive(filtered(env, filter), filter, 4, corners)
     worst = (np.array(env.trace) @ weights.T - most).max(0)
     assert (worst <= 0.0).all()
     assert worst[-1] > -0.15, "the limit of speed is used"
@@ -103,7 +104,7 @@ def test_limits_hold_between_periods_and_in_the_stop(name):
 
 def decisions_at_the_edge(clearance_margin, count, post=False):
     """Yield decisions of the boxed car that drives near its limit in x, and optionally beside a post."""
-    filter = Filter(ready("boxed car").model, clearance_margin=clearance_margin)
+    filter = limited("car", clearance_margin=clearance_margin)
     rng, plan, driving = np.random.default_rng(0), np.zeros((filter.robot.horizon, 2)), np.array([0.2, 0.0])
     for _ in range(count):
         state = np.array([rng.uniform(0.55, 0.8), 0.0, rng.uniform(-0.3, 0.3), 0.2])
@@ -122,7 +123,7 @@ def test_a_limit_is_kept_with_any_clearance_margin():
 
 def test_a_limit_never_blocks_a_proposal_that_is_adjusted_for_clearance():
     """A limit has no clearance margin, so a tube may come nearer to it than to the obstacle that is named."""
-    limits, adjusted = {limit.name for limit in ROBOTS["boxed car"].limits}, 0
+    limits, adjusted = {limit.name for limit in LIMITED["car"].limits}, 0
     for decision in decisions_at_the_edge(0.1, 300, post=True):
         if decision.for_clearance:
             assert decision.blocked_by.by not in limits
@@ -132,7 +133,6 @@ def test_a_limit_never_blocks_a_proposal_that_is_adjusted_for_clearance():
 
 @pytest.mark.parametrize("margin", [0.2, -0.1])
 def test_an_obstacles_margin_is_kept_even_if_negative(margin):
-    robot = ROBOTS["feedback"]
-    env = Toy(robot, discs(margin), capsule=((0.0, 0.0), (0.0, 0.0), 0.1 + margin))
-    drive(filtered(env, ready("feedback")), ready("feedback"), 5)
+    env = Toy(ROBOTS["puck"], discs(margin), capsule=((0.0, 0.0), (0.0, 0.0), 0.1 + margin))
+    drive(filtered(env, ready("puck")), ready("puck"), 5)
     assert 0.0 < env.worst < 0.12
