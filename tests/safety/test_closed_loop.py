@@ -76,27 +76,22 @@ def pushing(k, rng):
 @pytest.mark.parametrize("policy", [wild, pushing])
 @pytest.mark.parametrize("obstacles", [ROOM, CORRIDOR], ids=["room", "corridor"])
 def test_the_robot_hits_nothing_and_does_not_get_stuck(ready, obstacles, policy):
-    counts, least, violations, longest = drive(ready, obstacles, policy, 1600, seed=11)
+    counts, least, violations, longest = drive(ready, obstacles, policy, 800, seed=11)
     assert least > 0.0
-    assert violations <= 5
-    assert counts[ADJUSTED] > 20
-    assert counts[ALLOWED] > 320
+    assert violations <= 2
+    assert counts[ADJUSTED] > 10
+    assert counts[ALLOWED] > 160
     assert longest < 100
 
 
 @pytest.mark.parametrize(
-    ("which", "seed", "most"),
-    [
-        (("set-membership", "direct"), 12, 0),
-        (("matrix-zonotope", "direct"), 12, 0),
-        (("residual", "recursion"), 13, 3),
-    ],
+    "which", [("set-membership", "direct"), ("matrix-zonotope", "direct"), ("residual", "recursion")]
 )
-def test_the_other_model_sets_hit_nothing_either(models, which, seed, most):
-    counts, least, violations, _ = drive(Filter(models[which]), ROOM, wild, 400, seed)
+def test_the_other_model_sets_hit_nothing_either(models, which):
+    counts, least, violations, _ = drive(Filter(models[which]), ROOM, wild, 150, seed=12)
     assert least > 0.0
-    assert violations <= most
-    assert counts[ALLOWED] + counts[ADJUSTED] > 100
+    assert violations <= (1 if which[0] == "residual" else 0)
+    assert counts[ALLOWED] + counts[ADJUSTED] > 40
 
 
 EXTRA = 0.02  # m: this robot keeps to its chords and stops at once, so its bounds on both are raised first
@@ -120,41 +115,27 @@ def without_measurement_error(model):
 
 
 MUTANTS = {
-    "footprint": (None, without_footprint),
-    "width": (None, with_a_tenth_of_the_width),
-    "measurement error": (None, without_measurement_error),
-    "chord deviation": ("chord_deviations", lambda model: widened(model, "chord_deviations", -EXTRA)),
-    "stopping distance": ("stopping_distance", lambda model: widened(model, "stopping_distance", -EXTRA)),
+    "footprint": without_footprint,
+    "width": with_a_tenth_of_the_width,
+    "measurement error": without_measurement_error,
+    "chord_deviations": lambda model: widened(model, "chord_deviations", -EXTRA),
+    "stopping_distance": lambda model: widened(model, "stopping_distance", -EXTRA),
 }
 
 
-def before_a_wall():
-    """Yield requests in front of a wall: from right before it to well off."""
-    for x in np.linspace(0.11, 0.2, 150):
-        yield request((0, 0, 0, 0.2, 0), (0.25, 0.0), [Obstacle("wall", (x, 0.0), (), np.pi)])
-
-
-def too_near(filter, model, ask):
-    """Return whether a filter verifies an input whose true tube touches the wall."""
-    decision = filter.decide(ask)
-    return decision.kind != FAILSAFE and fits(model, ask, decision.plan[0]) <= 0.0
-
-
-@pytest.mark.parametrize("part", [None, "chord_deviations", "stopping_distance"])
-def test_no_verified_tube_touches_the_wall(model, part):
-    honest = model if part is None else widened(model, part, EXTRA)
-    filter = Filter(honest)
-    assert not any(too_near(filter, honest, ask) for ask in before_a_wall())
-
-
 @pytest.mark.parametrize("name", MUTANTS)
-def test_a_part_that_the_model_omits_is_noticed(model, name):
-    part, mutant = MUTANTS[name]
-    honest = model if part is None else widened(model, part, EXTRA)
-    filter = Filter(mutant(honest))
-    assert any(too_near(filter, honest, ask) for ask in before_a_wall())
+def test_no_verified_tube_touches_a_wall_unless_the_model_omits_a_part(model, name):
+    """From right before the wall to well off, the true tubes of verified inputs are compared with the wall."""
+    honest = widened(model, name, EXTRA) if hasattr(model, name) else model
 
+    def too_near(filter):
+        """Return whether the filter verifies an input whose true tube touches the wall."""
+        for x in np.linspace(0.11, 0.2, 60):
+            ask = request((0, 0, 0, 0.2, 0), (0.25, 0.0), [Obstacle("wall", (x, 0.0), (), np.pi)])
+            decision = filter.decide(ask)
+            if decision.kind != FAILSAFE and fits(honest, ask, decision.plan[0]) <= 0.0:
+                return True
+        return False
 
-def test_without_the_footprint_the_robot_collides(model):
-    _, least, _, _ = drive(Filter(without_footprint(model)), ROOM, pushing, 600, seed=16)
-    assert least < 0.0
+    assert not too_near(Filter(honest))
+    assert too_near(Filter(MUTANTS[name](honest)))
