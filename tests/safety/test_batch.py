@@ -5,8 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadRequest
@@ -15,7 +13,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Disc
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
-from brakeline.safety.filter.batch import lane_decisions, plane_batch, qp_batch, search_batch
+from brakeline.safety.filter.batch import lane_decisions, qp_batch, search_batch
 from brakeline.safety.filter.batch.batch_filter import BatchFilter
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
@@ -32,6 +30,7 @@ SAME = 1e-6
 WORTH = 3 * WORTH_A_BATCH  # of the ground robot
 FORMS = ("ground direct", "ground recursion", "two discs", "one-step", "real time", "quadrotor direct")
 LONG = Disc((0.08, 0.02), 0.07), Disc((-0.08, 0.0), 0.09)
+EQUAL = ("kind", "verified", "at_least", "contained", "compared", "for_clearance", "model", "bound", "judges", "reason")
 
 
 @pytest.fixture
@@ -44,6 +43,11 @@ def filters(models, data):
         "real time": lambda: Filter(certify(replace(driven(), robot=ROBOT.in_real_time()), CONFIG)[0]),
     }
     return lambda form: made[form]() if form in made else Filter.load(form.split()[0])
+
+
+@cache
+def ground():
+    return Filter.load("ground")
 
 
 def shape(rng, at, d):
@@ -99,22 +103,11 @@ def check_same(ready, requests, answers):
     """Check that the answers are those of the single path."""
     for row, request in enumerate(requests):
         batch, single = answers.row(row), ready.decide(request)
-        for name in (
-            "kind",
-            "verified",
-            "at_least",
-            "contained",
-            "compared",
-            "for_clearance",
-            "model",
-            "bound",
-            "judges",
-        ):
+        for name in EQUAL:
             assert getattr(batch, name) == getattr(single, name), (row, name)
         assert (batch.score is None) == (single.score is None)
         assert (batch.blocked_by and batch.blocked_by.by) == (single.blocked_by and single.blocked_by.by)
         assert apart(batch, single) < SAME, row
-        assert batch.reason == single.reason
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +119,7 @@ def _whole_searches(monkeypatch):
 @pytest.mark.parametrize("form", FORMS)
 def test_a_batch_decides_as_the_single_path(filters, form):
     ready, rng = filters(form), np.random.default_rng(0)
-    requests = [scene(rng, ready, crowd=0.8) for _ in range(250)]
+    requests = [scene(rng, ready, crowd=0.8) for _ in range(100)]
     answers = ready.decide_batch(RequestArrays.of(requests))
     check_same(ready, requests, answers)
     kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
@@ -134,28 +127,14 @@ def test_a_batch_decides_as_the_single_path(filters, form):
     assert len(answers.singly) < 0.5 * len(requests)
 
 
-@pytest.mark.parametrize("lanes", [7, 1 << 16])
-def test_the_number_of_lanes_at_once_changes_no_decision(lanes, monkeypatch):
+def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
     ready, rng = ground(), np.random.default_rng(2)
-    requests = [scene(rng, ready, crowd=0.8) for _ in range(100)]
-    monkeypatch.setattr(lane_decisions, "LANES", lanes)
+    requests = [scene(rng, ready, crowd=0.8) for _ in range(50)]
+    monkeypatch.setattr(lane_decisions, "LANES", 7)
     check_same(ready, requests, BatchFilter(ready).decide(RequestArrays.of(requests)))
 
 
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 40))
-def test_any_scenes_are_decided_as_the_single_path_decides_them(seed, count):
-    rng, ready = np.random.default_rng(seed), ground()
-    requests = [scene(rng, ready, crowd=1.0) for _ in range(count)]
-    check_same(ready, requests, ready.decide_batch(RequestArrays.of(requests)))
-
-
-@cache
-def ground():
-    return Filter.load("ground")
-
-
-def test_past_windows_are_scored(filters):
+def test_past_windows_are_scored():
     ready, rng = one_step(), np.random.default_rng(3)
     robot = ready.robot
     requests = []
@@ -168,7 +147,7 @@ def test_past_windows_are_scored(filters):
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
 
 
-@pytest.mark.parametrize(("crowd", "rows"), [(0.9, 120), (0.0, 5)])
+@pytest.mark.parametrize(("crowd", "rows"), [(0.9, 40), (0.0, 5)])
 def test_torch_gives_the_same_answers_in_its_own_tensors(crowd, rows):
     torch = pytest.importorskip("torch")
     ready, rng = ground(), np.random.default_rng(5)
@@ -196,7 +175,7 @@ def moved(requests, change):
 
 def test_obstacles_may_have_empty_slots_with_any_numbers():
     ready, rng = ground(), np.random.default_rng(6)
-    requests = [scene(rng, ready, crowd=0.9) for _ in range(60)]
+    requests = [scene(rng, ready, crowd=0.9) for _ in range(30)]
     arrays = RequestArrays.of(requests)
     empty = np.arange(arrays.obstacles.rho.shape[1]) >= arrays.obstacles.count[:, None]
     assert empty.any()
@@ -237,10 +216,8 @@ def invalid():
     arrays = RequestArrays.of([scene(rng, ready, crowd=1.0) for _ in range(4)])
     yield "state", replace(arrays, state=arrays.state[:, :4])
     yield "plan", replace(arrays, plan=arrays.plan[:3])
-    yield (
-        "obstacles.margin",
-        replace(arrays, obstacles=replace(arrays.obstacles, margin=arrays.obstacles.margin[:, :0])),
-    )
+    narrow = replace(arrays.obstacles, margin=arrays.obstacles.margin[:, :0])
+    yield "obstacles.margin", replace(arrays, obstacles=narrow)
     yield "obstacles.count", replace(arrays, obstacles=replace(arrays.obstacles, count=arrays.obstacles.count + 9))
     yield "model", replace(arrays, model=["a"])
     yield "state", replace(arrays, state=arrays.state.astype(np.float32))
@@ -251,12 +228,11 @@ def invalid():
     yield "obstacles", replace(arrays, obstacles=none, known_free=np.zeros(4, dtype=bool))
 
 
-@pytest.mark.parametrize("number", range(10))
-def test_an_invalid_batch_is_refused_with_the_fields_name(number):
-    name, arrays = list(invalid())[number]
-    with pytest.raises(BadRequest) as refusal:
-        ground().decide_batch(arrays)
-    assert refusal.value.field == name
+def test_an_invalid_batch_is_refused_with_the_fields_name():
+    for name, arrays in invalid():
+        with pytest.raises(BadRequest) as refusal:
+            ground().decide_batch(arrays)
+        assert refusal.value.field == name
 
 
 # --- what the batch does not decide itself -------------------------------------------------------------------------
@@ -319,7 +295,7 @@ def test_a_client_in_process_asks_for_many_at_once(monkeypatch):
 def test_a_wrong_answer_of_the_solver_is_not_verified(filters, form, monkeypatch):
     """The solver returns the proposal as the solution of every QP."""
     ready, rng = filters(form), np.random.default_rng(13)
-    requests = [scene(rng, ready, crowd=1.0) for _ in range(120)]
+    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
 
     def wrong(self, rows, z_0, proposal):
         everywhere = np.ones(proposal.shape[1], dtype=bool)
@@ -352,17 +328,3 @@ def test_an_unsure_comparison_goes_to_the_single_path(monkeypatch):
     answers = BatchFilter(ready).decide(RequestArrays.of(requests))
     assert len(answers.singly) > 30
     check_same(ready, requests, answers)
-
-
-def test_a_broken_half_space_is_seen_by_these_tests(monkeypatch):
-    """A planted fault: half-spaces that do not keep off the body."""
-    ready, rng = ground(), np.random.default_rng(15)
-    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
-    monkeypatch.setattr(
-        "brakeline.safety.filter.batch.constraint_batch.planes_beside",
-        lambda xp, near, start, nominal, turn, keep_off, measured: plane_batch.planes_beside(
-            xp, near, start, nominal, turn, 0.5 * keep_off, measured
-        ),
-    )
-    with pytest.raises(AssertionError):
-        check_same(ready, requests, BatchFilter(ready).decide(RequestArrays.of(requests)))

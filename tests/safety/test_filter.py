@@ -13,8 +13,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
-from brakeline.safety.model.error_bounds import ErrorBound
-from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
@@ -59,30 +58,18 @@ def test_the_penalty_counts_from_what_bounds_and_slew_let_pass():
     assert correction_penalty(QUADROTOR, (np.nan, 0.1, np.inf), before, (0.2, 0.1, -4.1), 1.0) == pytest.approx(0.0)
 
 
-def test_a_slew_limit_is_kept():
-    """The model set is that of an invented integrator."""
-    robot = replace(GROUND, action_slew=(0.05, 0.1))
-
-    def certificate(C, w):
-        n, nz = C.shape
-        return ErrorBound(C, np.zeros((0, nz)), np.zeros((n, 0)), np.zeros((n, nz)), np.full(n, w), np.eye(n))
-
-    steps = []
-    for _ in range(3):
-        C = np.zeros((5, 6))
-        C[0, 4] = C[2, 5] = 0.2
-        steps.append(certificate(C, 0.002))
-    domain = np.array([[-0.1, -0.6, 0.0, -0.5], [0.3, 0.6, 0.25, 0.5]])
-    nothing = certificate(np.zeros((3, 6)), 0.001), certificate(np.zeros((1, 6)), 0.001)
-    ready = Filter(ModelSet(robot, ModelConfig(), tuple(steps), *nothing, domain, np.eye(6), {}))
-    found = ready.decide(request((0, 0, 0, 0.2, 0), (0.0, 0.5), [cylinder(2, 0)]))
-    assert found.kind == ALLOWED
-    assert np.allclose(found.plan[0], [0.15, 0.1])
-    for x in np.linspace(0.24, 0.28, 9):
-        found = ready.decide(request((0, 0, 0, 0.15, 0), (0.25, 0.5), [cylinder(x, 0.02)]))
-        if found.kind != FAILSAFE:
-            assert 0.1 - 1e-12 <= found.plan[0][0] <= 0.2 + 1e-12
-            assert abs(found.plan[0][1]) <= 0.1 + 1e-12
+def test_a_slew_limit_is_kept(model):
+    ready = Filter(replace(model, robot=replace(GROUND, action_slew=(0.05, 0.1))))
+    decision = ready.decide(request((0, 0, 0, 0.2, 0), (0.0, 0.5), [cylinder(2, 0)]))
+    assert decision.kind == ALLOWED and np.allclose(decision.plan[0], [0.15, 0.1])
+    kinds = set()
+    for x in np.linspace(0.24, 0.32, 9):
+        decision = ready.decide(request((0, 0, 0, 0.15, 0), (0.25, 0.5), [cylinder(x, 0.02)]))
+        kinds.add(decision.kind)
+        if decision.kind != FAILSAFE:
+            assert 0.1 - 1e-12 <= decision.plan[0][0] <= 0.2 + 1e-12
+            assert abs(decision.plan[0][1]) <= 0.1 + 1e-12
+    assert ADJUSTED in kinds
 
 
 def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
@@ -90,13 +77,10 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(0, 0.25, 41), np.linspace(-0.5, 0.5, 41)), -1).reshape(-1, 2)
     width = GROUND.high() - GROUND.low()
-    adjusted = 0
-    for _ in range(300):
-        ask = random_request(rng)
-        decision = ready.decide(ask)
-        if decision.kind != ADJUSTED:
-            continue
-        adjusted += 1
+    decisions = [(ask, ready.decide(ask)) for ask in (random_request(rng) for _ in range(250))]
+    adjusted = [(ask, decision) for ask, decision in decisions if decision.kind == ADJUSTED]
+    assert len(adjusted) > 12
+    for ask, decision in adjusted[:12]:
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
         scene = ready.constraints.local_map(ask, z_0, ready.builder.reachable(ask.input_in_force))
         proposal = ready.inputs.limited(ask.action, ask.input_in_force)
@@ -105,14 +89,9 @@ def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
         at = Linearized(ready.constraints, scene, z, planes, ready.constraints.slack(scene, z, planes))
         kept = PlanSearch(ready, scene, z_0, proposal, DecisionRecord(0)).with_clearance_margin(at)
         taken = np.linalg.norm((decision.plan[0] - ask.action) / width)
-        best = np.inf
-        for u in grid:
-            if ready.constraints.margin(kept, np.concatenate([z_0, u])) >= 0.0:
-                best = min(best, np.linalg.norm((u - ask.action) / width))
+        possible = [u for u in grid if ready.constraints.margin(kept, np.concatenate([z_0, u])) >= 0.0]
+        best = min((np.linalg.norm((u - ask.action) / width) for u in possible), default=np.inf)
         assert taken <= best + 2e-3
-        if adjusted == 12:
-            break
-    assert adjusted == 12
 
 
 def test_a_verified_proposal_is_allowed_or_replaced_for_clearance_and_the_decision_says_which(ready, model):
@@ -144,7 +123,7 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
         assert decision.plan[0] == pytest.approx(ask.action)
 
 
-@pytest.mark.parametrize(("kind", "count"), [("residual", 250), ("set-membership", 80), ("matrix-zonotope", 80)])
+@pytest.mark.parametrize(("kind", "count"), [("residual", 80), ("set-membership", 30), ("matrix-zonotope", 30)])
 def test_every_plan_keeps_clear_and_ends_in_a_stop(models, kind, count):
     model = models[kind, "direct"]
     ready = Filter(model)
@@ -167,35 +146,31 @@ def test_every_plan_keeps_clear_and_ends_in_a_stop(models, kind, count):
 
 def test_beside_one_obstacle_every_proposal_with_enough_clearance_is_allowed(ready, model):
     """Half-spaces cost space only between several obstacles."""
-    rng = np.random.default_rng(2)
-    for _ in range(300):
+    rng, roomy = np.random.default_rng(2), 0
+    for _ in range(80):
         ask = random_request(rng, count=1)
-        roomy = fits(model, ask, ask.action) > ready.clearance_margin + 0.02
-        if roomy:
+        if fits(model, ask, ask.action) > ready.clearance_margin + 0.02:
             assert ready.decide(ask).kind == ALLOWED
+            roomy += 1
+    assert roomy > 20
 
 
 def test_the_tube_is_of_true_positions_and_holds_them(ready):
     rng = np.random.default_rng(3)
-    outside = 0
-    for _ in range(300):
+    for _ in range(150):
         robot = Unicycle((0.3, -0.2, rng.uniform(-3, 3)), rng)
-        state = robot.measure()
-        decision = ready.decide(request(state, rng.uniform([0, -0.5], [0.25, 0.5]), input_in_force=np.zeros(2)))
-        for k in range(3):
-            robot.step(decision.plan[k])
-            if k == 0:
-                assert decision.predicted.contains(GROUND, robot.measure())
-            off = np.abs(robot.state[:2] - decision.tube_center[k])
-            outside += bool((off > decision.tube_half_width[k]).any())
-    assert outside == 0
+        decision = ready.decide(
+            request(robot.measure(), rng.uniform([0, -0.5], [0.25, 0.5]), input_in_force=np.zeros(2))
+        )
+        for u, center, half_width in zip(decision.plan, decision.tube_center, decision.tube_half_width, strict=True):
+            robot.step(u)
+            assert (np.abs(robot.state[:2] - center) <= half_width).all()
 
 
 @pytest.mark.parametrize("kind", [ALLOWED, ADJUSTED, FAILSAFE])
 def test_the_prediction_holds_for_every_kind(ready, kind):
-    rng = np.random.default_rng(4)
-    found = 0
-    for _ in range(3000):
+    rng, compared = np.random.default_rng(4), 0
+    for _ in range(1000):
         robot = Unicycle((0, 0, rng.uniform(-3, 3)), rng)
         before = rng.uniform([0, -0.5], [0.25, 0.5])
         robot.step(before)
@@ -204,14 +179,13 @@ def test_the_prediction_holds_for_every_kind(ready, kind):
         place = state[:2] + away * np.array([np.cos(state[2] + angle), np.sin(state[2] + angle)])
         obstacles = [] if kind == ALLOWED else [cylinder(*place)]
         decision = ready.decide(request(state, (0.25, 0.1), obstacles, input_in_force=before, model=ready.version))
-        if decision.kind != kind:
-            continue
-        robot.step(decision.plan[0])
-        assert decision.predicted.contains(GROUND, robot.measure())
-        found += 1
-        if found == 100:
+        if decision.kind == kind:
+            robot.step(decision.plan[0])
+            assert decision.predicted.contains(GROUND, robot.measure())
+            compared += 1
+        if compared == 60:
             return
-    raise AssertionError(f"only {found} decisions were {kind}")
+    raise AssertionError(f"only {compared} decisions were {kind}")
 
 
 NAN, INF = float("nan"), float("inf")
@@ -286,11 +260,11 @@ def test_the_reach_covers_every_plan(ready):
 
 def test_the_same_request_has_the_same_answer_whatever_came_between(model):
     rng = np.random.default_rng(6)
-    asks = [random_request(rng) for _ in range(60)]
+    asks = [random_request(rng) for _ in range(30)]
     first = Filter(model)
     once = [first.decide(ask) for ask in asks]
     other = Filter(ModelSet.decode(model.encode()))
-    for i in rng.permutation(60):
+    for i in rng.permutation(30):
         assert same(first.decide(asks[i]), once[i])
         assert same(other.decide(asks[i]), once[i])
 
