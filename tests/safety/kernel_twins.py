@@ -141,43 +141,48 @@ def stretch(predictor, root, weight, window):
     return stretches(predictor, root, weight, window[None])[0]
 
 
+def turning(angle, d):
+    """Return the rotation (d, d) about the vertical axis."""
+    turn = np.eye(d)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return turn
+
+
+def features(predictor, window):
+    """Yield the features of each period, which starts with the speeds that follow from the period before."""
+    C, scale, saturations, terms, others, _, _, _, inputs = predictor
+    speeds, plan = window[: len(others)], window[len(others) :].reshape(-1, inputs)
+    for before, u in pairwise(plan):
+        v = np.concatenate([speeds, u, before])
+        bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
+        phi = np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
+        yield phi
+        speeds = (C @ phi)[others]
+
+
 def rollouts(predictor, z):
     """`window_rollout_kernels.rollouts`."""
-    C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
-    r, found = len(others), []
+    C, _, _, _, _, heading, arms, d, _ = predictor
+    outputs = []
     for window in z:
-        s, plan, p, angle, rows = window[:r], window[r:].reshape(-1, inputs), np.zeros(d), 0.0, []
-        for before, u in pairwise(plan):
-            v = np.concatenate([s, u, before])
-            bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
-            y = C @ np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
-            turn = np.eye(d)
-            turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-            p, s, row = p + turn @ y[:d], y[others], y.copy()
-            if heading >= 0:
-                angle += y[heading]
-                row[heading] = angle
-                turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        p, angle, rows = np.zeros(d), 0.0, []
+        for phi in features(predictor, window):
+            row = C @ phi
+            p = p + turning(angle, d) @ row[:d]
             row[:d] = p
-            rows.append(np.concatenate([row, *(p + turn @ arm - arm for arm in arms)]))
-        found.append(rows)
-    return np.array(found)
+            if heading >= 0:
+                angle += row[heading]
+                row[heading] = angle
+            rows.append(np.concatenate([row, *(p + turning(angle, d) @ arm - arm for arm in arms)]))
+        outputs.append(rows)
+    return np.array(outputs)
 
 
 def stretches(predictor, root, weight, z):
     """`window_rollout_kernels.stretches`."""
-    C, scale, saturations, terms, others, _, _, _, inputs = predictor
-    r, found = len(others), []
-    for window in z:
-        s, plan, total, rows = window[:r], window[r:].reshape(-1, inputs), 0.0, []
-        for k, (before, u) in enumerate(pairwise(plan)):
-            v = np.concatenate([s, u, before])
-            bent = [np.tanh((v[int(a)] - (v[int(b)] if b >= 0 else 0.0)) / width) for a, b, width in saturations]
-            phi = np.concatenate([[1.0], v / scale, bent])[terms].prod(axis=1)
-            s, total = (C @ phi)[others], total + phi
-            rows.append(np.sqrt(1.0 + weight * np.sum((np.tril(root) @ total) ** 2) / (k + 1)))
-        found.append(rows)
-    return np.array(found)
+    sums = np.array([np.cumsum(list(features(predictor, window)), axis=0) for window in z])  # (T, N, terms)
+    spread = ((sums @ np.tril(root).T) ** 2).sum(axis=2)
+    return np.sqrt(1.0 + weight * spread / np.arange(1, sums.shape[1] + 1))
 
 
 def linearized(predictor, z, T):
@@ -206,11 +211,8 @@ def sets_around(predictor, root, weight, T, kept, sets, more_sets, z):
 def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
     """`window_kernels.score`."""
     _, _, _, _, others, heading, _, d, _ = predictor
-    window = np.concatenate([states[0, others], executed.ravel()])
-    after, turn = states[1:].copy(), np.eye(d)
-    cos, sin = np.cos(states[0, heading]), np.sin(states[0, heading])
-    turn[:2, :2] = [[cos, sin], [-sin, cos]]
-    after[:, :d] = (states[1:, :d] - states[0, :d]) @ turn.T
+    window, after = np.concatenate([states[0, others], executed.ravel()]), states[1:].copy()
+    after[:, :d] = (states[1:, :d] - states[0, :d]) @ turning(states[0, heading], d)
     after[:, heading] = np.angle(np.exp(1j * (states[1:, heading] - states[0, heading])))
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
     off = np.abs(after - rollouts(predictor, window[None])[0, :, : states.shape[1]])

@@ -1,7 +1,9 @@
-"""Each compiled kernel of the filter gives what its plain NumPy twin gives."""
+"""Each compiled kernel of the filter gives what its plain NumPy twin gives, and what its definition says."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.safety.filter import plan_inputs
@@ -14,6 +16,8 @@ from brakeline.safety.filter.kernels import (
     window_kernels,
     window_rollout_kernels,
 )
+from brakeline.safety.filter.qp import ObstacleRows
+from brakeline.safety.filter.reachable_tube import Tube
 from tests.safety import kernel_twins
 
 N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors, free inputs
@@ -28,13 +32,6 @@ MODULES = (
     window_kernels,
     window_rollout_kernels,
 )
-
-
-def turned(rng, d):
-    """A rotation (d, d) about the vertical axis."""
-    angle, turn = rng.uniform(-3.0, 3.0), np.eye(d)
-    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return turn
 
 
 def half_space_parts(rng, d):
@@ -91,7 +88,7 @@ def shapes(rng, d):
 def cases(rng, d):
     """Arguments for each kernel, by its name."""
     W_t, M_t, m_0, position, offset, directions, widening = tube = tube_parts(rng, d)
-    z, start, turn = rng.normal(size=NZ), rng.normal(size=d), turned(rng, d)
+    z, start, turn = rng.normal(size=NZ), rng.normal(size=d), kernel_twins.turning(rng.uniform(-3.0, 3.0), d)
     parts, measured = half_space_parts(rng, d), rng.random(d)
     plans = np.abs(W_t.T[:, -FREE:]), np.abs(position[..., -FREE:]), np.abs(directions)
     low, high, slew = np.array([-1.0, 0.0]), np.array([1.0, 0.3]), np.array([0.2, np.inf])
@@ -156,21 +153,19 @@ def test_every_kernel_has_a_twin_and_a_case():
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("name", sorted(cases(np.random.default_rng(0), 2)))
-def test_a_kernel_gives_what_its_plain_twin_gives(name, d):
-    kernel = next(getattr(module, name) for module in MODULES if hasattr(module, name))
-    twin = getattr(kernel_twins, name)
-    for seed in range(40):
-        arguments = cases(np.random.default_rng(seed), d)[name]
-        arguments = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) and x.ndim else x for x in arguments]
-        ours, plain = kernel(*arguments), twin(*arguments)
+@pytest.mark.parametrize("seed", range(40))
+def test_each_kernel_gives_what_its_plain_twin_gives(seed, d):
+    kernels = public_kernels()
+    for name, values in cases(np.random.default_rng(seed), d).items():
+        arguments = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) and x.ndim else x for x in values]
+        ours, plain = kernels[name](*arguments), getattr(kernel_twins, name)(*arguments)
         if name == "presolve_rows":
             count = ours[0]
             ours = count, ours[1][: max(count, 0)], ours[2][: max(count, 0)]
         ours, plain = (value if isinstance(value, tuple) else (value,) for value in (ours, plain))
+        close = 1e-5 if name in ("linearized", "affine") else 1e-9  # its twin differentiates numerically
         for one, other in zip(ours, plain, strict=True):
-            close = 1e-5 if name in ("linearized", "affine") else 1e-9  # its twin differentiates numerically
-            np.testing.assert_allclose(one, other, rtol=close, atol=close)
+            np.testing.assert_allclose(one, other, rtol=close, atol=close, err_msg=name)
 
 
 def test_the_presolve_cases_have_rows_that_rule_out_and_rows_that_are_left():
@@ -181,3 +176,115 @@ def test_the_presolve_cases_have_rows_that_rule_out_and_rows_that_are_left():
 def test_a_value_that_is_not_a_number_is_never_the_least():
     assert np.isnan(halfspace_kernels.least(np.array([1.0, np.nan, -1.0]), 0.5))
     assert not tube_kernels.within(np.array([0.0, np.nan]), np.array([[-1.0, -1.0], [1.0, 1.0]]))
+
+
+# --- the rows of a tube against half-spaces, by their definitions --------------------------------------------------
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def a_tube(rng, d, own=True):
+    """own: each period has generators of its own, as in `stack_direct`."""
+    N, nz, L, q = int(rng.integers(1, 6)), int(rng.integers(3, 8)), int(rng.integers(1, 9)), int(rng.integers(1, 6))
+    directions = rng.normal(size=(N, d, L))
+    if own:
+        directions *= (np.arange(L) % N == np.arange(N)[:, None])[:, None, :]
+    magnitudes = np.abs(rng.normal(size=(L + N + 1, q)))
+    nothing = np.zeros((N, 0, nz)), np.zeros((N, 0, L))
+    m_0 = np.abs(rng.normal(size=L + N + 1))
+    constant = rng.normal(size=(N, d)), np.zeros((N, 0))
+    return Tube(rng.normal(size=(N, d, nz)), directions, rng.normal(size=(q, nz)), magnitudes, m_0, *nothing, *constant)
+
+
+def supports(tube, normals, z):
+    """Return the supports (n, 2N+1) of the sets at both ends of all periods, by the definition in `ObstacleRows`."""
+    N, L, sizes = tube.horizon, tube.generators, tube.magnitudes(z)
+    centers = np.vstack([np.zeros(normals.shape[2]), tube.centers(z)])
+    spans = np.concatenate([np.zeros((1, *tube.directions.shape[1:])), tube.directions])
+    ends = [(k, k, L + k) for k in range(N)] + [(k, k + 1, L + k) for k in range(N)] + [(N - 1, N, L + N)]
+    values = [
+        normals[:, period] @ centers[end] + np.abs(normals[:, period] @ spans[end]) @ sizes[:L] + sizes[about]
+        for period, end, about in ends
+    ]
+    return np.array(values).T
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@given(seed=SEEDS)
+def test_rows_and_slack_agree_with_the_definition(d, seed):
+    rng = np.random.default_rng(seed)
+    tube = a_tube(rng, d, own=bool(seed % 2))
+    normals, offsets = rng.normal(size=(4, tube.horizon, d)), rng.normal(size=(4, tube.horizon))
+    z = rng.normal(size=tube.W.shape[1])
+    layout, center = ObstacleRows(tube.directions), (tube.position, tube.offset, tube.stretch)
+    rows = layout.rows(center, normals, offsets, 1.0)
+    period = [*range(tube.horizon), *range(tube.horizon), tube.horizon - 1]
+    expected = (offsets[:, period] - supports(tube, normals, z)).ravel()
+    assert rows.bound - rows.support(tube, z) == pytest.approx(expected, abs=1e-9)
+    assert layout.slack(center, normals, offsets, tube.magnitudes(z), z) == pytest.approx(expected, abs=1e-9)
+
+
+def test_nan_in_any_input_leaves_no_slack():
+    rng = np.random.default_rng(0)
+    tube = a_tube(rng, 3)
+    center, layout = (tube.position, tube.offset, tube.stretch), ObstacleRows(tube.directions)
+    parts = rng.normal(size=(4, tube.horizon, 3)), np.full((4, tube.horizon), 100.0), rng.normal(size=tube.W.shape[1])
+    for number in range(len(parts)):
+        normals, offsets, z = (part.copy() for part in parts)
+        (normals, offsets, z)[number].flat[0] = np.nan
+        assert np.isnan(layout.slack(center, normals, offsets, tube.magnitudes(z), z)).any()
+
+
+@given(seed=SEEDS)
+def test_the_presolve_drops_only_rows_that_do_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    rows, known, free, L, q = 12, 3, 3, 5, 3
+    gradient, spread = rng.normal(size=(rows, known + free)), np.abs(rng.normal(size=(rows, L)))
+    spread *= rng.random(spread.shape) < 0.5
+    z_0, constant = rng.normal(size=known), np.abs(rng.normal(size=L))
+    M, center, radius = np.abs(rng.normal(size=(L, q))), rng.normal(size=free), rng.uniform(0.0, 1.0, free)
+    W, offset, scale = rng.normal(size=(q, free)), rng.normal(size=q), rng.uniform(0.5, 2.0, free + q)
+    f = center + radius * rng.uniform(-1.0, 1.0, (400, free))
+    f[:8] = center + radius * np.array(np.meshgrid(*[[-1.0, 1.0]] * free)).reshape(free, -1).T
+    t = np.abs(f @ W.T + offset)
+    z = np.hstack([np.tile(z_0, (len(f), 1)), f])
+    reached = z @ gradient.T + (constant + t @ M.T) @ spread.T  # (plans, rows)
+    bound = rng.uniform(reached.min(axis=0) - 0.1, reached.max(axis=0) + 1.0)
+    bound[::2] = reached.max(axis=0)[::2] - rng.uniform(0.0, 0.2, rows // 2)  # a corner or so is just beyond
+    atom, give = W @ center + offset, np.abs(W) @ radius
+    within = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
+    count, A, b = halfspace_kernels.presolve_rows(
+        gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6
+    )
+    left = bound - 1e-6 - reached
+    if count < 0:
+        assert (left.min(axis=1) < 1e-9).all(), "infeasible: no plan meets all rows"
+        return
+    of_those = (b[:count] - (np.hstack([f, t]) / scale) @ A[:count].T).min(axis=1, initial=np.inf)
+    assert ((left.min(axis=1) >= 0.0) == (of_those >= 0.0))[np.abs(left).min(axis=1) > 1e-9].all()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@settings(max_examples=40)
+@given(seed=SEEDS)
+def test_no_plan_leaves_the_boxes_of_all_plans(d, seed):
+    rng = np.random.default_rng(seed)
+    tube = a_tube(rng, d, own=bool(seed % 2))
+    free, whole = 2, np.ascontiguousarray
+    z, radius, beside = rng.normal(size=tube.W.shape[1]), rng.uniform(0.0, 1.0, free), rng.uniform(0.0, 0.2, d)
+    start, turn = rng.normal(size=d), kernel_twins.turning(rng.uniform(-3.0, 3.0), d)
+    W_free, moved = whole(np.abs(tube.W[:, -free:])), whole(np.abs(tube.position[..., -free:]))
+    spans = np.abs(tube.directions)
+    parts = whole(tube.W), W_free, whole(tube.M), tube.m_0, whole(tube.position), tube.offset, moved, spans, 1.0
+    low, high = halfspace_kernels.filled_by_plans(*parts, z, radius, beside, start, turn)
+    assert low.shape == (tube.horizon + 1, d)
+    for share in rng.uniform(-1.0, 1.0, (20, free)):
+        plan = z.copy()
+        plan[-free:] += radius * share
+        sizes, points = tube.magnitudes(plan), np.vstack([np.zeros(d), tube.centers(plan)])  # (N + 1, d)
+        signs = rng.choice([-1.0, 1.0], (20, tube.generators))
+        points = np.tile(points, (len(signs), 1, 1))
+        points[:, 1:] += np.einsum("kdl,sl->skd", tube.directions, signs * sizes[: tube.generators])
+        chord_deviation = float(sizes[tube.generators :].max())
+        points = start + (points + (chord_deviation + beside) * rng.uniform(-1.0, 1.0, points.shape)) @ turn.T
+        assert (points >= low - 1e-9).all() and (points <= high + 1e-9).all()
