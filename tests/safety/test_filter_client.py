@@ -13,7 +13,7 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import check_for_filter
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, check_for_filter
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.client import SafetyClient
@@ -75,10 +75,6 @@ def client(request, model):
     return request.param(model)
 
 
-def test_every_client_implements_the_interface(client, model):
-    assert isinstance(client, FilterClient) and not isinstance(Filter(model), FilterClient)
-
-
 def test_without_a_decision_every_client_goes_on_with_its_backup_plan(client):
     client.backup_plan.accept(np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.0]]), "version", None, True)
     assert np.array_equal(client.fallback(), [0.1, 0.0])
@@ -90,17 +86,8 @@ def test_the_clients_have_the_same_parameters():
     wanted = list(signature(FilterClient.decide).parameters.values())
     for kind in (SafetyClient, InProcess):
         own = list(signature(kind.decide).parameters.values())
-        assert [(p.name, p.kind, p.default) for p in own[: len(wanted)]] == [
-            (p.name, p.kind, p.default) for p in wanted
-        ]
+        assert own[: len(wanted)] == [p.replace(annotation=own[i].annotation) for i, p in enumerate(wanted)]
         assert all(p.kind is p.KEYWORD_ONLY for p in own[4:])
-
-
-def test_arguments_after_the_obstacles_are_keyword_only(client):
-    with pytest.raises(TypeError, match="positional"):
-        client.decide(np.zeros(5), [0.25, 0.0], [], WALL)
-    with pytest.raises(TypeError, match="scna"):
-        client.decide(np.zeros(5), [0.25, 0.0], [], scna=WALL)
 
 
 @pytest.mark.parametrize(
@@ -141,16 +128,13 @@ def test_a_request_without_obstacles_scan_or_map_is_refused(model, ask):
         assert answer.kind == "failsafe", "the scan counts"
 
 
-@pytest.mark.parametrize("prediction", [False, True])
-def test_the_quick_check_and_the_full_check_both_need_known_space(ready, prediction):
-    sets = Prediction(np.zeros(5), np.full(5, 0.1), 0.0) if prediction else None
-    silent = request(known_free=False, predicted=sets)
-    assert ready.ordinary(silent), "the request is valid apart from that"
-    for check in (ready.decide, lambda asked: check_for_filter(GROUND, asked)):
-        with pytest.raises(BadRequest) as caught:
-            check(silent)
-        assert caught.value.field == "obstacles"
-    walker = MovingObstacles.of(
-        [Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))], 2
-    )
-    assert ready.decide(replace(silent, movers=walker)).kind in ("allowed", "adjusted", "failsafe")
+def test_the_quick_check_and_the_full_check_both_need_known_space(ready):
+    predicted = Prediction(np.zeros(5), np.full(5, 0.1), 0.0)
+    for silent in (request(known_free=False), request(known_free=False, predicted=predicted)):
+        assert ready.ordinary(silent), "the request is valid apart from that"
+        for check in (ready.decide, lambda asked: check_for_filter(GROUND, asked)):
+            with pytest.raises(BadRequest) as caught:
+                check(silent)
+            assert caught.value.field == "obstacles"
+    walker = Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))
+    assert ready.decide(replace(silent, movers=MovingObstacles.of([walker], 2))).kind in (ALLOWED, ADJUSTED, FAILSAFE)

@@ -54,17 +54,16 @@ def ready(model):
     return Filter(model)
 
 
-@given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=2))
-def test_normalised_actions_and_back(action):
-    between = normalised(CAR)
-    control = between.action_to_control(np.array(action))
+PAIR = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2).map(np.array)
+
+
+@given(PAIR, PAIR)
+def test_normalised_actions_become_inputs_and_inputs_actions(there, share):
+    between, wanted = normalised(CAR), 2.0 * there - 1.0
+    control = between.action_to_control(wanted)
     assert (control >= CAR.low()).all() and (control <= CAR.high()).all()
-    assert np.allclose(between.control_to_action(control), action, atol=1e-12)
-
-
-@given(st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2))
-def test_inputs_as_normalised_actions_and_back(share):
-    between, control = normalised(CAR), CAR.low() + np.array(share) * (CAR.high() - CAR.low())
+    assert np.allclose(between.control_to_action(control), wanted, atol=1e-12)
+    control = CAR.low() + share * (CAR.high() - CAR.low())
     action = between.control_to_action(control)
     assert (np.abs(action) <= 1.0).all()
     assert np.allclose(between.action_to_control(action), control, atol=1e-12)
@@ -110,9 +109,9 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
 
 def test_the_wrapper_passes_a_safe_action_and_clipping_costs_nothing(ready):
     env = wrapped(Toy(CAR), ready, penalty=2.0, **HOW)
-    for action in ([0.3, 0.5], [9.0, 0.0]):
-        _, reward, _, _, info = env.step(np.array(action, np.float32))
-        executed = normalised(CAR).action_to_control(np.clip(np.array(action, np.float32), -1.0, 1.0))
+    for action in np.array([[0.3, 0.5], [9.0, 0.0]], np.float32):
+        _, reward, _, _, info = env.step(action)
+        executed = normalised(CAR).action_to_control(np.clip(action, -1.0, 1.0))
         assert info["safety"].kind == "allowed" and np.allclose(info["diagnostics"]["executed"], executed, atol=1e-12)
         assert reward == info["penalty"] == 0.0
 

@@ -55,7 +55,7 @@ def _root(square: Fraction | int) -> Fraction:
     return Fraction(isqrt(int(Fraction(square) * 10**24)), 10**12)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200)
 @given(scenes())
 def test_the_distance_to_an_obstacle_is_exact(scene: tuple[Obstacle, list[float]]) -> None:
     obstacle, point = scene
