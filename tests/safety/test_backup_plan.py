@@ -11,6 +11,8 @@ from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
 
+ELSEWHERE = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
+
 
 def moving(tail=((0, 0), (0, 0), (0, 0)), x=0.215, **more):
     """Return a request at full speed, so near an obstacle that only the backup plan is left."""
@@ -21,11 +23,8 @@ def moving(tail=((0, 0), (0, 0), (0, 0)), x=0.215, **more):
 def test_a_failsafe_is_the_backup_plans_next_input(ready):
     tail = ((0.0, 0.1), (0, 0), (0, 0))
     decision = ready.decide(moving(tail, model=ready.version))
-    assert decision.kind == FAILSAFE
-    assert decision.verified
-    assert np.array_equal(decision.plan, tail)
-    assert decision.margin < 0.0
-    assert "no verified input" in decision.reason
+    assert decision.kind == FAILSAFE and decision.verified and np.array_equal(decision.plan, tail)
+    assert decision.margin < 0.0 and "no verified input" in decision.reason
 
 
 @pytest.mark.parametrize(
@@ -33,7 +32,7 @@ def test_a_failsafe_is_the_backup_plans_next_input(ready):
 )
 def test_a_plan_counts_as_unverified_without_its_model_or_prediction(ready, version, prediction):
     """The robot moves without a model's version, with another one, or outside its predicted set."""
-    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0) if prediction else None
+    wrong = ELSEWHERE if prediction else None
     for tail in (((0.2, 0.0), (0, 0), (0, 0)), STILL):
         decision = ready.decide(moving(tail, model=ready.version if prediction else version, predicted=wrong))
         assert (decision.kind, decision.verified) == (FAILSAFE, False)
@@ -47,41 +46,28 @@ def test_an_older_models_tail_is_verified_anew(ready, version):
     for x, in_domain, verified in ((0.6, True, True), (0.6, False, False), (0.215, True, False)):
         ask = moving(((0.1, 0.2), (0, 0), (0, 0)), x, model=version)
         z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
-        found = ready._committed(
-            ask,
-            ready.constraints.local_map(ask, z_0, ready.builder.reachable(z_0[-2:])),
-            z_0,
-            DecisionRecord(0),
-            in_domain,
-        )
-        assert found.verified == verified
-        assert np.array_equal(found.plan, ask.plan if verified else STILL)
+        around = ready.constraints.local_map(ask, z_0, ready.builder.reachable(z_0[-2:]))
+        committed = ready._committed(ask, around, z_0, DecisionRecord(0), in_domain)
+        assert committed.verified == verified
+        assert np.array_equal(committed.plan, ask.plan if verified else STILL)
 
 
 def test_outside_the_recorded_domain_nothing_new_is_verified(ready):
     ask = request((0, 0, 0, 0.6, 0.0), (0.1, 0.0), input_in_force=np.array([0.25, 0.0]))
     decision = ready.decide(replace(ask, model="0123456789ab"))
-    assert decision.kind == FAILSAFE
-    assert not decision.verified
-    assert "domain" in decision.reason
+    assert decision.kind == FAILSAFE and not decision.verified and "domain" in decision.reason
     trusted = ready.decide(replace(ask, model=ready.version))
-    assert trusted.kind == FAILSAFE
-    assert trusted.verified, "the plan was verified when it was made"
+    assert trusted.kind == FAILSAFE and trusted.verified, "the plan was verified when it was made"
 
 
 def test_after_a_violation_the_proposal_may_still_be_verified_from_the_new_measurement(ready):
-    wrong = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
-    decision = ready.decide(request(predicted=wrong))
-    assert decision.kind == ALLOWED
-    assert decision.compared
-    assert not decision.contained
+    decision = ready.decide(request(predicted=ELSEWHERE))
+    assert decision.kind == ALLOWED and decision.compared and not decision.contained
 
 
 def test_standing_still_needs_no_token(ready):
     decision = ready.decide(request(obstacles=[cylinder(0.2, 0)]))
-    assert decision.kind == FAILSAFE
-    assert decision.verified
-    assert not decision.plan.any()
+    assert decision.kind == FAILSAFE and decision.verified and not decision.plan.any()
 
 
 def test_an_unverified_plan_stays_unverified_until_the_robot_stands():

@@ -41,30 +41,19 @@ def test_the_room_is_the_margin_of_the_proposals_tube(ready):
     rng = np.random.default_rng(1)
     for question, decision in blocked(ready, (random_request(rng) for _ in range(60))):
         z_0 = np.concatenate([question.state[ready.regressor], question.input_in_force])
-        z = ready.inputs.regressors(
-            z_0,
-            ready.inputs.limited(question.action, question.input_in_force),
-        )
+        z = ready.inputs.regressors(z_0, ready.inputs.limited(question.action, question.input_in_force))
         scene = ready.constraints.local_map(question, z_0, ready.builder.reachable(question.input_in_force))
         assert decision.blocked_by.room == pytest.approx(ready.constraints.margin(ready.constraints.rows(scene, z), z))
 
 
-def test_a_wall_a_box_a_mover_and_a_limit_have_their_names(ready):
-    def by(filter=ready, movers=None, obstacles=(), action=(0.25, 0.0), state=(0, 0, 0, 0.25, 0)):
-        blocked_by = filter.decide(request(state, action, obstacles, movers=movers)).blocked_by
-        assert blocked_by is not None
-        return blocked_by.by
+def test_a_wall_a_box_a_mover_a_limit_and_the_sight_have_their_names(ready):
+    def name(filter=ready, movers=None, obstacles=(), state=(0, 0, 0, 0.25, 0)):
+        return filter.decide(request(state, (0.25, 0.0), obstacles, movers=movers)).blocked_by.by
 
-    assert by(obstacles=[Obstacle("wall", (0.16, 0.0), (), np.pi), cylinder(-1.0, 0.0)]) == "wall"
-    assert by(obstacles=[cylinder(-1.0, 0.0), Obstacle("box", (0.3, 0.0), (0.3, 0.3))]) == "box"
+    assert name(obstacles=[Obstacle("wall", (0.16, 0.0), (), np.pi), cylinder(-1.0, 0.0)]) == "wall"
+    assert name(obstacles=[cylinder(-1.0, 0.0), Obstacle("box", (0.3, 0.0), (0.3, 0.3))]) == "box"
     walker = Obstacle("cylinder", (0.45, 0.0), (0.1,), motion=Motion((0.0, 0.0), 0.0, 0.0, speed=0.5))
-    assert by(movers=MovingObstacles.of([walker], 2), obstacles=[cylinder(-1.0, 0.0)]) == "moving cylinder"
+    assert name(movers=MovingObstacles.of([walker], 2), obstacles=[cylinder(-1.0, 0.0)]) == "moving cylinder"
     slow = replace(ready.robot, limits=(Limit("walking pace", (0.0, 0.0, 0.0, 1.0, 0.0), 0.1),))
-    limited = Filter(replace(ready.model, robot=slow))
-    assert by(limited, state=(0, 0, 0, 0.05, 0)) == "walking pace"
-
-
-def test_a_short_sight_has_its_name(ready):
-    near_sighted = Filter(replace(ready.model, robot=replace(ready.robot, sight=0.15)))
-    decision = near_sighted.decide(request((0, 0, 0, 0.25, 0), (0.25, 0.0)))
-    assert decision.blocked_by is not None and decision.blocked_by.by == SIGHT
+    assert name(Filter(replace(ready.model, robot=slow)), state=(0, 0, 0, 0.05, 0)) == "walking pace"
+    assert name(Filter(replace(ready.model, robot=replace(ready.robot, sight=0.15)))) == SIGHT

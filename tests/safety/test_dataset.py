@@ -11,9 +11,10 @@ from hypothesis.extra.numpy import arrays
 
 from brakeline.errors import BadData
 from brakeline.messaging.obstacle import rotate
+from brakeline.messaging.robot import Disc
 from brakeline.safety.model.dataset import ENTRY, Dataset, Trajectory
 from brakeline.safety.model.tensor_file import pack, unpack
-from brakeline.safety.model.windows import check_regressors, displacement, non_overlapping, windows
+from brakeline.safety.model.windows import check_regressors, displacement, non_overlapping, ways, windows
 from tests.robots import GROUND
 from tests.safety.unicycle import record
 
@@ -30,6 +31,16 @@ def changed(data, **parts):
     return replace(data, trajectories=(replace(data.trajectories[0], **parts), *data.trajectories[1:]))
 
 
+def turning(samples, turn=0.3, speed=0.1):
+    """Return one period of an even turn at an even speed, in `samples` samples."""
+    at = np.arange(1, samples + 1) / samples
+    radius = speed / turn
+    path = np.column_stack([radius * np.sin(at * turn), radius * (1.0 - np.cos(at * turn))])
+    states = np.zeros((2, 5))
+    states[1, :3] = *path[-1], turn
+    return Trajectory(states, np.zeros((1, 2)), path[None], np.array([turn]), None, (at * turn)[None])
+
+
 def with_value(array, value, at=(3, 0)):
     array = array.copy()
     array[at[: array.ndim]] = value
@@ -37,19 +48,20 @@ def with_value(array, value, at=(3, 0)):
 
 
 def test_a_saved_data_set_is_loaded_unchanged(small, tmp_path):
-    moving = changed(small, before=np.array([0.1, -0.2]))
-    moving.save(tmp_path / "deep" / "set.safetensors")
-    again = Dataset.load(tmp_path / "deep" / "set.safetensors")
-    assert again.digest() == Dataset.load(tmp_path / "deep" / "set.safetensors").digest()
+    path, moving = tmp_path / "deep" / "set.safetensors", changed(small, before=np.array([0.1, -0.2]))
+    moving.save(path)
+    again = Dataset.load(path)
     again.save(str(tmp_path / "named"))
     assert Dataset.load(str(tmp_path / "named")).digest() == again.digest()
-    assert again.about == small.about
-    assert again.periods == 240
+    assert again.about == small.about and again.periods == 240
     for one, other in zip(moving.trajectories, again.trajectories, strict=True):
         for name in ("states", "inputs", "paths", "turned"):
             assert np.array_equal(getattr(one, name), getattr(other, name))
     assert np.array_equal(again.trajectories[0].before, [0.1, -0.2])
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["set.safetensors"]
+    with_headings = Dataset(GROUND, (turning(10), turning(10)))
+    with_headings.save(path)
+    assert (Dataset.load(path).trajectories[1].headings == turning(10).headings).all()
 
 
 @pytest.mark.parametrize("name", ["states", "inputs", "paths", "turned"])
@@ -73,14 +85,12 @@ def test_wrong_sizes_bounds_and_boundaries_are_refused(small):
     ):
         with pytest.raises(BadData, match="shape"):
             changed(small, **parts).check()
-    with pytest.raises(BadData, match="out of the robot's bounds"):
-        changed(small, inputs=with_value(t.inputs, -0.1)).check()
-    with pytest.raises(BadData, match="out of the robot's bounds"):
-        changed(small, before=np.array([0.0, 0.7])).check()
-    with pytest.raises(BadData, match="no trajectory"):
-        replace(small, trajectories=()).check()
-    with pytest.raises(BadData, match="no trajectory"):
-        windows(replace(small, trajectories=()), 1)
+    for parts in ({"inputs": with_value(t.inputs, -0.1)}, {"before": np.array([0.0, 0.7])}):
+        with pytest.raises(BadData, match="out of the robot's bounds"):
+            changed(small, **parts).check()
+    for check in (Dataset.check, lambda data: windows(data, 1)):
+        with pytest.raises(BadData, match="no trajectory"):
+            check(replace(small, trajectories=()))
 
 
 def test_two_recordings_glued_into_one_are_refused(small):
@@ -185,6 +195,33 @@ def test_chord_deviation_and_stopping_distance_by_brute_force(small):
         assert columns.stopping_distance[row] == pytest.approx(farthest, abs=1e-12, nan_ok=True)
     assert np.isnan(columns.stopping_distance).any()
     assert not np.isnan(columns.stopping_distance).all()
+
+
+LONG = (Disc((0.12, 0.0), 0.1), Disc((0.0, 0.0), 0.15), Disc((-0.12, 0.0), 0.1))
+ARM = max(disc.arm for disc in LONG)
+
+
+def off_chord(trajectory):
+    """Return how far the discs of a long robot leave their chords in a trajectory's first period."""
+    return ways(replace(GROUND, body=LONG), trajectory)[0][0]
+
+
+def test_discs_that_turn_leave_their_chords_by_little_more_than_the_sagitta_if_the_headings_are_known():
+    farthest = (ARM + 0.1 / 0.3) * (1.0 - np.cos(0.15))  # no disc is farther from the center of the turn
+    assert off_chord(turning(100)) < farthest + ARM * 0.3 / 100 + 1e-6
+    assert off_chord(replace(turning(100), headings=None)) > 3.0 * off_chord(turning(100))
+    assert off_chord(turning(1)) == pytest.approx(ARM * 0.3), "one sample says nothing about the time of the turn"
+
+
+def test_no_point_of_a_disc_is_farther_from_its_chord_than_stated():
+    fine = turning(1000)
+    cos, sin = np.cos(fine.headings[0]), np.sin(fine.headings[0])
+    for disc in LONG:
+        x, y = disc.at
+        path = fine.paths[0] + np.column_stack([cos * x - sin * y, sin * x + cos * y])
+        begin, chord = np.asarray(disc.at), path[-1] - np.asarray(disc.at)
+        along = np.clip((path - begin) @ chord / (chord @ chord), 0.0, 1.0)
+        assert np.linalg.norm(path - begin - along[:, None] * chord, axis=1).max() <= off_chord(turning(10))
 
 
 STATE = arrays(float, 5, elements=st.floats(-3, 3))
