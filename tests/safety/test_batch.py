@@ -83,6 +83,11 @@ def scene(rng, ready, crowd=0.5):
     )
 
 
+def scenes(ready, count, crowd=0.5, seed=0):
+    rng = np.random.default_rng(seed)
+    return [scene(rng, ready, crowd) for _ in range(count)]
+
+
 def plain(ready, state, action, before, plan):
     return Request(state, action, before, plan, Shapes.of([], ready.robot.position_dim), known_free=True)
 
@@ -99,8 +104,9 @@ def apart(one, other):
     return max(float(np.abs(np.asarray(a) - b).max(initial=0.0)) for a, b in parts)
 
 
-def check_same(ready, requests, answers):
-    """Check that the answers are those of the single path."""
+def check_same(ready, requests, answers=None):
+    """Check that the answers of a new batch, or these, are those of the single path. Return the answers."""
+    answers = answers or BatchFilter(ready).decide(RequestArrays.of(requests))
     for row, request in enumerate(requests):
         batch, single = answers.row(row), ready.decide(request)
         for name in EQUAL:
@@ -108,6 +114,7 @@ def check_same(ready, requests, answers):
         assert (batch.score is None) == (single.score is None)
         assert (batch.blocked_by and batch.blocked_by.by) == (single.blocked_by and single.blocked_by.by)
         assert apart(batch, single) < SAME, row
+    return answers
 
 
 @pytest.fixture(autouse=True)
@@ -118,20 +125,17 @@ def _whole_searches(monkeypatch):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_batch_decides_as_the_single_path(filters, form):
-    ready, rng = filters(form), np.random.default_rng(0)
-    requests = [scene(rng, ready, crowd=0.8) for _ in range(100)]
-    answers = ready.decide_batch(RequestArrays.of(requests))
-    check_same(ready, requests, answers)
+    ready = filters(form)
+    requests = scenes(ready, 100, crowd=0.8)
+    answers = check_same(ready, requests, ready.decide_batch(RequestArrays.of(requests)))
     kinds = {KINDS[kind] for row, kind in enumerate(answers.kind) if row not in answers.singly}
     assert {ALLOWED, ADJUSTED} <= kinds <= {ALLOWED, ADJUSTED, FAILSAFE}
     assert len(answers.singly) < 0.5 * len(requests)
 
 
 def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
-    ready, rng = ground(), np.random.default_rng(2)
-    requests = [scene(rng, ready, crowd=0.8) for _ in range(50)]
     monkeypatch.setattr(lane_decisions, "LANES", 7)
-    check_same(ready, requests, BatchFilter(ready).decide(RequestArrays.of(requests)))
+    check_same(ground(), scenes(ground(), 50, crowd=0.8))
 
 
 def test_past_windows_are_scored():
@@ -142,16 +146,14 @@ def test_past_windows_are_scored():
         states = np.tile(request.state, (robot.horizon, 1)) + 0.01 * rng.normal(size=(robot.horizon, robot.state_dim))
         past = PastWindow(states, np.tile(request.input_in_force, (robot.horizon + 1, 1)), bool(rng.random() < 0.5))
         requests.append(replace(request, past=past if rng.random() < 0.5 else None))
-    answers = ready.decide_batch(RequestArrays.of(requests))
-    check_same(ready, requests, answers)
+    answers = check_same(ready, requests)
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
 
 
 @pytest.mark.parametrize(("crowd", "rows"), [(0.9, 40), (0.0, 5)])
 def test_torch_gives_the_same_answers_in_its_own_tensors(crowd, rows):
     torch = pytest.importorskip("torch")
-    ready, rng = ground(), np.random.default_rng(5)
-    requests = RequestArrays.of([scene(rng, ready, crowd) for _ in range(rows)])
+    ready, requests = ground(), RequestArrays.of(scenes(ground(), rows, crowd))
     theirs, ours = ready.decide_batch(moved(requests, torch.asarray)), ready.decide_batch(requests)
     assert isinstance(theirs.plan, torch.Tensor) and set(theirs.singly) == set(ours.singly)
     assert theirs.kind.tolist() == ours.kind.tolist()
@@ -174,8 +176,7 @@ def moved(requests, change):
 
 
 def test_obstacles_may_have_empty_slots_with_any_numbers():
-    ready, rng = ground(), np.random.default_rng(6)
-    requests = [scene(rng, ready, crowd=0.9) for _ in range(30)]
+    ready, requests = ground(), scenes(ground(), 30, crowd=0.9)
     arrays = RequestArrays.of(requests)
     empty = np.arange(arrays.obstacles.rho.shape[1]) >= arrays.obstacles.count[:, None]
     assert empty.any()
@@ -188,8 +189,8 @@ def test_obstacles_may_have_empty_slots_with_any_numbers():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_verify_nothing(value):
-    ready, rng = ground(), np.random.default_rng(7)
-    requests = RequestArrays.of([replace(scene(rng, ready), model=ready.version) for _ in range(20)])
+    ready = ground()
+    requests = RequestArrays.of([replace(request, model=ready.version) for request in scenes(ready, 20)])
     requests.action[3, 0] = value
     answers = ready.decide_batch(requests)
     assert KINDS[answers.kind[3]] == FAILSAFE and 3 in answers.singly
@@ -212,8 +213,7 @@ def test_an_obstacle_that_is_not_finite_is_no_free_space(part):
 
 
 def invalid():
-    ready, rng = ground(), np.random.default_rng(9)
-    arrays = RequestArrays.of([scene(rng, ready, crowd=1.0) for _ in range(4)])
+    arrays = RequestArrays.of(scenes(ground(), 4, crowd=1.0))
     yield "state", replace(arrays, state=arrays.state[:, :4])
     yield "plan", replace(arrays, plan=arrays.plan[:3])
     narrow = replace(arrays.obstacles, margin=arrays.obstacles.margin[:, :0])
@@ -238,50 +238,42 @@ def test_an_invalid_batch_is_refused_with_the_fields_name():
 # --- what the batch does not decide itself -------------------------------------------------------------------------
 
 
-def test_a_row_that_the_batch_does_not_cover_is_decided_singly():
+def test_what_the_batch_does_not_cover_is_decided_singly(monkeypatch):
     ready = ground()
     stand = plain(ready, np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), np.zeros((3, 2)))
     outside = replace(stand, state=np.array([0.0, 0.0, 0.0, 5.0, 0.0]))
     turning = replace(stand, action=np.array([0.0, 0.4]))
-    answers = ready.decide_batch(RequestArrays.of([stand, outside, turning]))
-    assert sorted(answers.singly) == [1, 2]
-    check_same(ready, [stand, outside, turning], answers)
-
-
-def test_a_robot_that_batches_do_not_cover_is_decided_singly(monkeypatch):
-    ready, rng = ground(), np.random.default_rng(10)
-    requests = [scene(rng, ready) for _ in range(5)]
-    batch = BatchFilter(ready)
+    assert sorted(check_same(ready, [stand, outside, turning]).singly) == [1, 2]
+    requests, batch = scenes(ready, 5), BatchFilter(ready)
     assert batch.covers
-    monkeypatch.setattr(batch, "covers", False)
-    answers = batch.decide(RequestArrays.of(requests))
-    assert len(answers.singly) == 5
-    check_same(ready, requests, answers)
+    monkeypatch.setattr(batch, "covers", False)  # as it is for some robots
+    assert len(check_same(ready, requests, batch.decide(RequestArrays.of(requests))).singly) == 5
+
+
+def test_an_unsure_comparison_goes_to_the_single_path(monkeypatch):
+    monkeypatch.setattr(search_batch, "ROUNDING", np.inf)
+    assert len(check_same(ground(), scenes(ground(), 60, crowd=1.0)).singly) > 30
 
 
 def test_decide_all_keeps_the_order_and_decides_singly_what_does_not_fit():
-    ready, rng = ground(), np.random.default_rng(11)
-    requests = [scene(rng, ready) for _ in range(WORTH + 10)]
+    ready, requests = ground(), scenes(ground(), WORTH + 10)
     mover = Obstacle("cylinder", (3.0, 0.0), (0.1,), motion=Motion(velocity=(0.0, 0.1), position_error=0.01, speed=0.2))
     requests[4] = replace(requests[4], movers=split_moving([mover], 2)[1])
-    decisions = ready.decide_all(requests)
-    assert [one.kind for one in decisions] == [ready.decide(request).kind for request in requests]
-    assert all(apart(one, ready.decide(request)) < SAME for one, request in zip(decisions, requests, strict=True))
+    for decision, request in zip(ready.decide_all(requests), requests, strict=True):
+        single = ready.decide(request)
+        assert decision.kind == single.kind and apart(decision, single) < SAME
     assert len(ready.decide_all(requests[:3])) == 3
     with pytest.raises(BadRequest, match="obstacles"):
         ready.decide_all([*requests, replace(requests[0], obstacles=Shapes.of([], 2), known_free=False)])
 
 
 def test_a_client_in_process_asks_for_many_at_once(monkeypatch):
-    ready, rng, asked = ground(), np.random.default_rng(12), []
-    monkeypatch.setattr(
-        ready, "decide_batch", lambda arrays, of=ready.decide_batch: asked.append(len(arrays)) or of(arrays)
-    )
-    client = InProcess(ready)
-    plans = [BackupPlan(ready.robot) for _ in range(WORTH)]
-    actions = rng.uniform([0.0, -0.5], [0.25, 0.5], (len(plans), 2))
+    ready, asked, decide = ground(), [], ground().decide_batch
+    monkeypatch.setattr(ready, "decide_batch", lambda arrays: asked.append(len(arrays)) or decide(arrays))
+    client, plans = InProcess(ready), [BackupPlan(ready.robot) for _ in range(WORTH)]
+    actions = np.random.default_rng(12).uniform([0.0, -0.5], [0.25, 0.5], (len(plans), 2))
     requests = [
-        client.request(plan, np.zeros(5), action, known_free=True) for plan, action in zip(plans, actions, strict=True)
+        client.request(*parts, known_free=True) for parts in zip(plans, np.zeros((WORTH, 5)), actions, strict=True)
     ]
     answers = client.decide_all(plans, requests)
     assert asked == [len(plans)]
@@ -294,8 +286,8 @@ def test_a_client_in_process_asks_for_many_at_once(monkeypatch):
 @pytest.mark.parametrize("form", ["ground direct", "one-step"])
 def test_a_wrong_answer_of_the_solver_is_not_verified(filters, form, monkeypatch):
     """The solver returns the proposal as the solution of every QP."""
-    ready, rng = filters(form), np.random.default_rng(13)
-    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
+    ready = filters(form)
+    requests = scenes(ready, 60, crowd=1.0)
 
     def wrong(self, rows, z_0, proposal):
         everywhere = np.ones(proposal.shape[1], dtype=bool)
@@ -319,12 +311,3 @@ def exact_margin(ready, request, first):
     around = ready.constraints.local_map(request, z_0, reachable)
     z = ready.inputs.regressors(z_0, np.ascontiguousarray(first))
     return ready.constraints_for(z, request.widening).margin_in(around, z)
-
-
-def test_an_unsure_comparison_goes_to_the_single_path(monkeypatch):
-    ready, rng = ground(), np.random.default_rng(14)
-    requests = [scene(rng, ready, crowd=1.0) for _ in range(60)]
-    monkeypatch.setattr(search_batch, "ROUNDING", np.inf)
-    answers = BatchFilter(ready).decide(RequestArrays.of(requests))
-    assert len(answers.singly) > 30
-    check_same(ready, requests, answers)

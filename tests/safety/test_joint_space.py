@@ -56,10 +56,13 @@ def safety(n=2):
 # --- the description ----------------------------------------------------------------------------------------------
 
 
-def test_a_two_link_arm_is_a_robot(capsys):
+def test_the_command_line_checks_and_shows_an_arm_and_refuses_what_needs_a_task(capsys):
     assert brakeline(["robot", "check", str(ARM)]) == 0
     assert "4 coordinates, 2 inputs, no mistake" in capsys.readouterr().out
     assert brakeline(["robot", "show", str(ARM)]) == 0
+    for command in ("collect", "evaluate", "train"):
+        assert brakeline([command, str(ARM)]) != 0
+        assert "has no position" in "".join(capsys.readouterr())
 
 
 def test_a_description_without_a_position_has_neither_sight_nor_body():
@@ -211,10 +214,8 @@ def test_the_widening_follows_a_weak_motor_and_keeps_the_limits():
 
 
 def test_an_arm_that_stands_beyond_a_limit_recovers():
-    robot = joints(2)
-    arm, client = Joints(robot, np.random.default_rng(6)), safety()
+    arm, client, kinds = Joints(joints(2), np.random.default_rng(6)), safety(), []
     arm.reset(np.array([1.1, 0.0]))
-    kinds = []
     for _ in range(60):
         answer = client.decide(arm.measured(), [1.0, 0.0])
         kinds.append(answer.kind)
@@ -233,24 +234,18 @@ def test_any_number_of_joints():
 # --- space is no word ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("said", "field"),
-    [
-        ({"obstacles": Shapes.of([cylinder(1.0, 0.0, 0.1)], 2)}, "obstacles"),
-        ({"scan": Scan(np.ones(8), 0.5 * np.arange(8.0), (0.0, 0.0, 0.0))}, "scan"),
-        ({"reservation": Reservation(np.zeros((6, 0)), np.zeros((6, 0)), np.zeros(6))}, "reservation"),
-    ],
-)
-def test_what_only_a_robot_with_a_position_can_hit_is_refused(said, field):
+def test_what_only_a_robot_with_a_position_can_hit_is_refused():
     backup_plan = BackupPlan(joints(2))
     request = Request(np.zeros(4), np.zeros(2), backup_plan.input_in_force, backup_plan.plan, Shapes.of([], 0))
     assert ready().decide(request).kind == ALLOWED, "known_free is implied"
-    with pytest.raises(BadRequest, match="has no position") as caught:
-        ready().decide(replace(request, **said))
-    assert caught.value.field == field
-
-
-def test_a_client_that_gives_an_obstacle_is_told_so():
+    for field, value in (
+        ("obstacles", Shapes.of([cylinder(1.0, 0.0, 0.1)], 2)),
+        ("scan", Scan(np.ones(8), 0.5 * np.arange(8.0), (0.0, 0.0, 0.0))),
+        ("reservation", Reservation(np.zeros((6, 0)), np.zeros((6, 0)), np.zeros(6))),
+    ):
+        with pytest.raises(BadRequest, match="has no position") as caught:
+            ready().decide(replace(request, **{field: value}))
+        assert caught.value.field == field
     with pytest.raises(BadShape, match="without a position has no obstacles"):
         safety().decide([0.0] * 4, [0.0, 0.0], [cylinder(1.0, 0.0, 0.1)])
 
@@ -279,9 +274,3 @@ def test_a_gymnasium_environment_records_its_own_data():
     robot = joints(2)
     data = collect(JointEnvironment(robot), robot, 200)
     assert data.periods == 200 and data.trajectories[0].paths.shape[1:] == (1, 4) and data.chord_deviation > 0.0
-
-
-@pytest.mark.parametrize("words", [["collect"], ["evaluate"], ["train"]])
-def test_what_needs_a_task_is_refused(words, capsys):
-    assert brakeline([*words, str(ARM)]) != 0
-    assert "has no position" in "".join(capsys.readouterr())
