@@ -1,12 +1,14 @@
 """The three error bounds: published sets, known noise, and the relations between them."""
 
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
 
 from brakeline.errors import ErrorBoundError
 from brakeline.safety.filter.reachable_tube import RecursionMaps, stack_recursive
@@ -19,6 +21,7 @@ from brakeline.safety.model.error_bounds import (
     set_membership,
     whitening,
 )
+from brakeline.safety.model.facet_normals import facet_normals
 from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
 
 pytestmark = pytest.mark.fast
@@ -280,3 +283,25 @@ def test_the_residual_certificate_bounds_its_samples():
     y = z @ rng.normal(size=(3, 2)) + 0.01 * np.sin(5.0 * z[:, :2]) * np.abs(z[:, :1])
     bound = residual(z, y, least_squares(z, y))
     assert (np.abs(y - z @ bound.C.T) <= bound.half_widths(z)).all()
+
+
+# --- the facets of a zonotope ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_point_is_inside_exactly_if_no_facet_separates_it(dim, seed):
+    rng = np.random.default_rng(seed)
+    generators = rng.normal(size=(dim, 5))
+    vertices = np.array(list(product((-1.0, 1.0), repeat=5))) @ generators.T
+    hull = ConvexHull(vertices).equations  # its outward normals and offsets
+    points = rng.normal(size=(50, dim)) * 3.0
+    inside = (points @ hull[:, :-1].T + hull[:, -1] <= 0.0).all(1)
+    normals = facet_normals(generators)
+    by_support = (np.abs(points @ normals.T) <= np.abs(normals @ generators).sum(1)).all(1)
+    assert (inside == by_support).all()
+
+
+def test_more_than_three_dimensions_are_refused():
+    with pytest.raises(ValueError, match="3 dimensions"):
+        facet_normals(np.eye(4))

@@ -235,35 +235,6 @@ def test_nan_in_any_input_leaves_no_slack():
         assert np.isnan(layout.slack(center, normals, offsets, tube.magnitudes(z), z)).any()
 
 
-@given(seed=SEEDS)
-def test_the_presolve_drops_only_rows_that_do_not_matter(seed):
-    rng = np.random.default_rng(seed)
-    rows, known, free, L, q = 12, 3, 3, 5, 3
-    gradient, spread = rng.normal(size=(rows, known + free)), np.abs(rng.normal(size=(rows, L)))
-    spread *= rng.random(spread.shape) < 0.5
-    z_0, constant = rng.normal(size=known), np.abs(rng.normal(size=L))
-    M, center, radius = np.abs(rng.normal(size=(L, q))), rng.normal(size=free), rng.uniform(0.0, 1.0, free)
-    W, offset, scale = rng.normal(size=(q, free)), rng.normal(size=q), rng.uniform(0.5, 2.0, free + q)
-    f = center + radius * rng.uniform(-1.0, 1.0, (400, free))
-    f[:8] = center + radius * np.array(np.meshgrid(*[[-1.0, 1.0]] * free)).reshape(free, -1).T
-    t = np.abs(f @ W.T + offset)
-    z = np.hstack([np.tile(z_0, (len(f), 1)), f])
-    reached = z @ gradient.T + (constant + t @ M.T) @ spread.T  # (plans, rows)
-    bound = rng.uniform(reached.min(axis=0) - 0.1, reached.max(axis=0) + 1.0)
-    bound[::2] = reached.max(axis=0)[::2] - rng.uniform(0.0, 0.2, rows // 2)  # a corner or so is just beyond
-    atom, give = W @ center + offset, np.abs(W) @ radius
-    within = np.stack([np.maximum(np.abs(atom) - give, 0.0), np.abs(atom) + give])
-    count, A, b = halfspace_kernels.presolve_rows(
-        gradient, spread, bound, z_0, constant, M, center, radius, within, scale, 1e-6
-    )
-    left = bound - 1e-6 - reached
-    if count < 0:
-        assert (left.min(axis=1) < 1e-9).all(), "infeasible: no plan meets all rows"
-        return
-    of_those = (b[:count] - (np.hstack([f, t]) / scale) @ A[:count].T).min(axis=1, initial=np.inf)
-    assert ((left.min(axis=1) >= 0.0) == (of_those >= 0.0))[np.abs(left).min(axis=1) > 1e-9].all()
-
-
 @pytest.mark.parametrize("d", [2, 3])
 @settings(max_examples=40)
 @given(seed=SEEDS)
