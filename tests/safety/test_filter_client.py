@@ -1,4 +1,4 @@
-"""The clients return equal answers in process and over the bus."""
+"""The clients give equal answers in process and over the bus; the fleet client decides for all robots, or for none."""
 
 from dataclasses import replace
 from inspect import signature
@@ -6,11 +6,13 @@ from inspect import signature
 import numpy as np
 import pytest
 
-from brakeline.errors import BadRequest, SafetyError
+from brakeline.errors import BadRequest, NoReply, SafetyError
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.scan import Scan
+from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, check_for_filter
@@ -18,10 +20,13 @@ from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.filter_client import Answer, FilterClient
+from brakeline.safety.service.fleet_client import FleetClient
 from brakeline.safety.service.in_process import InProcess
+from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
 from tests.safety.asked import cylinder, request, same
-from tests.safety.served import ServiceClient
+from tests.safety.served import Service, ServiceClient
+from tests.safety.unicycle import Unicycle
 
 LATE = GROUND.in_real_time()
 AHEAD = cylinder(0.34, 0.0)
@@ -138,3 +143,101 @@ def test_the_quick_check_and_the_full_check_both_need_known_space(ready):
             assert caught.value.field == "obstacles"
     walker = Obstacle("cylinder", (0.9, 0.0), (0.2,), motion=Motion((0.0, 0.0), 0.05, speed=0.5))
     assert ready.decide(replace(silent, movers=MovingObstacles.of([walker], 2))).kind in (ALLOWED, ADJUSTED, FAILSAFE)
+
+
+# --- a fleet: a client decides for all robots of a world, or for none -----------------------------------------------
+
+POST = Obstacle("cylinder", (0.0, 0.8), (0.1,))
+NAMES = ("left", "right")
+
+
+def facing():
+    """Return two robots half a metre apart that face each other."""
+    rng = np.random.default_rng(0)
+    return [Unicycle((-0.25, 0.0, 0.0), rng, noise=0.0), Unicycle((0.25, 0.0, np.pi), rng, noise=0.0)]
+
+
+def decided(fleet, robots, actions):
+    """Return the answers, after retries until the service is found."""
+    while True:
+        try:
+            return fleet.decide([r.measure() for r in robots], actions, [[POST], [POST]])
+        except NoReply:
+            continue
+
+
+@pytest.fixture
+def fleet(join, endpoint, model):  # noqa: F811
+    join("safety", listen=True).serve(DECIDE, Service(model).answer)
+    with FleetClient.open(endpoint, "ground", NAMES, deadline=5.0) as client:
+        yield client
+
+
+def test_two_robots_that_drive_at_each_other_do_not_meet(fleet):
+    robots, moved = facing(), 0.0
+    for _ in range(15):
+        answers = decided(fleet, robots, [[0.25, 0.0], [0.25, 0.0]])
+        for robot, answer in zip(robots, answers, strict=True):
+            robot.step(answer.action)
+        moved = max(moved, robots[0].state[0] + 0.25)
+        one, other = (backup_plan.reservation for backup_plan in fleet.backup_plans)
+        assert one.distance(other) > 0.0
+        assert np.hypot(*(robots[0].state[:2] - robots[1].state[:2])) > 2.0 * GROUND.footprint
+    assert moved > 0.02, "they stood all the time"
+    fleet.reset()
+    assert all(backup_plan.reservation is None and not backup_plan.plan.any() for backup_plan in fleet.backup_plans)
+
+
+def test_without_a_decision_for_one_robot_no_robot_has_one(fleet):
+    robots = facing()
+    answers = decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])
+    for robot, answer in zip(robots, answers, strict=True):
+        robot.step(answer.action)
+    before = [(backup.plan.copy(), backup.input_in_force, backup.reservation) for backup in fleet.backup_plans]
+    with pytest.raises(SafetyError) as caught:
+        decided(fleet, robots, [[0.2, 0.3], [0.0]])
+    assert caught.value.field == "action"
+    for backup, (plan, in_force, reservation) in zip(fleet.backup_plans, before, strict=True):
+        assert np.array_equal(backup.plan, plan)
+        assert backup.input_in_force is in_force and backup.reservation is reservation
+    inputs = fleet.fallback()
+    assert all(np.array_equal(executed, plan[0]) for executed, (plan, *_) in zip(inputs, before, strict=True))
+    for robot, executed in zip(robots, inputs, strict=True):
+        robot.step(executed)
+    assert [a.verified for a in decided(fleet, robots, [[0.1, 0.0], [0.1, 0.0]])] == [True, True]
+
+
+def test_the_first_robot_changes_each_period(fleet, monkeypatch):
+    queries = []
+    monkeypatch.setattr(fleet.bus, "ask", lambda key, payload, *_, **__: queries.append(payload) or b"")
+    for _ in range(3):
+        with pytest.raises(SafetyError):
+            fleet.decide([np.zeros(5), np.ones(5)], [[0.1, 0.0]] * 2, [[], []])
+        fleet.fallback()
+    requests = [pb.RequestBatch.FromString(payload).requests for payload in queries]
+    assert [[(r.step, r.actor, tuple(r.fleet)) for r in batch] for batch in requests] == [
+        [(i, name, NAMES) for name in NAMES] for i in range(3)
+    ]
+
+
+def test_a_fleet_needs_known_free_space(fleet):
+    robots = facing()
+    decided(fleet, robots, [[0.0, 0.1]] * 2)
+    fleet.reset()
+    questions = [r.measure() for r in robots], [[0.0, 0.1]] * 2
+    with pytest.raises(SafetyError, match="known_free") as caught:
+        fleet.decide(*questions)
+    assert caught.value.field == "obstacles"
+    fleet.fallback()
+    assert [answer.kind for answer in fleet.decide(*questions, known_free=True)] == ["allowed", "allowed"]
+    fleet.reset()
+    walls = [replace(WALL, pose=tuple(state[:3])) for state in questions[0]]
+    assert {answer.kind for answer in fleet.decide(*questions, scans=walls)} == {"failsafe"}
+
+
+def test_a_malformed_fleet_is_refused(fleet):
+    for names in ((), ("alone",), ("same", "same")):
+        with pytest.raises(ValueError, match="two robots or more"):
+            FleetClient(fleet.bus, "ground", names)
+    with pytest.raises(ValueError, match="zip"):
+        fleet.decide([np.zeros(5)], [[0.1, 0.0]] * 2, [[], []])
