@@ -14,22 +14,20 @@ MOST = 1.0  # rad, limit of every joint, to both sides
 BEYOND = 1.2  # rad; a recording goes a little beyond the limits
 
 
-def description(n=2, limit=True, **changes):
-    said = {
+def description(n=2, **changes):
+    return {
         "name": f"{n}-joints",
         "period": 0.1,
         "state": {f"q{i}": {"unit": "rad", "error": 0.002} for i in range(n)}
         | {f"dq{i}": {"unit": "rad/s", "error": 0.01, "follows": f"w{i}"} for i in range(n)},
         "input": {f"w{i}": {"unit": "rad/s", "low": -1.0, "high": 1.0} for i in range(n)},
         "plan": {"horizon": 6, "free": 1, "brake": 2},
-    }
-    if limit:
-        said["limit"] = [
+        "limit": [
             {"name": f"q{i} {way}", "weights": {f"q{i}": sign}, "most": MOST}
             for i in range(n)
             for way, sign in (("up", 1.0), ("down", -1.0))
-        ]
-    return said | changes
+        ],
+    } | changes
 
 
 def joints(n=2, **changes):

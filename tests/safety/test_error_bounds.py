@@ -158,12 +158,7 @@ def test_the_factored_form_is_the_matrix_zonotope_multiplied_out():
     sizes = rng.uniform(0.5, 2.0, (2, len(z)))
     bound = matrix_zonotope(z, y, G, sizes, np.zeros((2, 3)), np.zeros(2))
     pseudo = np.linalg.pinv(z.T)
-    matrices = []
-    for j in range(2):
-        for t in range(len(z)):
-            noise = np.zeros((2, len(z)))
-            noise[:, t] = sizes[j, t] * G[:, j]
-            matrices.append(noise @ pseudo)
+    matrices = [sizes[j, t] * np.outer(G[:, j], pseudo[t]) for j in range(2) for t in range(len(z))]
     for _ in range(20):
         at, direction = rng.normal(size=3), rng.normal(size=2)
         explicit = sum(abs(direction @ matrix @ at) for matrix in matrices)

@@ -28,7 +28,7 @@ from brakeline.safety.model.windows import ways
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
 from tests.safety.asked import cylinder
-from tests.safety.joints import MOST, JointEnvironment, Joints, description, joints, record
+from tests.safety.joints import MOST, JointEnvironment, Joints, joints, record
 from tests.safety.served import ServiceClient
 
 ARM = Path(__file__).parents[2] / "examples/two_link_arm/two_link_arm.toml"
@@ -90,7 +90,7 @@ def test_a_description_without_a_position_has_neither_sight_nor_body():
 )
 def test_a_mistake_in_a_description_without_a_position_is_told(changes, field, word):
     with pytest.raises(BadDescription) as caught:
-        robot_from_description(description(2, **changes))
+        joints(2, **changes)
     assert any(place == field and word in text for place, text in caught.value.problems), caught.value.problems
 
 
@@ -101,7 +101,7 @@ def test_limits_are_compared_in_units_of_half_their_distance():
         {"name": "alone", "weights": {"q1": 2.0}, "most": -0.5},
         {"name": "at zero", "weights": {"q0": 1.0, "q1": 1.0}, "most": 0.0},
     ]
-    robot = robot_from_description(description(2, limit=False) | {"limit": limits})
+    robot = joints(2, limit=limits)
     assert robot.limit_scales == pytest.approx([2.0, 2.0, 0.5, 1.0])
     assert robot.limit_values(np.array([1.0, 1.0, 9.0, 9.0])) == pytest.approx([0.5, -0.5, 4.0, 2.0])
 
