@@ -24,18 +24,6 @@ from tests.safety.asked import cylinder, fits, random_request, request, same
 from tests.safety.unicycle import FIX, Unicycle
 
 
-@pytest.mark.parametrize(
-    ("action", "executed"), [((0.2, -0.3), (0.2, -0.3)), ((7.0, -3.0), (0.25, -0.5))], ids=["within", "clipped"]
-)
-def test_far_from_everything_the_proposal_is_allowed_within_its_bounds(ready, action, executed):
-    decision = ready.decide(request(action=action, obstacles=[cylinder(2, 0)]))
-    assert decision.kind == ALLOWED
-    assert decision.reason == decision.solver == ""
-    assert np.array_equal(decision.plan, [executed, [0, 0], [0, 0]])
-    assert decision.verified and decision.contained and not decision.compared
-    assert correction_penalty(GROUND, action, np.zeros(2), decision.plan[0], 1.0) == 0.0
-
-
 @pytest.mark.parametrize("way", [0.28, 0.35, 0.45, 0.7])
 def test_the_margin_is_the_distance_to_the_obstacle_even_beyond_the_reach(model, ready, way):
     ask = request(obstacles=[cylinder(way, 0.0)])
@@ -45,11 +33,15 @@ def test_the_margin_is_the_distance_to_the_obstacle_even_beyond_the_reach(model,
     assert decision.at_least == (way - 0.1 > ready.reach), "beyond the reach, the margin is a lower bound"
 
 
-def test_where_nothing_is_near_the_margin_is_a_lower_bound(ready):
+def test_where_nothing_is_near_the_proposal_is_allowed_within_its_bounds_and_the_margin_is_a_lower_bound(ready):
     for obstacles in ([], [cylinder(2.0, 0.0)]):
-        decision = ready.decide(request(action=(0.2, -0.3), obstacles=obstacles))
-        assert decision.at_least
-        assert ready.reach < decision.margin < GROUND.sight - GROUND.footprint
+        for action, executed in (((0.2, -0.3), (0.2, -0.3)), ((7.0, -3.0), (0.25, -0.5))):
+            decision = ready.decide(request(action=action, obstacles=obstacles))
+            assert (decision.kind, decision.reason, decision.solver) == (ALLOWED, "", "")
+            assert decision.verified and decision.contained and not decision.compared
+            assert np.array_equal(decision.plan, [executed, [0, 0], [0, 0]])
+            assert correction_penalty(GROUND, action, np.zeros(2), decision.plan[0], 1.0) == 0.0
+            assert decision.at_least and ready.reach < decision.margin < GROUND.sight - GROUND.footprint
     behind = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(-0.31, 0.0), cylinder(0.34, 0.0)]))
     alone = ready.decide(request(action=(0.2, -0.3), obstacles=[cylinder(0.34, 0.0)]))
     assert behind.margin == alone.margin < ready.reach, "the obstacle behind is nearer, but not to the tube"
