@@ -215,27 +215,24 @@ def test_an_obstacle_that_is_not_finite_is_no_free_space(part):
     assert {KINDS[kind] for kind in answers.kind[[0, 1, 3]]} == {ADJUSTED}
 
 
-def invalid():
-    arrays = RequestArrays.of(scenes(ground(), 4, crowd=1.0))
-    yield "state", replace(arrays, state=arrays.state[:, :4])
-    yield "plan", replace(arrays, plan=arrays.plan[:3])
-    narrow = replace(arrays.obstacles, margin=arrays.obstacles.margin[:, :0])
-    yield "obstacles.margin", replace(arrays, obstacles=narrow)
-    yield "obstacles.count", replace(arrays, obstacles=replace(arrays.obstacles, count=arrays.obstacles.count + 9))
-    yield "model", replace(arrays, model=["a"])
-    yield "state", replace(arrays, state=arrays.state.astype(np.float32))
-    yield "known_free", replace(arrays, known_free=np.ones(4))
-    yield "widening", replace(arrays, widening=np.array([1.0, 1.0, 0.9, 1.0]))
-    yield "plan", replace(arrays, plan=arrays.plan + 0.1)
-    none = replace(arrays.obstacles, count=np.zeros(4, dtype=int))
-    yield "obstacles", replace(arrays, obstacles=none, known_free=np.zeros(4, dtype=bool))
-
-
 def test_an_invalid_batch_is_refused_with_the_fields_name():
-    for name, arrays in invalid():
+    arrays = RequestArrays.of(scenes(ground(), 4, crowd=1.0))
+    around, none = arrays.obstacles, np.zeros(4, dtype=int)
+    for field, changes in (
+        ("state", {"state": arrays.state[:, :4]}),
+        ("plan", {"plan": arrays.plan[:3]}),
+        ("obstacles.margin", {"obstacles": replace(around, margin=around.margin[:, :0])}),
+        ("obstacles.count", {"obstacles": replace(around, count=around.count + 9)}),
+        ("model", {"model": ["a"]}),
+        ("state", {"state": arrays.state.astype(np.float32)}),
+        ("known_free", {"known_free": np.ones(4)}),
+        ("widening", {"widening": np.array([1.0, 1.0, 0.9, 1.0])}),
+        ("plan", {"plan": arrays.plan + 0.1}),
+        ("obstacles", {"obstacles": replace(around, count=none), "known_free": none.astype(bool)}),
+    ):
         with pytest.raises(BadRequest) as refusal:
-            ground().decide_batch(arrays)
-        assert refusal.value.field == name
+            ground().decide_batch(replace(arrays, **changes))
+        assert refusal.value.field == field
 
 
 # --- what the batch does not decide itself -------------------------------------------------------------------------

@@ -102,22 +102,14 @@ def widened(model, part, by):
     return replace(model, **{part: replace(bound, w=bound.w + by)})
 
 
-def without_footprint(model):
-    return replace(model, robot=replace(GROUND, body=(Disc((0.0, 0.0), 0.05),)))
-
-
-def with_a_tenth_of_the_width(model):
-    return replace(model, steps=tuple(replace(s, kappa=0.1 * s.kappa, w=0.1 * s.w) for s in model.steps))
-
-
-def without_measurement_error(model):
-    return replace(model, robot=replace(GROUND, measurement_bound=(0.0, 0.0, *GROUND.measurement_bound[2:])))
-
-
 MUTANTS = {
-    "footprint": without_footprint,
-    "width": with_a_tenth_of_the_width,
-    "measurement error": without_measurement_error,
+    "footprint": lambda model: replace(model, robot=replace(GROUND, body=(Disc((0.0, 0.0), 0.05),))),
+    "width": lambda model: replace(
+        model, steps=tuple(replace(step, kappa=0.1 * step.kappa, w=0.1 * step.w) for step in model.steps)
+    ),
+    "measurement error": lambda model: replace(
+        model, robot=replace(GROUND, measurement_bound=(0.0, 0.0, *GROUND.measurement_bound[2:]))
+    ),
     "chord_deviations": lambda model: widened(model, "chord_deviations", -EXTRA),
     "stopping_distance": lambda model: widened(model, "stopping_distance", -EXTRA),
 }
