@@ -26,7 +26,6 @@ from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
 from tests.safety.test_one_step import CONFIG, ROBOT, driven
-from tests.safety.test_one_step import ready as one_step
 from tests.safety.test_qp_solver import crowded
 
 SAME = 1e-6
@@ -43,7 +42,7 @@ def filters(models, data):
         "ground recursion": lambda: Filter(models["residual", "recursion"]),
         "two discs": lambda: Filter(fit_model_set(replace(data, robot=replace(data.robot, body=LONG)), ModelConfig())),
         "one-step": one_step,
-        "real time": lambda: Filter(certify(replace(driven(), robot=ROBOT.in_real_time()), CONFIG)[0]),
+        "real time": lambda: Filter(certify(replace(driven(trajectories=3), robot=ROBOT.in_real_time()), CONFIG)[0]),
     }
     return lambda form: made[form]() if form in made else Filter.load(form.split()[0])
 
@@ -51,6 +50,11 @@ def filters(models, data):
 @cache
 def ground():
     return Filter.load("ground")
+
+
+@cache
+def one_step():
+    return Filter(certify(driven(trajectories=3), CONFIG)[0])
 
 
 def shape(rng, at, d):
