@@ -26,7 +26,6 @@ from tests.safety.toys import Toy, car, discs, near, puck, seen
 CAR, PUCK = car("gym-car"), puck("gym-puck")
 HOW = {"state": seen, "obstacles": near, "actions": normalised(CAR)}
 SCANNED = {"state": seen, "actions": normalised(CAR)}
-BOTH = pytest.mark.parametrize("many", [False, True], ids=["one", "vector"])
 
 
 def wrapped(env, ready, many=False, penalty=0.0, **how):
@@ -217,11 +216,15 @@ class Walled(Toy):
         return observation, *ended, self._with_scan(info | {"state": observation})
 
 
-def test_a_vector_decides_by_scans_too(ready):
+def test_one_environment_and_a_vector_decide_by_scans(ready):
     margins = []
     for many in (False, True):
-        *_, info = wrapped(Walled(CAR), ready, many, **SCANNED).step(np.ones((1, 2) if many else 2, np.float32))
+        action, blind = np.ones((1, 2) if many else 2, np.float32), Walled(CAR)
+        *_, info = wrapped(Walled(CAR), ready, many, **SCANNED).step(action)
         margins.append(float(np.squeeze(info["diagnostics"]["margin"])))
+        blind.blind = True
+        *_, info = wrapped(blind, ready, many, **SCANNED).step(action)
+        assert np.all(info["diagnostics"]["kind"] == "failsafe"), "before the first scan, nothing is free"
     assert margins[0] == margins[1] < 0.3, "the wall is near"
 
 
@@ -231,7 +234,7 @@ def test_a_vector_view_without_lists_is_refused(ready):
         env.step(np.ones((1, 2), np.float32))
 
 
-@BOTH
+@pytest.mark.parametrize("many", [False, True], ids=["one", "vector"])
 def test_an_empty_list_means_free_space_and_none_means_unknown_space(ready, many):
     def stepped(near):
         env = wrapped(Toy(CAR), ready, many, obstacles=lambda *_: [near] if many else near, **SCANNED)
@@ -256,14 +259,6 @@ def test_a_missing_scan_frees_nothing(ready):
     figures = after["diagnostics"]
     assert figures["kind"] == "failsafe" and "s old" in figures["reason"], "an old scan frees nothing either"
     assert CAR.is_stop_input(figures["executed"])
-
-
-@BOTH
-def test_before_the_first_scan_nothing_is_free(ready, many):
-    env = Walled(CAR)
-    env.blind = True
-    *_, info = wrapped(env, ready, many, **SCANNED).step(np.ones((1, 2) if many else 2, np.float32))
-    assert np.all(info["diagnostics"]["kind"] == "failsafe")
 
 
 def test_collecting_drops_episodes_that_end_in_a_collision(data):
