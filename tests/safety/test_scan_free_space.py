@@ -1,6 +1,7 @@
 """Free space from scans of random scenes contains no point of an obstacle."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.errors import BadScan
-from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
-from tests.messaging import test_obstacle
 from tests.messaging.test_obstacle import sample
+from tests.safety import ray_casting
 
 FAR, WIDTH = 3.5, 0.1
 FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
@@ -20,7 +21,7 @@ FAN = np.linspace(-math.pi, math.pi, 360, endpoint=False)
 
 def cast(obstacles, at, angles, far=FAR):
     """Return the ranges in the plane along angles [rad]."""
-    return test_obstacle.cast(obstacles, at, np.stack([np.cos(angles), np.sin(angles)], axis=1), far)
+    return ray_casting.cast(obstacles, at, np.stack([np.cos(angles), np.sin(angles)], axis=1), far)
 
 
 def scene(rng, count=6):
@@ -65,19 +66,14 @@ def test_every_point_of_an_obstacle_is_beyond_some_half_space(seed, drop):
     obstacles = scene(rng)
     scan = taken(rng, obstacles, drop, 0.01, position_error=0.02, heading_error=0.02)
     measured = np.array([*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)])
-    error = rng.normal(size=2)
-    error *= 0.02 / np.linalg.norm(error)
+    start, error = measured[:2], rng.normal(size=2)
     turn = measured[2] + rng.uniform(-0.02, 0.02)  # of the robot's frame in the world, truly
-    moved = Scan(scan.ranges, FAN, tuple(measured), far=FAR, range_error=0.01, position_error=0.02, heading_error=0.02)
-    within = 1.0
-    near = occupied_cells(moved, within)
-    start = measured[:2]
+    near = occupied_cells(replace(scan, pose=tuple(measured)), 1.0)
     nominal = start + np.cumsum(rng.uniform(-0.1, 0.1, (3, 2)), axis=0)
     normals, offsets = half_spaces(near, start, nominal, 0.0, np.zeros(2), 0.2)
     solid = np.concatenate([sample(o, rng, 1500) for o in obstacles])
-    solid = solid[np.linalg.norm(solid, axis=1) < within]
-    cos, sin = math.cos(turn), math.sin(turn)
-    world = solid @ np.array([[cos, sin], [-sin, cos]]) + measured[:2] + error
+    solid = solid[np.linalg.norm(solid, axis=1) < 1.0]
+    world = rotate(solid, turn) + start + 0.02 * error / np.linalg.norm(error)
     for k in range(3):
         beyond = (world - start) @ normals[:, k].T >= offsets[:, k] - 1e-9
         assert beyond.any(axis=1).all()
@@ -130,8 +126,7 @@ def test_with_doubt_one_false_range_hides_no_obstacle_of_the_least_width(beams):
         away, turn, yaw = rng.uniform(0.3, 2.5), rng.uniform(-0.2, 0.2), rng.uniform(-3.0, 3.0)
         at = away * np.array([math.cos(turn), math.sin(turn)])
         ranges = cast([Obstacle("box", tuple(at), (WIDTH, WIDTH), yaw)], np.zeros(2), fan)
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        solid = grid @ np.array([[cos, sin], [-sin, cos]]) + at
+        solid = rotate(grid, yaw) + at
         towards, far = np.arctan2(solid[:, 1], solid[:, 0]), np.linalg.norm(solid, axis=1)
         for k in np.flatnonzero(ranges < FAR):
             broken = ranges.copy()

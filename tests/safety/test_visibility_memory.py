@@ -16,13 +16,14 @@ from brakeline.safety.perception.scan_free_space import gaps
 from brakeline.safety.perception.visibility_memory import FanMemory
 from tests.safety.test_scan_free_space import FAN, FAR, WIDTH, cast, scene
 
-BODY, BLIND = 0.02, math.radians(30.0)  # rad on either side of straight behind
+BODY = 0.02
+BEHIND = np.abs(FAN) > math.radians(150.0)  # beams that measure nothing
 
 
 def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
-    """Return a scan from the true pose, blind behind, with a measured pose that is wrong within its bounds."""
+    """Return a scan from a true pose, blind behind, with a measured pose that is wrong within its bounds."""
     ranges = cast(obstacles, np.array(pose[:2]), FAN + pose[2])
-    ranges[np.abs(FAN) > math.pi - BLIND] = 0.0
+    ranges[BEHIND] = 0.0
     off = rng.normal(size=2)
     off *= error / np.linalg.norm(off)
     seen = (pose[0] + off[0], pose[1] + off[1], pose[2] + rng.uniform(-turn, turn))
@@ -52,52 +53,53 @@ def test_space_that_memory_shows_to_be_free_is_free(seed):
     assert remembered > 0
 
 
-def test_memory_fills_a_blind_sector_after_driving_ahead():
-    rng = np.random.default_rng(0)
-    memory = FanMemory(0.105)
-    for k in range(20):
-        filled = memory.fill(_open(0.05 * k, rng), 0.2)
-    behind = gaps(filled)[2][np.abs(gaps(filled)[0]) > math.pi - 0.3]
-    assert behind.min() > 0.3
+def empty(x=0.0, speed=0.0):
+    """Return a scan of empty space, blind behind."""
+    return taken([], (x, 0.0, 0.0), np.random.default_rng(0), speed=speed)
 
 
-def test_in_a_moving_world_memory_fades():
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize("speed", [0.0, 1.6])
+def test_memory_fills_a_blind_sector_after_driving_ahead_and_fades_in_a_moving_world(speed):
     memory = FanMemory(0.105)
     for k in range(20):
-        filled = memory.fill(_open(0.05 * k, rng, speed=1.6), 0.2)
-    assert not filled.valid_beams[np.abs(FAN) > math.pi - BLIND].any()
+        filled = memory.fill(empty(0.05 * k, speed), 0.2)
+    if speed:
+        assert not filled.valid_beams[BEHIND].any()
+    else:
+        angles, _, free = gaps(filled)
+        assert free[np.abs(angles) > math.pi - 0.3].min() > 0.3
 
 
 def test_at_the_start_only_a_ring_around_the_body_is_free():
-    filled = FanMemory(0.105).fill(_open(0.0, np.random.default_rng(0)), 0.0)
-    behind = filled.ranges[np.abs(FAN) > math.pi - BLIND] - filled.range_error
+    filled = FanMemory(0.105).fill(empty(), 0.0)
+    behind = filled.ranges[BEHIND] - filled.range_error
     assert (behind > 0.17).all() and (behind <= 0.205).all()
 
 
+BLINDED = replace(empty(speed=1.2), ranges=np.zeros(len(FAN)))
+
+
 def test_without_a_new_scan_the_last_one_ages():
-    memory, rng = FanMemory(0.105), np.random.default_rng(0)
+    memory = FanMemory(0.105)
     assert not len(memory.fill(None, 0.2).ranges), "before the first scan, nothing is free"
-    filled = memory.fill(_open(0.0, rng, speed=1.2), 0.2)
+    filled = memory.fill(empty(speed=1.2), 0.2)
     memory.later(0.2)  # a period without a call of `fill`
     again = memory.fill(None, 0.2)
     assert np.array_equal(again.ranges, filled.ranges) and again.age == pytest.approx(filled.age + 0.4)
     assert memory.fill(None, 0.2).age == pytest.approx(filled.age + 0.6)
     for _ in range(10):
         memory.fill(None, 0.2)
-    blind = replace(_open(0.0, rng, speed=1.2), ranges=np.zeros(len(FAN)))
-    assert not memory.fill(blind, 0.2).valid_beams.any(), "movers may have entered all remembered space"
+    assert not memory.fill(BLINDED, 0.2).valid_beams.any(), "movers may have entered all remembered space"
 
 
 def test_the_ring_at_the_start_ages_before_the_first_scan():
     """If the first scan comes late, a person may have walked in."""
-    blind = replace(_open(0.0, np.random.default_rng(0), speed=1.2), ranges=np.zeros(len(FAN)))
     memory = FanMemory(0.105)
-    assert memory.fill(blind, 0.2).valid_beams.any(), "at once"
+    assert memory.fill(BLINDED, 0.2).valid_beams.any(), "at once"
     memory.reset()
     for _ in range(3):
         memory.fill(None, 0.2)
-    assert not memory.fill(blind, 0.2).valid_beams.any()
+    assert not memory.fill(BLINDED, 0.2).valid_beams.any()
 
 
 @pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])
@@ -110,11 +112,3 @@ def test_overwriting_the_callers_array_does_not_change_the_memory(memory):
     last = memory.fill(None, 0.2)
     assert (last.ranges == 0.5).all()
     assert beams.ndim == 2 or last.angles[0] == -math.pi
-
-
-def _open(x, rng, speed=0.0):
-    """Return a scan of empty space, blind behind."""
-    ranges = np.where(np.abs(FAN) > math.pi - BLIND, 0.0, FAR)
-    pose = (x + rng.uniform(-0.005, 0.005), rng.uniform(-0.005, 0.005), rng.uniform(-0.01, 0.01))
-    known = {"position_error": 0.01, "heading_error": 0.02, "range_error": 0.02}
-    return Scan(ranges, FAN, pose, far=FAR, least_width=WIDTH, speed=speed, **known)
