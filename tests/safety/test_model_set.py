@@ -1,6 +1,7 @@
-"""Model sets: files are read back, a version names one content, and malformed files are refused."""
+"""Model sets: they hold on held-out data, a version names one content, and malformed files are refused."""
 
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import pytest
@@ -9,30 +10,82 @@ from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.error_bounds import KINDS, least_squares
 from brakeline.safety.model.fitting import fit_model_set
-from brakeline.safety.model.model_set import ENTRY, MODES, ModelConfig, ModelSet
+from brakeline.safety.model.model_set import DIRECT, ENTRY, MODES, ModelConfig, ModelSet
 from brakeline.safety.model.tensor_file import pack, unpack
+from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import periods_until_standing, windows
-from tests.robots import GROUND
 from tests.safety.unicycle import record
 
 ALL = [(kind, mode) for kind in KINDS for mode in MODES]
 
 
+@pytest.fixture(scope="module")
+def plans(data):
+    return windows(data, 3)
+
+
+@pytest.fixture(scope="module")
+def held_out_plans(held_out):
+    return windows(held_out, 3)
+
+
 @pytest.mark.parametrize("which", ALL, ids="-".join)
-def test_an_encoded_model_set_is_decoded_unchanged(models, which, tmp_path):
+def test_a_model_set_is_decoded_unchanged_and_holds_on_its_own_and_on_fresh_data(
+    models, data, plans, held_out, held_out_plans, which
+):
     model = models[which]
     again = ModelSet.decode(model.encode())
-    assert again.version == model.version
-    assert again.model_config == model.model_config
-    assert again.about == model.about
-    model.save(tmp_path / "deep" / "model.safetensors")
-    assert ModelSet.load(tmp_path / "deep" / "model.safetensors").version == model.version
-    model.save(str(tmp_path / "again"))
-    assert ModelSet.load(str(tmp_path / "again")).version == model.version
+    assert (again.version, again.model_config, again.about) == (model.version, model.model_config, model.about)
     z = np.array([0.1, 0.2, 0.1, 0.2, 0.25, -0.5])
     for one, other in ((model.tube(), again.tube()), (model.outer_tube(), again.outer_tube())):
         assert np.array_equal(one.magnitudes(z), other.magnitudes(z))
         assert np.array_equal(one.centers(z), other.centers(z))
+
+    _, bound = data.split((0.5, 0.5))
+    w = windows(bound, 1)
+    z = model.first_regressor(w.z)
+    assert (np.abs(w.y - z @ model.first.C.T) <= model.first.half_widths(z) + 1e-12).all()
+    assert (w.chord_deviation <= model.chord_deviations.half_widths(w.z)[:, 0]).all()
+    seen = ~np.isnan(plans.stopping_distance)
+    assert (plans.stopping_distance[seen] <= model.stopping_distance.half_widths(plans.z[seen])[:, 0]).all()
+
+    report = validate(model, data, held_out)
+    assert (report.certificate, report.mode, report.version) == (*which, model.version)
+    assert 500 < report.windows <= (~np.isnan(held_out_plans.stopping_distance)).sum(), "only stops that were seen"
+    assert report.violations <= 0.01 * report.windows
+    assert report.step_violations <= report.violations
+    assert report.bound_step <= report.bound_plan < 0.05
+    assert report.bound_step <= report.bound_episode <= 1.0
+    assert report.outside_episode == pytest.approx(300 * report.bound_step)
+    assert report.outside_episode > report.bound_episode
+    assert report.outside_hour == pytest.approx(18_000 * report.bound_step), "a period lasts 0.2 s"
+    assert 0 < report.half_width_rest < report.half_width_full
+    assert report.samples == len(plans)
+    assert set(report.figures()) > {"samples", "rank", "condition", "bound_step", "bound_plan"}
+    if report.mode == DIRECT:
+        assert report.in_place_windows > 100 and report.in_place_violations <= 0.02 * report.in_place_windows
+
+
+def test_known_values_of_the_bound():
+    assert upper_bound(0, 100) == pytest.approx(1 - 0.01 ** (1 / 100))
+    assert upper_bound(0, 1) == pytest.approx(0.99)
+    assert upper_bound(5, 5) == upper_bound(0, 0) == 1.0
+    for violations, count in ((1, 10), (3, 50), (20, 1000)):  # so few would be seen in 1 % of all cases
+        p = upper_bound(violations, count)
+        assert sum(comb(count, i) * p**i * (1 - p) ** (count - i) for i in range(violations + 1)) == pytest.approx(0.01)
+
+
+def test_a_narrowed_model_and_a_robot_that_changed_show_their_violations(model, data, held_out):
+    honest = validate(model, data, held_out)
+    narrow = replace(model, steps=tuple(replace(s, kappa=0.5 * s.kappa, w=0.5 * s.w) for s in model.steps))
+    report = validate(narrow, data, held_out)
+    assert report.violations > 0.2 * report.windows
+    assert report.bound_plan > 20 * honest.bound_plan
+    for part in ("chord_deviations", "stopping_distance"):
+        thin = getattr(model, part)
+        gone = replace(model, **{part: replace(thin, kappa=0.0 * thin.kappa, w=0.0 * thin.w)})
+        assert validate(gone, data, held_out).violations > 0.2 * honest.windows
+    assert validate(model, data, record(trajectories=10, periods=300, seed=3, slip=0.3)).violations > 100
 
 
 def test_the_version_names_the_content(models, model, data):
@@ -44,18 +97,15 @@ def test_the_version_names_the_content(models, model, data):
     assert replace(model, model_config=replace(model.model_config, mode="recursion")).version != model.version
 
 
-def test_the_time_until_a_robot_stands_comes_from_the_data(model, data):
+def test_the_time_until_a_robot_stands_comes_from_the_data(model, data, plans):
     """The robot stands after two of three periods, unless one recorded plan still moved then."""
     assert model.moving == model.stands == 2
-    whole = windows(data, GROUND.horizon)
-    number, start = whole.start[len(whole) // 2]
-    coasting = data.trajectories[number]
-    states = coasting.states.copy()
-    states[start + 2, 3] = 0.03
+    number, start = plans.start[len(plans) // 2]
     some = list(data.trajectories)
-    some[number] = replace(coasting, states=states)
-    assert periods_until_standing(whole, replace(data, trajectories=some), "plan") == 3
-    assert periods_until_standing(whole, data, "plan") == 2 and periods_until_standing(whole, data, "free") == 3
+    some[number] = replace(some[number], states=some[number].states.copy())
+    some[number].states[start + 2, 3] = 0.03  # it coasts
+    assert periods_until_standing(plans, replace(data, trajectories=some), "plan") == 3
+    assert periods_until_standing(plans, data, "plan") == 2 and periods_until_standing(plans, data, "free") == 3
     assert ModelSet.decode(model.encode()).stands == 2
     assert replace(model, stands=3).version != model.version
     assert replace(model, stands=3).version == replace(model, stands=0).version  # both mean: not before the plan ends
@@ -63,8 +113,11 @@ def test_the_time_until_a_robot_stands_comes_from_the_data(model, data):
         ModelSet.decode(edited(model, {"stands": 4}))
 
 
-def test_garbage_is_refused(model, tmp_path):
+def test_a_model_set_is_read_from_the_file_that_it_was_saved_in_and_garbage_is_refused(model, tmp_path):
     whole = model.encode()
+    for path in (tmp_path / "deep" / "model.safetensors", str(tmp_path / "again")):
+        model.save(path)
+        assert ModelSet.load(path).version == model.version
     for bad in (b"", b"garbage", whole[:-8], whole[: len(whole) // 2], b"\xff" * 100):
         with pytest.raises(BadModel, match="no model set"):
             ModelSet.decode(bad)
@@ -136,21 +189,8 @@ def test_data_that_support_no_model_are_refused(data):
         fit_model_set(replace(data, trajectories=slow), ModelConfig())
 
 
-@pytest.mark.parametrize("which", ALL, ids="-".join)
-def test_every_model_set_bounds_its_own_data(models, data, which):
-    model = models[which]
-    _, bound = data.split((0.5, 0.5))
-    w = windows(bound, 1)
-    z = model.first_regressor(w.z)
-    assert (np.abs(w.y - z @ model.first.C.T) <= model.first.half_widths(z) + 1e-12).all()
-    assert (w.chord_deviation <= model.chord_deviations.half_widths(w.z)[:, 0]).all()
-    whole = windows(data, 3)
-    seen = ~np.isnan(whole.stopping_distance)
-    assert (whole.stopping_distance[seen] <= model.stopping_distance.half_widths(whole.z[seen])[:, 0]).all()
-
-
-def test_the_residual_bound_is_the_narrowest_and_the_others_contain_its_fit(models, data):
-    w = windows(data, 3)
+def test_the_residual_bound_is_the_narrowest_and_the_others_contain_its_fit(models, data, plans):
+    w = plans
     widths = {kind: Filter(models[kind, "direct"]).tube.half_widths(w.z[0])[-1].max() for kind in KINDS}
     assert widths["residual"] <= widths["set-membership"] <= widths["matrix-zonotope"]
     fit, _ = data.split((0.5, 0.5))

@@ -16,6 +16,7 @@ from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import RESTLESS, START
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
@@ -69,7 +70,7 @@ def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_pr
 
 def test_the_stated_shares_hold_on_fresh_driving_overall_and_in_every_kind_of_driving():
     model, report = certified()
-    fresh = samples_of(driven(seed=77, trajectories=60))
+    fresh = samples_of(driven(seed=77, trajectories=40))
     widths = np.stack([step.half_widths(fresh.z) for step in model.steps], axis=1)
     off = np.abs(fresh.after - model.one_step.rollouts(ROBOT, fresh.z))
     widths *= model.one_step.stretches(ROBOT, fresh.z)[..., None]
@@ -173,18 +174,9 @@ def test_sets_grow_with_the_leverage_of_a_plan():
 
 
 def test_too_little_driving_and_stops_by_feedback_are_refused():
-    short = driven(trajectories=1)
-    few = replace(short, trajectories=(replace(short.trajectories[0], **_cut(short.trajectories[0], 20)),))
+    (whole,) = driven(trajectories=1).trajectories
+    few = Trajectory(whole.states[:21], whole.inputs[:20], whole.paths[:20], whole.turned[:20])
     with pytest.raises(BadData, match="record at least"):
-        fit_one_step(few, CONFIG)
+        fit_one_step(Dataset(ROBOT, (few,)), CONFIG)
     with pytest.raises(ErrorBoundError, match="feedback"):
-        fit_one_step(replace(short, robot=puck("puck")), CONFIG)
-
-
-def _cut(t, periods):
-    return {
-        "states": t.states[: periods + 1],
-        "inputs": t.inputs[:periods],
-        "paths": t.paths[:periods],
-        "turned": t.turned[:periods],
-    }
+        fit_one_step(Dataset(puck("puck"), (whole,)), CONFIG)

@@ -1,4 +1,4 @@
-"""The stacked tube agrees with its definition. That it holds fresh plans: `test_validation.py`."""
+"""The stacked tube agrees with its definition. That it holds fresh plans: `test_model_set.py`."""
 
 import numpy as np
 import pytest
