@@ -1,6 +1,7 @@
 """Plain NumPy twins of the compiled kernels of perception: the same mathematics, one array operation at a time."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.safety.filter.halfspaces import TOUCHING
@@ -74,12 +75,6 @@ def patch_minimum(free, columns_per_patch):
     return np.concatenate([np.minimum.reduceat(ring, np.arange(0, columns, width)) for ring, width in rings])
 
 
-def rotation_matrix(attitude):
-    """By Hamilton products: each column is q e q*."""
-    w, *v = np.asarray(attitude) / np.linalg.norm(attitude)
-    return np.column_stack([e + 2.0 * w * np.cross(v, e) + 2.0 * np.cross(v, np.cross(v, e)) for e in np.eye(3)])
-
-
 def derive_rows(capsules):
     length, near, far = capsules[LENGTH], capsules[NEAR_RADIUS], capsules[FAR_RADIUS]
     capsules[TAPER] = (far - near) / np.maximum(length, np.float32(TOUCHING))
@@ -91,7 +86,7 @@ def shadow_capsules(free, patches, pose, boxes, radii, origin):
     columns_per_patch, directions = patches
     attitude, position, mount = pose
     body, growth, base = radii
-    rotation = rotation_matrix(attitude)
+    rotation = Rotation.from_quat(np.roll(attitude, -1)).as_matrix()
     sensor = np.asarray(position) + rotation @ mount
     low, high = boxes[0].min(axis=0), boxes[1].max(axis=0)
     last = (np.linalg.norm(np.maximum(sensor - low, high - sensor) + body) + base) / (1.0 - growth)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, ModelTubes, Noise, feature_box
+from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, ModelTubes, Noise
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.one_step import features_for
 
@@ -57,18 +57,6 @@ def test_consistent_models_are_the_constrained_matrix_zonotope():
     off = wanted @ (truth - found.C).T
     assert (low - 1e-9 <= off).all() and (off <= high + 1e-9).all()
     assert (np.abs(truth - found.C) <= found.box + 1e-9).all()
-
-
-def test_a_box_of_features_holds_those_of_its_points():
-    draw = np.random.default_rng(3)
-    v, radius = draw.uniform(-1.0, 1.0, (20, 6)), draw.uniform(0.0, 0.3, (20, 6))
-    features = features_for(DIFF, v, 3, 1, saturating=False)
-    phi, linear, rest = feature_box(features, v, radius)
-    np.testing.assert_allclose(phi, features(v))
-    for _ in range(50):
-        at = draw.uniform(-1.0, 1.0, v.shape)
-        changes = features(v + at * radius) - phi - (linear * at[:, None]).sum(-1)
-        assert (np.abs(changes) <= rest + 1e-12).all()
 
 
 @pytest.mark.parametrize("fit", [LeastSquaresZonotope.fit, ConsistentModels.fit])

@@ -5,13 +5,16 @@ from math import comb
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from brakeline.errors import BadData, BadModel, ErrorBoundError
+from brakeline.errors import BadData, BadModel, BadTensors, ErrorBoundError
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.error_bounds import KINDS, least_squares
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ENTRY, MODES, ModelConfig, ModelSet
-from brakeline.safety.model.tensor_file import pack, unpack
+from brakeline.safety.model.tensor_file import content, has_entry, pack, unpack
 from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import periods_until_standing, windows
 from tests.safety.unicycle import record
@@ -200,3 +203,33 @@ def test_the_residual_bound_is_the_narrowest_and_the_others_contain_its_fit(mode
         step = models[kind, "direct"].steps[2]
         off = np.abs(w.z[:500] @ (trusted - step.C).T)
         assert (off <= np.abs(w.z[:500] @ step.W.T) @ step.M.T + 1e-9).all()
+
+
+# --- tensor files ---------------------------------------------------------------------------------------------------
+
+WORDS = st.dictionaries(st.text(max_size=5), st.one_of(st.text(max_size=5), st.integers(), st.booleans()), max_size=5)
+ARRAYS = st.dictionaries(st.text("abcx.", min_size=1, max_size=4), arrays(np.float64, (2, 3)), max_size=3)
+
+
+@given(ARRAYS, WORDS)
+def test_a_packed_file_is_unpacked_unchanged_and_equal_content_gives_equal_bytes(tensors, about):
+    payload = pack(tensors, "entry", about)
+    loaded, loaded_about = unpack(payload, "entry")
+    assert loaded_about == about and loaded.keys() == tensors.keys()
+    assert all(loaded[name].tobytes() == tensors[name].tobytes() for name in tensors)
+    turned = dict(reversed(list(about.items())))
+    assert pack(dict(reversed(list(tensors.items()))), "entry", turned) == payload
+    assert content(tensors) == content(loaded)
+
+
+def test_other_bytes_are_refused_with_a_reason():
+    whole = pack({"a": np.arange(6.0)[::2]}, "entry", {"x": 1})
+    assert has_entry(whole, "entry") and not has_entry(whole, "another")
+    with pytest.raises(BadTensors, match="another"):
+        unpack(whole, "another")
+    for garbage in (b"", b"garbage", whole[:-1], whole[:20], b"\x02" + b"\0" * 7 + b"[]", b"\xff" * 40):
+        assert not has_entry(garbage, "another")
+        with pytest.raises(BadTensors):
+            unpack(garbage, "entry")
+    with pytest.raises(BadTensors, match="no object"):
+        unpack(pack({}, "entry", [1]), "entry")

@@ -1,6 +1,7 @@
 """Half-spaces beside movers: a mover that keeps its bounds is beyond them during every period."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,10 +19,6 @@ from tests.messaging.test_obstacle import obstacles, sample
 BODY, PERIOD, PERIODS = 0.1, 0.2, 4
 
 
-def moving(obstacle, motion):
-    return Obstacle(obstacle.kind, obstacle.position, obstacle.size, obstacle.yaw, motion=motion)
-
-
 def ball(rng, d, radius):
     draw = rng.normal(size=d)
     return draw * (radius * rng.choice([1.0, rng.uniform()]) / np.linalg.norm(draw))
@@ -31,9 +28,8 @@ def ball(rng, d, radius):
 def motions(draw, d):
     velocity = tuple(draw(st.floats(-1.5, 1.5)) for _ in range(d))
     bound = draw(st.floats(0, 2))
-    by_speed = draw(st.booleans())
+    limits = {draw(st.sampled_from(["speed", "acceleration"])): bound}
     age = draw(st.sampled_from([0.0, 0.1]))
-    limits = {"speed": bound} if by_speed else {"acceleration": bound}
     return Motion(velocity, draw(st.floats(0, 0.1)), draw(st.floats(0, 0.1)), **limits, age=age)
 
 
@@ -72,7 +68,7 @@ def test_a_mover_within_its_bounds_stays_beyond_the_half_spaces(data, seed):
     rng = np.random.default_rng(seed)
     start, nominal = rng.uniform(-4, 4, d), rng.uniform(-4, 4, (PERIODS, d))
     measured = rng.uniform(0, 0.05, d)
-    near = MovingObstacles.of([moving(obstacle, motion)], d)
+    near = MovingObstacles.of([replace(obstacle, motion=motion)], d)
     normals, offsets = swept_half_spaces(near, start, nominal, BODY, measured, PERIOD)
     solid = sample(obstacle, rng, 300)
     times = PERIOD * np.linspace(0, PERIODS, 6 * PERIODS + 1)
@@ -94,7 +90,7 @@ def test_a_mover_with_speed_zero_leaves_no_less_room_than_a_standing_obstacle(ob
     d = len(obstacle.position)
     ways = np.cumsum(rng.uniform(-0.5, 0.5, (PERIODS + 1, d)), axis=0)
     start, nominal = ways[0], ways[1:]
-    near = MovingObstacles.of([moving(obstacle, Motion((0.0,) * d, 0.0, speed=0.0))], d)
+    near = MovingObstacles.of([replace(obstacle, motion=Motion((0.0,) * d, 0.0, speed=0.0))], d)
     normals, offsets = swept_half_spaces(near, start, nominal, BODY, np.zeros(d), PERIOD)
     still, stops = half_spaces(Shapes.of([obstacle], d), start, nominal, BODY, np.zeros(d))
     for k in range(PERIODS):
@@ -117,12 +113,9 @@ def test_the_half_spaces_recede_from_a_walker_that_comes():
 def test_the_memory_for_movers_grows_linearly():
     """With memory for each pair, a thousand movers in one request would block the service for seconds."""
     rng, count = np.random.default_rng(0), 1000
-    near = [
-        moving(Obstacle("cylinder", tuple(at), (0.05,)), Motion((0.1, 0.0), 0.01, 0.01, speed=0.5))
-        for at in rng.uniform(-2.0, 2.0, (count, 2))
-    ]
-    nominal = np.array([[0.05, 0.0], [0.1, 0.0], [0.1, 0.0]])
-    _, movers = split_moving(near, 2)
+    motion, nominal = Motion((0.1, 0.0), 0.01, 0.01, speed=0.5), np.array([[0.05, 0.0], [0.1, 0.0], [0.1, 0.0]])
+    places = rng.uniform(-2.0, 2.0, (count, 2))
+    movers = MovingObstacles.of([Obstacle("cylinder", tuple(at), (0.05,), motion=motion) for at in places], 2)
     tracemalloc.start()
     normals, offsets = swept_half_spaces(movers, np.zeros(2), nominal, BODY, np.zeros(2), PERIOD)
     most = tracemalloc.get_traced_memory()[1]
@@ -143,25 +136,10 @@ def test_a_mover_with_nan_leaves_nothing_free():
 @settings(max_examples=50, deadline=None)
 @given(st.data(), st.integers(0, 10_000))
 def test_a_mover_within_its_bounds_is_consistent_with_its_last_sighting(data, seed):
-    rng = np.random.default_rng(seed)
-    motion = data.draw(motions(2))
-    since = 0.2
-    moved = path(motion, rng, [since])[0]
-    now = tuple(moved + ball(rng, 2, motion.position_error))
-    # The velocity now is not drawn with the path: only the place is looked at here.
-    limits = {"speed": motion.speed if motion.speed is not None else 2.0}
-    later = Motion((0.0, 0.0), motion.position_error, before=Sighting((0.0, 0.0), motion.velocity, since), **limits)
-    if motion.speed is not None:
-        assert later.is_consistent(now)
-    wide = Motion(
-        motion.velocity,
-        motion.position_error,
-        motion.velocity_error,
-        acceleration=motion.acceleration or 0.0,
-        before=Sighting((0.0, 0.0), motion.velocity, since),
-    )
-    if motion.speed is None:
-        assert wide.is_consistent(now)
+    """The velocity now is not drawn with the path: only the place is tested."""
+    rng, motion, since = np.random.default_rng(seed), data.draw(motions(2)), 0.2
+    now = path(motion, rng, [since])[0] + ball(rng, 2, motion.position_error)
+    assert replace(motion, before=Sighting((0.0, 0.0), motion.velocity, since)).is_consistent(tuple(now))
 
 
 def test_a_mover_that_breaks_its_bound_is_inconsistent_with_its_last_sighting():
@@ -194,7 +172,7 @@ def test_a_malformed_motion_is_refused(motion):
 
 def test_movers_are_separated_from_standing_obstacles():
     still = Obstacle("sphere", (1.0, 0.0), (0.3,))
-    mover = moving(still, Motion((1.0, 0.0), 0.0, speed=1.0))
+    mover = replace(still, motion=Motion((1.0, 0.0), 0.0, speed=1.0))
     shapes, movers = split_moving([still, mover, still], 2)
     assert len(shapes) == 2 and movers is not None and len(movers) == 1
     assert split_moving([still], 2)[1] is None

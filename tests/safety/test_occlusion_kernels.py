@@ -216,13 +216,14 @@ def test_no_body_in_a_periods_boxes_touches_a_shadow_on_any_path(seed):
     assert slack[in_either[0] | in_either[1]].max(initial=-np.inf) <= 1e-6
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("period", [0, 2])
-def test_a_path_with_nan_is_not_free_from_there_on(period):
+def test_a_path_with_nan_is_not_free_from_there_on(period, value):
     near = occluded_regions(scattered(0), room(2.0, 1.0), 0.0, ORIGIN)
     nominal = np.tile(np.arange(1.0, 5.0)[:, None] * 0.7, 3)
     sound = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)[1]
     assert np.isfinite(sound).all()
-    nominal[period:] = np.nan
+    nominal[period:] = value
     _, offsets = half_spaces(near, np.zeros(3), 0.1 * nominal, 0.0, np.zeros(3), 0.2)
     assert np.isneginf(offsets).all() if period == 0 else np.isfinite(offsets[:, :period]).all()
 

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brakeline import compilation
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.safety.perception.image_coverage import BeamGrid
@@ -28,15 +27,6 @@ def capsules_around(rng, n):
 
 
 @settings(max_examples=40)
-@given(SEEDS, st.integers(2, 9), st.integers(3, 24), st.integers(0, 9))
-def test_the_minimum_of_a_window_is_that_of_all_its_beams(seed, rings, columns, rows):
-    rng = np.random.default_rng(seed)
-    values, beside = rng.random((rings, columns), np.float32), rng.integers(0, columns, rings)
-    least = proximity_kernels.window_minimum(values, rows, beside)
-    assert np.array_equal(least, twins.window_minimum(values, rows, beside))
-
-
-@settings(max_examples=40)
 @given(SEEDS, st.integers(2, 9), st.integers(3, 24), st.integers(0, 9), st.booleans())
 def test_free_ranges_of_single_beams_come_from_returns_without_ghosts(seed, rings, columns, rows, whole):
     rng = np.random.default_rng(seed)
@@ -49,10 +39,6 @@ def test_free_ranges_of_single_beams_come_from_returns_without_ghosts(seed, ring
     returns, free = proximity_kernels.single_beam_ranges(*arguments)
     twin_returns, twin_free = twins.single_beam_ranges(*arguments)
     assert np.array_equal(returns, twin_returns) and np.array_equal(free, twin_free)
-    raw = proximity_kernels.shortest_returns(ranges, added, 8.0, 0.05)
-    assert np.array_equal(proximity_kernels.mesh_maximum(raw), twins.mesh_maximum(raw))
-    known = proximity_kernels.forget_ghosts(raw, twins.mesh_maximum(raw), 0.8, 0.1, rows, beside)
-    assert known == (raw >= 0.0).sum() and np.array_equal(raw, returns)
 
 
 @settings(max_examples=30)
@@ -71,7 +57,6 @@ def test_a_rotation_matrix_is_that_of_the_range_image(seed):
     attitude = np.random.default_rng(seed).normal(size=4)
     attitude /= np.linalg.norm(attitude)
     matrix = shadow_kernels.rotation_matrix(tuple(attitude))
-    assert np.allclose(matrix, twins.rotation_matrix(attitude), atol=1e-12)
     assert np.allclose(matrix, RangeImage(np.ones((20, 40)), (0.0, 0.0, 0.0), tuple(attitude)).rotation, atol=1e-12)
 
 
@@ -96,57 +81,15 @@ def test_shadows_that_meet_the_boxes_become_capsules(sensor, seed):
     assert np.allclose(capsules[TAPER:], twin[TAPER:, by_axis.argmax(axis=0)], rtol=1e-2, atol=1e-3)
 
 
-def random_path(rng, periods):
-    """Ends (N+1, 3), boxes (2, N+1, 3) around them that grow, and the groups' first periods."""
-    steps = rng.normal(size=(periods, 3)) * 0.2 + [rng.choice([0.0, 0.3]), 0.0, 0.0]
-    ends = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    half = 0.1 + np.cumsum(rng.uniform(0.0, 0.2, (periods + 1, 3)), axis=0)
-    first = occlusion_kernels.group_periods(ends, 0.6)
-    assert np.array_equal(first, twins.group_periods(ends, 0.6))
-    return ends, np.stack([ends - half, ends + half]), first
-
-
-@settings(max_examples=40)
-@given(SEEDS, st.integers(1, 12), st.integers(1, 300))
-def test_gaps_reach_and_free_groups_of_a_path(seed, periods, n):
-    rng = np.random.default_rng(seed)
-    ends, boxes, first = random_path(rng, periods)
-    capsules = capsules_around(rng, n)
-    gaps = occlusion_kernels.group_gaps(capsules, ends, first)
-    assert np.allclose(gaps, twins.group_gaps(capsules, ends, first), atol=1e-5)
-    broken = ends.copy()
-    broken[rng.integers(0, 2 * periods) % (periods + 1)] = rng.choice([np.nan, 0.1, np.inf])
-    free = occlusion_kernels.count_free_groups(broken, first, gaps, 0.1)
-    assert free == twins.count_free_groups(broken, first, gaps, 0.1)
-    count, growth = int(rng.integers(1, len(first) + 1)), np.cumsum(rng.random(periods))
-    reach = occlusion_kernels.group_reach(ends, first, count, boxes, growth, 0.3)
-    assert np.allclose(reach, twins.group_reach(ends, first, count, boxes, growth, 0.3))
-    planes = rng.normal(size=(count, 4, 3)), rng.normal(size=(count, 4))
-    planes[0][rng.random((count, 4)) < 0.3] = 0.0
-    arguments = planes, first, boxes, growth, (0.2, rng.random(3)), rng.normal(size=3)
-    pairs = zip(occlusion_kernels.period_planes(*arguments), twins.period_planes(*arguments), strict=True)
-    assert all(np.allclose(compiled, twin, atol=1e-12) for compiled, twin in pairs)
-
-
-@settings(max_examples=40)
-@given(SEEDS, st.integers(1, 300), st.sampled_from([0.0, 0.05]), st.sampled_from([2, 64]))
-def test_the_same_shadows_are_supported_one_after_the_other(seed, n, give, most):
-    rng = np.random.default_rng(seed)
-    capsules, chords = capsules_around(rng, n), rng.uniform(-0.2, 0.2, (2, 2, 3))
-    gaps, reach = rng.random((2, n), np.float32), rng.uniform(0.2, 2.0, 2)
-    arguments = capsules, chords, gaps, reach, most, (0.2, give, 1e-4)
-    normals, levels = occlusion_kernels.supporting_planes(*arguments)
-    twin_normals, twin_levels = twins.supporting_planes(*arguments)
-    assert np.allclose(normals, twin_normals, atol=1e-6) and np.allclose(levels, twin_levels, atol=1e-6)
-
-
 @settings(max_examples=40)
 @given(SEEDS, st.integers(1, 10), st.integers(1, 100))
 def test_half_spaces_of_a_path(seed, periods, n):
     rng = np.random.default_rng(seed)
-    ends, boxes, _ = random_path(rng, periods)
+    steps = rng.normal(size=(periods, 3)) * 0.2 + [rng.choice([0.0, 0.3]), 0.0, 0.0]
     capsules, origin = capsules_around(rng, n), rng.normal(size=3)
-    plan, motion = (ends[0] + origin, ends[1:] + origin, boxes + origin), (0.05, 0.02)
+    ends = origin + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    half = 0.1 + np.cumsum(rng.uniform(0.0, 0.2, (periods + 1, 3)), axis=0)
+    plan, motion = (ends[0], ends[1:], np.stack([ends - half, ends + half])), (0.05, 0.02)
     arguments = capsules, origin, plan, motion, (0.1, np.full(3, 0.01)), (40, 0.05)
     normals, levels = occlusion_kernels.path_planes(*arguments)
     twin_normals, twin_levels = twins.path_planes(*arguments)
@@ -168,16 +111,3 @@ def test_the_extent_of_a_capsule_with_nan_is_nan(row):
 def test_a_kernel_refuses_other_types():
     with pytest.raises(TypeError):
         proximity_kernels.window_minimum(np.zeros((3, 3)), 1, np.ones(3, np.int64))
-
-
-def test_without_a_folder_for_the_cache_each_process_compiles(monkeypatch):
-    tried = []
-
-    def njit(signature, **how):
-        tried.append(how)
-        if how.get("cache"):
-            raise RuntimeError("cannot cache function: no locator available")
-        return lambda function: function
-
-    monkeypatch.setattr(compilation, "njit", njit)
-    assert compilation.compiled("f8(f8)")(abs) is abs and len(tried) == 2

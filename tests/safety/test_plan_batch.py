@@ -43,6 +43,7 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
         infos["state"][1, 0] += 0.01 if period % 7 == 6 else 0.0
         before = plans.input_in_force
         outcome = plans.decide(infos["state"], actions, ObstacleArrays(**infos["obstacles"]))
+        penalties = correction_penalties(GROUND, actions, before, outcome.inputs, 1.0)
         for row, single in enumerate(singles):
             single.decide(infos["state"][row], actions[row], near(infos, row), known_free=True)
             plan = single.backup_plan
@@ -50,8 +51,7 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
             assert status[plans._status[row]] == plan.model
             assert plans.widening[row] == pytest.approx(plan.widening.factor, abs=1e-6)
             penalty = correction_penalty(GROUND, actions[row], before[row], outcome.inputs[row], 1.0)
-            mine = correction_penalties(GROUND, actions, before, outcome.inputs, 1.0)
-            assert mine[row] == pytest.approx(penalty, abs=1e-12)
+            assert penalties[row] == pytest.approx(penalty, abs=1e-12)
         _, _, terminated, truncated, infos = env.step(outcome.inputs)
         ended = terminated | truncated
         plans.reset(ended)

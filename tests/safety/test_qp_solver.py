@@ -70,9 +70,9 @@ def parts(monkeypatch):
 
 
 def test_the_active_rows_alone_give_the_solution_of_all_rows(parts):
-    programs = [crowded(np.random.default_rng(seed)) for seed in range(200)]
     impossible = 0
-    for program in programs:
+    for seed in range(100):
+        program = crowded(np.random.default_rng(seed))
         ours, (theirs, flag) = solve(program), by_daqp(program)
         assert (ours.status == "solved") == (flag >= 1)
         impossible += flag < 1
@@ -81,17 +81,18 @@ def test_the_active_rows_alone_give_the_solution_of_all_rows(parts):
             assert np.abs(ours.x - theirs).max() < 1e-6
             assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-5)
         assert (solve(program).x == ours.x).all(), "it is deterministic"
-    assert 20 < impossible < 180 and np.median(parts) < 30, "few of 172 rows"
+    assert 10 < impossible < 90 and np.median(parts) < 30, "few of 172 rows"
 
 
 def test_the_guessed_active_set_saves_rounds_and_changes_no_solution(parts, monkeypatch):
-    crowded_programs = [one for one in map(crowded, map(np.random.default_rng, range(300))) if by_daqp(one)[1] >= 1]
     rounds = []
     for steps in (qp_solver.STEPS, 0):
         parts.clear()
         monkeypatch.setattr(qp_solver, "STEPS", steps)
-        for program in crowded_programs:
-            assert value(program, solve(program).x) == pytest.approx(value(program, by_daqp(program)[0]), abs=1e-5)
+        for program in map(crowded, map(np.random.default_rng, range(300))):
+            theirs, flag = by_daqp(program)
+            if flag >= 1:
+                assert value(program, solve(program).x) == pytest.approx(value(program, theirs), abs=1e-5)
         rounds.append(len(parts))
     assert rounds[0] < 0.9 * rounds[1]
 
@@ -139,23 +140,15 @@ def test_another_solver_agrees(models, kind):
     assert feasible > 30
 
 
-def test_an_infeasible_problem_comes_back_with_its_residual():
-    program = QuadraticProgram(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
-    solution = solve(program)
-    assert solution.residual > 0.5
-    assert solution.found  # a candidate that the caller must check
-
-
-def test_a_program_without_rows_is_solved():
-    solution = solve(QuadraticProgram(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
-    assert solution.status == "solved" and solution.x == pytest.approx([1.0, -2.0], abs=1e-6)
-
-
-def test_the_residual_is_recomputed_from_the_rows():
-    program = QuadraticProgram(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
-    solution = solve(program)
+def test_the_residual_is_recomputed_from_the_rows_also_if_there_are_none_or_no_solution():
+    bounded = QuadraticProgram(np.ones(2), np.array([-1.0, -1.0]), np.eye(2), np.array([0.5, 2.0]))
+    solution = solve(bounded)
     assert solution.x == pytest.approx([0.5, 1.0], abs=1e-5)
-    assert solution.residual == (program.A @ solution.x - program.b).max()
+    assert solution.residual == (bounded.A @ solution.x - bounded.b).max()
+    free = solve(QuadraticProgram(np.ones(2), np.array([-1.0, 2.0]), np.zeros((0, 2)), np.zeros(0)))
+    assert free.status == "solved" and free.x == pytest.approx([1.0, -2.0], abs=1e-6)
+    impossible = solve(QuadraticProgram(np.ones(1), np.zeros(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])))
+    assert impossible.residual > 0.5 and impossible.found  # a candidate that the caller must check
     assert not Solution(np.array([np.nan]), "solved", 1, 0.0).found
 
 

@@ -20,6 +20,7 @@ from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import request
+from tests.safety.test_scan_free_space import FAN, cast
 from tests.safety.toys import SUBSTEPS, Toy, seen
 from tests.safety.unicycle import Unicycle
 
@@ -57,17 +58,19 @@ def drive(ready, steps, see, action=(0.25, 0.0)):
 @pytest.mark.parametrize("angle", [0.0, 1.5, 3.1, -2.0])
 def test_a_robot_too_close_to_an_obstacle_gets_away_and_drives_on(ready, angle, sensed):
     """The obstacle reaches a few centimetres into the body's disc, at any bearing. The policy wants straight ahead."""
-    pillar, radius = (0.1 + BODY - 0.045) * np.array([math.cos(angle), math.sin(angle)]), 0.1
+    at, radius = (0.1 + BODY - 0.045) * np.array([math.cos(angle), math.sin(angle)]), 0.1
+    pillar = Obstacle("cylinder", tuple(at), (radius,))
 
     def see(true, measured):
         if not sensed:
-            return {"obstacles": [Obstacle("cylinder", tuple(pillar), (radius,))]}
-        return {"scan": Scan(ranges_to(pillar, radius, true[:3]), TURN, tuple(measured[:3]), position_error=0.02)}
+            return {"obstacles": [pillar]}
+        ranges = cast([pillar], true[:2], FAN + true[2])
+        return {"scan": Scan(ranges, FAN, tuple(measured[:3]), position_error=0.02)}
 
     kinds, gaps = [], []
     for answer, true in drive(ready, 121, see):
         kinds.append(answer.kind)
-        gaps.append(float(np.linalg.norm(true[:2] - pillar)) - radius)
+        gaps.append(float(np.linalg.norm(true[:2] - at)) - radius)
         assert answer.verified or answer.kind != "allowed"
         if answer.kind == RECOVERING:
             assert not answer.verified and not answer.plan[-1].any()
@@ -106,19 +109,10 @@ def test_a_robot_that_may_be_too_close_by_less_than_the_measurement_errors_stand
     assert decision.kind == "failsafe" and decision.verified
 
 
-TURN = np.radians(np.arange(360) - 180.0)
-
-
-def room(beams: float = 1.0) -> Scan:
-    """Return a scan from the middle of an empty hall; beams: share of the beams that measure something."""
-    ranges = np.where(np.arange(360) < 360 * beams, 3.5, np.nan)
-    return Scan(ranges, TURN, pose=(0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize("beams, least", [(0.0, 0.0), (1.0, 3.5)], ids=["nothing seen", "all seen"])
-def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, beams, least):
+@pytest.mark.parametrize("ranges, least", [(np.nan, 0.0), (3.5, 3.5)], ids=["nothing seen", "all seen"])
+def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, ranges, least):
     """Odometry may jump, or a sensor may measure nothing: the robot must not drive off."""
-    scan = replace(room(beams), age=0.2)
+    scan = Scan(np.full(len(FAN), ranges), FAN, pose=(0.0, 0.0, 0.0), age=0.2)
     for distance in (0.01, 0.3, 0.75, 1.25, 2.5, 3.0, 3.51, 5.0, 40.0):
         for i, angle in enumerate(np.radians(np.arange(0, 360, 40))):
             for heading in np.radians(np.arange(30 * (i % 3), 360, 90)):  # three angles cover all twelve headings
@@ -138,9 +132,8 @@ def long_filter(data):
 
 def wall_scan(state, wall, **errors):
     """Return a scan of a wall to the left, at y = `wall` m."""
-    up = np.sin(TURN + state[2])
-    to = np.where(up > 1e-9, (wall - state[1]) / np.maximum(up, 1e-9), 3.5)
-    return Scan(np.clip(to, 0.02, 3.5), TURN, tuple(state[:3]), range_error=0.02, **errors)
+    ranges = cast([Obstacle("wall", (0.0, wall), yaw=-math.pi / 2)], state[:2], FAN + state[2])
+    return Scan(ranges, FAN, tuple(state[:3]), range_error=0.02, **errors)
 
 
 @pytest.mark.parametrize("wall", [0.09, 0.1, 0.12])
@@ -165,15 +158,6 @@ def test_the_way_out_leads_away_from_the_nearest_of_map_and_scan(ready):
         kinds.append(answer.kind)
         robot.step(answer.action)
     assert kinds[0] == RECOVERING and kinds[-1] != RECOVERING
-
-
-def ranges_to(pillar, radius, pose):
-    """Return the ranges (360,) [m] from a true pose to a pillar in an empty hall."""
-    x, y = pillar - pose[:2]
-    beams = TURN + pose[2]
-    along = x * np.cos(beams) + y * np.sin(beams)
-    half = radius**2 - (x * x + y * y - along**2)
-    return np.where((along > 0.0) & (half > 0.0), along - np.sqrt(np.maximum(half, 0.0)), 3.5)
 
 
 HOVERER = robot_from_description(

@@ -25,23 +25,18 @@ NAMES = ("ground", "ground+tracks")
 OBSERVED = (26, 50)
 
 
-@pytest.mark.parametrize("observed", [0, *OBSERVED])
-def test_the_filter_decides_the_same_whichever_tasks_are_loaded(ready, observed):
-    question = replace(request(obstacles=[cylinder(0.5, 0.0)]), observation=np.ones(observed, np.float32))
-    before = ready.decide(question)
-    for name in (*NAMES, *NAMES[:1]):
-        environment(robot_with_task(name), "default", 0)
-        assert same(ready.decide(question), before)
-        assert same(Filter(ready.model).decide(question), before)
-
-
-def test_two_environments_observe_each_by_its_own_task():
+def test_two_environments_observe_each_by_its_own_task_and_the_filter_decides_as_before(ready):
+    sizes = (0, *OBSERVED)
+    questions = [replace(request(obstacles=[cylinder(0.5, 0.0)]), observation=np.ones(n, np.float32)) for n in sizes]
+    before = [ready.decide(question) for question in questions]
     environments = [environment(robot_with_task(name), "default", 0) for name in NAMES]
     for _ in range(2):
         for env, observed in zip(environments, OBSERVED, strict=True):
             seen, _ = env.reset(seed=1)
             assert seen.shape == env.observation_space.shape == (observed,)
             assert env.step(np.zeros(2))[0].shape == (observed,)
+            for safety in (ready, Filter(ready.model)):
+                assert all(map(same, map(safety.decide, questions), before))
 
 
 def sailr(robot: RobotWithTask) -> Pretrained:

@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from brakeline.messaging.topics import HEALTH, MODEL
 from brakeline.safety.methods import archive_path, decode
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
-from brakeline.safety.service.server import ModelRegistry, SafetySettings, main
+from brakeline.safety.service.server import ModelRegistry
 from brakeline.safety.service.signature import (
     CONTEXT,
     ModelSigner,
@@ -51,12 +52,26 @@ def keys(tmp_path: Path) -> Path:
     return tmp_path / "keys"
 
 
-def resigned(keys: Path, signed: SignedModel, **changes: object) -> SignedModel:
-    """Return the model with a changed claim that a trusted key signed."""
-    claim = json.dumps(json.loads(signed.claim) | changes, sort_keys=True).encode()
+@pytest.fixture
+def trust(keys: Path) -> TrustedSigners:
+    return TrustedSigners.load(keys)
+
+
+@pytest.fixture
+def signed(model: ModelSet, keys: Path) -> SignedModel:
+    return ModelSigner.load(keys).sign(model)
+
+
+def claimed(keys: Path, file: bytes, claim: bytes) -> SignedModel:
+    """Return a file with any claim, which a trusted key signed."""
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
     assert isinstance(key, Ed25519PrivateKey)
-    return replace(signed, claim=claim, signature=key.sign(CONTEXT + claim))
+    return SignedModel(file, claim, key.sign(CONTEXT + claim))
+
+
+def resigned(keys: Path, signed: SignedModel, **changes: object) -> SignedModel:
+    """Return the model with a changed claim that a trusted key signed."""
+    return claimed(keys, signed.file, json.dumps(json.loads(signed.claim) | changes, sort_keys=True).encode())
 
 
 def shrunken(model: ModelSet) -> ModelSet:
@@ -65,68 +80,69 @@ def shrunken(model: ModelSet) -> ModelSet:
     return replace(model, steps=steps)
 
 
-def test_a_signed_model_is_accepted(model: ModelSet, keys: Path, tmp_path: Path) -> None:
-    signed = ModelSigner.load(keys).sign(model)
-    assert TrustedSigners.load(keys).open(signed, "ground").version == model.version
+def test_a_signed_model_is_accepted(model: ModelSet, signed: SignedModel, trust, keys: Path, tmp_path: Path) -> None:
+    assert trust.open(signed, "ground").version == model.version
     path = tmp_path / "model.safetensors"
     signed.save(path)
-    assert TrustedSigners.load(keys).load_model(path).version == model.version
+    assert trust.load_model(path).version == model.version
     assert SignedModel.load(path) == signed
     assert (keys / "signer.key").stat().st_mode & 0o077 == 0
 
 
-def test_a_matching_hash_without_a_signature_is_refused(model: ModelSet, keys: Path) -> None:
-    signed, trust = ModelSigner.load(keys).sign(model), TrustedSigners.load(keys)
+def test_a_matching_hash_without_a_signature_is_refused(model: ModelSet, signed: SignedModel, trust, keys) -> None:
     evil = shrunken(model)
     assert ModelSet.decode(evil.encode()).version == evil.version, "its own hash is right"
     with pytest.raises(Untrusted, match="not the one that was signed"):
         trust.open(replace(signed, file=evil.encode()), "ground")
-    claim = json.loads(signed.claim) | {"version": evil.version}
-    with pytest.raises(Untrusted, match="no trusted signer"):
-        trust.open(replace(signed, file=evil.encode(), claim=json.dumps(claim).encode()), "ground")
-    with pytest.raises(Untrusted, match="no trusted signer"):
-        trust.open(SignedModel(evil.encode(), b"", b""), "ground")
+    claim = json.dumps(json.loads(signed.claim) | {"version": evil.version}).encode()
     write_signer(keys.parent / "rogue")
+    for forged in (
+        replace(signed, file=evil.encode(), claim=claim),
+        SignedModel(evil.encode(), b"", b""),
+        ModelSigner.load(keys.parent / "rogue").sign(evil),
+    ):
+        with pytest.raises(Untrusted, match="no trusted signer"):
+            trust.open(forged, "ground")
     with pytest.raises(Untrusted, match="no trusted signer"):
-        trust.open(ModelSigner.load(keys.parent / "rogue").sign(evil), "ground")
-    assert TrustedSigners().signers == ()
-    with pytest.raises(Untrusted):
         TrustedSigners().open(signed, "ground")
 
 
-def test_a_model_must_be_of_the_robot_that_topic_and_key_name(model: ModelSet, tmp_path: Path) -> None:
-    write_signer(tmp_path / "any")
-    signed = ModelSigner.load(tmp_path / "any").sign(model)
+def test_a_model_must_be_of_the_robot_that_topic_and_key_name(model: ModelSet, signed, trust, tmp_path: Path) -> None:
     with pytest.raises(Untrusted, match="published as one of quadrotor"):
-        TrustedSigners.load(tmp_path / "any").open(signed, "quadrotor")
+        trust.open(signed, "quadrotor")
     write_signer(tmp_path / "other", robots=("quadrotor",))
     with pytest.raises(Untrusted, match="may not sign models of ground"):
         TrustedSigners.load(tmp_path / "other").open(ModelSigner.load(tmp_path / "other").sign(model), "ground")
 
 
-@pytest.mark.parametrize("field", ["robot", "layout", "version", "domain", "no domain"])
-def test_the_claim_must_match_the_file(model: ModelSet, keys: Path, field: str) -> None:
+def test_the_claim_must_match_the_file(model: ModelSet, signed: SignedModel, trust, keys: Path) -> None:
     """Even if a trusted key signed the claim: the file must agree with each entry."""
-    signed, trust = ModelSigner.load(keys).sign(model), TrustedSigners.load(keys)
-    domain = {"domain": (0.5 * model.domain).tolist()} if field == "domain" else {"domain": None}
-    with pytest.raises(Untrusted):
-        trust.open(resigned(keys, signed, **(domain if "domain" in field else {field: "quadrotor"})))
-    assert trust.open(resigned(keys, signed))
+    nothing, narrower = np.full(model.domain.shape, np.nan).tolist(), (0.5 * model.domain).tolist()
+    wrong: dict[str, list[Any]] = {name: ["quadrotor"] for name in ("robot", "layout", "version")} | {
+        "domain": [nothing, narrower, None, "1", [[1.0], [1.0, 2.0]], {}, 10**400],
+        "number": [-1, 2**63, True, "1", 1.5, None],
+    }
+    for name, values in wrong.items():
+        for value in values:
+            with pytest.raises(Untrusted, match=name):
+                trust.open(resigned(keys, signed, **{name: value}))
+    wider = np.full(model.domain.shape, [[-np.inf], [np.inf]]).tolist()
+    assert trust.open(resigned(keys, signed)) and trust.open(resigned(keys, signed, domain=wider))
 
 
-def test_a_domain_wider_than_the_data_is_not_signed(model: ModelSet, data, keys: Path) -> None:
+def test_a_domain_wider_than_the_data_is_not_signed(model: ModelSet, data, trust, keys: Path) -> None:
     signer, recorded = ModelSigner.load(keys), recorded_domain(data)
     assert (model.domain[0] >= recorded[0]).all() and (model.domain[1] <= recorded[1]).all()
-    assert TrustedSigners.load(keys).open(signer.sign(model, data))
+    assert trust.open(signer.sign(model, data))
     wider = replace(model, domain=np.stack([recorded[0], recorded[1] + 0.1]))
     with pytest.raises(Untrusted, match="wider"):
         signer.sign(wider, data)
 
 
-def test_a_restart_uses_the_newest_signed_model(model: ModelSet, keys: Path, tmp_path: Path) -> None:
-    trust, evil = TrustedSigners.load(keys), shrunken(model)
+def test_a_restart_uses_the_newest_signed_model(model: ModelSet, signed, trust, tmp_path: Path) -> None:
+    evil = shrunken(model)
     good, bad = (archive_path(tmp_path, "ground", m.version) for m in (model, evil))
-    ModelSigner.load(keys).sign(model).save(good)
+    signed.save(good)
     evil.save(bad)
     assert newest_model(tmp_path, "ground", trust) == good
     seal_of(bad).write_bytes(seal_of(good).read_bytes())
@@ -134,10 +150,9 @@ def test_a_restart_uses_the_newest_signed_model(model: ModelSet, keys: Path, tmp
 
 
 def test_the_times_of_files_and_a_clock_set_back_bring_no_older_model_into_use(
-    model: ModelSet, models: dict[tuple[str, str], ModelSet], keys: Path, tmp_path: Path, monkeypatch
+    model: ModelSet, models: dict[tuple[str, str], ModelSet], trust, keys: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    older, newer = model, models["set-membership", "direct"]
-    signer, trust = ModelSigner.load(keys), TrustedSigners.load(keys)
+    older, newer, signer = model, models["set-membership", "direct"], ModelSigner.load(keys)
     paths = [archive_path(tmp_path, "ground", m.version) for m in (older, newer)]
     signer.sign(older).save(paths[0])
     monkeypatch.setattr(time, "time_ns", lambda: 1)
@@ -157,8 +172,8 @@ def test_the_times_of_files_and_a_clock_set_back_bring_no_older_model_into_use(
     assert registry.filters["ground"].version == older.version
 
 
-def test_a_key_in_a_folder_that_cannot_be_written_still_signs_in_order(model, keys, monkeypatch, caplog) -> None:
-    signer, trust = ModelSigner.load(keys), TrustedSigners.load(keys)
+def test_a_key_in_a_folder_that_cannot_be_written_still_signs_in_order(model, trust, keys, monkeypatch, caplog) -> None:
+    signer = ModelSigner.load(keys)
 
     def read_only(*_: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -186,49 +201,33 @@ def test_without_keys_a_restart_uses_the_model_that_a_service_used_last(
         assert newest_model(tmp_path, "ground", None) is None, "then the model that the run began with"
 
 
-def test_a_dangling_link_in_the_archive_is_named_and_nothing_ends(model, keys, tmp_path, monkeypatch, caplog) -> None:
+def test_a_dangling_link_in_the_archive_is_named_and_nothing_ends(
+    model, signed, trust, tmp_path, monkeypatch, caplog
+) -> None:
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
     model.save(model_path(model.robot, ModelConfig()))
     path = archive_path(tmp_path, "ground", model.version)
-    ModelSigner.load(keys).sign(model).save(path)
+    signed.save(path)
     gone = path.with_name("000000000000.safetensors")
     gone.symlink_to(tmp_path / "nothing")
-    assert newest_model(tmp_path, "ground", TrustedSigners.load(keys)) == path
+    assert newest_model(tmp_path, "ground", trust) == path
     files = attachments(RunConfig(model_config=ModelConfig()), tmp_path)
     assert any(model.version in name for name in files)
     named = [record.getMessage() for record in caplog.records if gone.name in record.getMessage()]
     assert len(named) == 2
 
 
-@pytest.mark.parametrize("domain", [float("nan"), float("inf"), "1", [[1.0], [1.0, 2.0]], {}, 10**400])
-def test_no_domain_passes_that_is_none(model: ModelSet, keys: Path, domain: object) -> None:
-    signed = ModelSigner.load(keys).sign(model)
-    stated = np.full(model.domain.shape, domain).tolist() if isinstance(domain, float) else domain
-    if domain == float("inf"):
-        stated[0] = (-np.array(stated[0])).tolist()
-        assert TrustedSigners.load(keys).open(resigned(keys, signed, domain=stated)), "it is wider than any"
-        return
-    with pytest.raises(Untrusted, match="domain"):
-        TrustedSigners.load(keys).open(resigned(keys, signed, domain=stated))
-
-
 DEEP = b'{"a":' * 200_000
 
 
-def test_whatever_is_signed_a_reading_error_is_ours(model: ModelSet, keys: Path, tmp_path: Path) -> None:
-    trust, signed = TrustedSigners.load(keys), ModelSigner.load(keys).sign(model)
-    key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
-    assert isinstance(key, Ed25519PrivateKey)
+def test_whatever_is_signed_a_reading_error_is_ours(signed: SignedModel, trust, keys: Path, tmp_path: Path) -> None:
     deep = len(DEEP).to_bytes(8, "little") + DEEP
     for file in (deep, b"", b"\xff" * 9, signed.file[:-1]):
         with pytest.raises(BadModel):
             trust.open(resigned(keys, replace(signed, file=file), sha256=hashlib.sha256(file).hexdigest()))
     for claim in (DEEP, b"[]", b"5", b"\xff", b'{"number": 1}'):
         with pytest.raises(Untrusted):
-            trust.open(SignedModel(signed.file, claim, key.sign(CONTEXT + claim)))
-    for number in (-1, 2**63, True, "1", 1.5, None):
-        with pytest.raises(Untrusted, match="number"):
-            trust.open(resigned(keys, signed, number=number))
+            trust.open(claimed(keys, signed.file, claim))
     path = tmp_path / "model.safetensors"
     signed.save(path)
     for seal in (DEEP, b"[]", b"{}", b'{"claim": 1, "signature": 1}'):
@@ -258,13 +257,13 @@ def test_metadata_of_any_type_in_a_model_file_is_a_bad_model(model: ModelSet) ->
             decode(payload[:place] + bytes([payload[place] ^ 1 << random.randrange(8)]) + payload[place + 1 : -1])
 
 
-def test_a_full_disk_or_a_kill_in_a_write_to_the_archive_leaves_a_whole_model_or_none(model, keys, tmp_path) -> None:
-    trust, signer = TrustedSigners.load(keys), ModelSigner.load(keys)
+def test_a_full_disk_or_a_kill_in_a_write_to_the_archive_leaves_a_whole_model_or_none(
+    model, signed, trust, tmp_path
+) -> None:
     for error in (Died, full):
         for at in itertools.count():
             archive = tmp_path / f"{error.__name__}{at}"
             registry = ModelRegistry(archive, accept_bound=1.0)
-            signed = signer.sign(model)
             with failing(archive, at, error) as disk, suppress(Died):
                 registry.install(model, signed, trust.number(signed))
             if len(disk.seen) <= at:
@@ -303,13 +302,12 @@ def test_a_service_accepts_only_signed_models_over_the_bus(
             until(lambda: notes.get("model ground") == model.version)
             with Bus(settings, "certify") as certify:
                 publisher = certify.publisher(MODEL, robot="ground")
-                rest = {"robot": "ground", "version": evil.version}
-                publisher.put(pb.Model(file=evil.encode(), **rest))
-                signed = ModelSigner.load(keys).sign(model)
-                publisher.put(pb.Model(file=evil.encode(), claim=signed.claim, signature=signed.signature, **rest))
-                signed = ModelSigner.load(keys).sign(newer)
-                fields = {"claim": signed.claim, "signature": signed.signature}
-                publisher.put(pb.Model(robot="ground", version=newer.version, file=signed.file, **fields))
+                for file, claims in ((evil, None), (evil, model), (newer, newer)):
+                    seal = {}
+                    if claims is not None:
+                        signed = ModelSigner.load(keys).sign(claims)
+                        seal = {"claim": signed.claim, "signature": signed.signature}
+                    publisher.put(pb.Model(robot="ground", version=file.version, file=file.encode(), **seal))
                 until(lambda: notes.get("model ground") == newer.version)
         finally:
             service.terminate()
@@ -317,12 +315,3 @@ def test_a_service_accepts_only_signed_models_over_the_bus(
     archived = {path.stem for path in archive_path(archive, "ground", "*").parent.glob("*.safetensors")}
     assert archived == {model.version, newer.version}, "the archive holds no refused model"
     assert newest_model(archive, "ground", TrustedSigners.load(keys)) == archive_path(archive, "ground", newer.version)
-
-
-def test_with_keys_a_models_file_must_be_signed_too(model: ModelSet, tmp_path: Path) -> None:
-    keys, endpoint = keyring(tmp_path / "keys"), free_endpoint("tls")
-    write_signer(keys)
-    unsigned = tmp_path / "unsigned.safetensors"
-    model.save(unsigned)
-    with pytest.raises(Untrusted, match="no seal"):
-        main(SafetySettings(BusSettings(listen=(endpoint,), keys=keys), (unsigned,)))

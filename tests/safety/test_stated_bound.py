@@ -57,6 +57,7 @@ def test_the_limit_is_the_robots_own_unless_more_is_accepted(model):
     check_bound(tight, GROUND)
     check_bound(loose, LAX)
     check_bound(loose, GROUND, 0.27)
+    check_bound(rival(0.3), GROUND)  # a rival states none
     for robot, accepted in ((GROUND, None), (GROUND, 0.26), (LAX, 0.2)):
         with pytest.raises(TooLoose):
             check_bound(loose, robot, accepted)
@@ -100,6 +101,12 @@ def test_every_use_in_process_refuses_a_loose_model_set(model, tmp_path):
             use()
         use(accept_bound=0.27)
     ModelRegistry(limits={"ground": 0.3}).install(loose)
+    registry = ModelRegistry()
+    registry.install(said(model, TIGHT))
+    in_use = registry.filters["ground"]
+    with pytest.raises(TooLoose):
+        registry.install(loose)
+    assert registry.filters["ground"] is in_use, "the service goes on with its model set"
     for wrap, env in (
         (SafetyWrapper, Nothing()),
         (VectorSafetyWrapper, gymnasium.vector.SyncVectorEnv([Nothing])),
@@ -119,19 +126,6 @@ class Nothing(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
 
 
-def test_a_service_goes_on_with_its_model_set_when_a_loose_one_is_refused(model):
-    models = ModelRegistry()
-    models.install(said(model, TIGHT))
-    in_use = models.filters["ground"]
-    with pytest.raises(TooLoose):
-        models.install(said(model, FLOWN))
-    assert models.filters["ground"] is in_use
-
-
-def test_a_rival_needs_no_stated_bound():
-    check_bound(rival(0.3), GROUND)
-
-
 def test_every_decision_carries_the_bound(model):
     for about, bound in ((TIGHT, 0.0042), ({}, 1.0), ({"bound_plan": "nan"}, 1.0)):
         decision = Service(said(model, about)).decision(message())
@@ -148,10 +142,8 @@ def test_a_decision_of_an_old_log_or_of_a_rival_has_none(model):
 
 
 def test_verified_is_described_with_its_bound(model):
-    assert (
-        describe_verification(True, 0.0113)
-        == "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"
-    )
+    words = "verified; at most 1.2 % of such plans leave their tube, at 99 % confidence"
+    assert describe_verification(True, 0.0113) == words
     assert describe_verification(False, 0.001) == "not verified"
     assert "no bound" in describe_verification(True, None) and "states no bound" in describe_verification(True, 1.0)
     question = message()

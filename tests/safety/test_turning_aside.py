@@ -19,6 +19,7 @@ from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import request_of
 from tests.safety.asked import cylinder, fits, random_request, request, same
+from tests.safety.test_scan_free_space import FAN, cast
 
 GROUND = Filter.load("ground")
 
@@ -85,20 +86,9 @@ def test_the_turn_is_the_smallest_to_a_free_direction(sectors):
 
 
 def test_a_scan_shows_where_to_turn():
-    walls = [cylinder(0.27, 0.06, 0.12)]
-    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
-    rays = np.array([_range(angle, walls[0]) for angle in angles])
-    scan = Scan(rays, angles, pose=(0.0, 0.0, 0.0))
+    scan = Scan(cast([cylinder(0.27, 0.06, 0.12)], np.zeros(2), FAN), FAN, pose=(0.0, 0.0, 0.0))
     decision = GROUND.decide(replace(request(), known_free=False, scan=scan, turn_aside=True))
     assert decision.kind == ADJUSTED and decision.plan[0, 1] < -0.3
-
-
-def _range(angle, pillar):
-    """Return the range at which a ray from the origin hits a cylinder, at most 3.5 m."""
-    x, y = pillar.position
-    along, aside = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
-    inside = pillar.size[0] ** 2 - aside**2
-    return along - math.sqrt(inside) if along > 0.0 and inside > 0.0 else 3.5
 
 
 def test_robots_without_a_heading_ignore_it():

@@ -20,6 +20,7 @@ from tests.safety.test_one_step import certified, ready, request
 from tests.safety.test_turning_in_place import ROBOT, wandering
 from tests.safety.unicycle import Unicycle
 
+N = ROBOT.horizon
 POSTS = [cylinder(0.3, 0.25, 0.1), cylinder(-0.4, -0.3, 0.1)]
 
 
@@ -39,7 +40,7 @@ def test_the_factor_is_a_tenth_above_the_largest_recent_score_and_never_below_on
 
 
 def test_a_window_holds_the_last_periods_without_a_gap():
-    widening, N = Widening(ROBOT), ROBOT.horizon
+    widening = Widening(ROBOT)
     inputs = np.arange(2.0 * (N + 3)).reshape(-1, 2)
     for k in range(1, N + 2):
         assert widening.past is None or k == N + 1
@@ -64,7 +65,7 @@ def test_sets_are_wider_at_an_episodes_start_and_windows_from_there_are_judged_b
 
 
 def test_a_window_knows_whether_its_plan_was_decided_without_a_past_window():
-    widening, N, without = Widening(ROBOT), ROBOT.horizon, []
+    widening, without = Widening(ROBOT), []
     for k in range(4 * N):
         without.append(widening.past is None)  # the request at the start of period k
         if (past := widening.past) is not None:
@@ -76,21 +77,18 @@ def test_a_window_knows_whether_its_plan_was_decided_without_a_past_window():
     assert widening.past.from_start
 
 
-@pytest.mark.parametrize("factor", [0.99, 0.0, -1.0, np.nan, np.inf])
-def test_a_factor_below_one_or_without_a_value_is_refused(factor):
-    ask = replace(request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS), widening=factor)
-    with pytest.raises(BadRequest, match="widening"):
-        ready().decide(ask)
-
-
-def test_a_window_of_the_wrong_size_or_with_nan_is_refused():
-    ask = request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS)
-    N = ROBOT.horizon
-    for states, inputs in ((N, N), (N - 1, N + 1)):
-        with pytest.raises(BadRequest, match="past"):
-            ready().decide(replace(ask, past=PastWindow(np.zeros((states, 5)), np.zeros((inputs, 2)))))
-    with pytest.raises(BadRequest, match="NaN"):
-        ready().decide(replace(ask, past=PastWindow(np.full((N, 5), np.nan), np.zeros((N + 1, 2)))))
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        *(({"widening": factor}, "widening") for factor in (0.99, 0.0, -1.0, np.nan, np.inf)),
+        ({"past": PastWindow(np.zeros((N, 5)), np.zeros((N, 2)))}, "past"),
+        ({"past": PastWindow(np.zeros((N - 1, 5)), np.zeros((N + 1, 2)))}, "past"),
+        ({"past": PastWindow(np.full((N, 5), np.nan), np.zeros((N + 1, 2)))}, "NaN"),
+    ],
+)
+def test_a_factor_below_one_and_a_window_of_another_size_or_with_nan_are_refused(changes, said):
+    with pytest.raises(BadRequest, match=said):
+        ready().decide(replace(request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS), **changes))
 
 
 @pytest.mark.parametrize("of", ["one-step", "direct"])

@@ -37,9 +37,9 @@ def known(threshold=0.1, q=(0.0, 0.0), v=EVEN, robot=GROUND) -> Pretrained:
     return Pretrained(robot, "sailr", networks, {"threshold": threshold})
 
 
-def request(action, before=(0.0, 0.0), robot=GROUND, observation=None) -> Request:
+def request(action, before=(0.0, 0.0), robot=GROUND, observation=None, state=None) -> Request:
     return Request(
-        state=np.zeros(robot.state_dim),
+        state=np.zeros(robot.state_dim) if state is None else np.array(state, float),
         action=np.array(action, float),
         input_in_force=np.array(before, float),
         plan=np.zeros((robot.horizon, robot.action_dim)),

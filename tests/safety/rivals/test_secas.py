@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.errors import BadModel, BadRequest
-from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import planar_rays
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.filter.request import NOT_FINITE, Request
+from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.rivals.test_sailr import request
 from tests.safety.served import ServiceClient
 
 WIDE = np.full(3, 10.0)
@@ -96,19 +96,8 @@ def seen(ahead: float, beside: float = 3.5) -> np.ndarray:
     return np.concatenate([rays / 3.5, np.zeros(8)]).astype(np.float32)
 
 
-def request(observation, action, before=(0.0, 0.0), state=(0, 0, 0, 0, 0), robot=GROUND) -> Request:
-    return Request(
-        state=np.array(state, float),
-        action=np.array(action, float),
-        input_in_force=np.array(before, float),
-        plan=np.zeros((robot.horizon, robot.action_dim)),
-        obstacles=Shapes.of([], robot.position_dim),
-        observation=np.asarray(observation, np.float32),
-    )
-
-
 def test_far_from_everything_the_proposal_passes():
-    decision = Secas(known()).decide(request(seen(1.0), (0.25, 0.4)))
+    decision = Secas(known()).decide(request((0.25, 0.4), observation=seen(1.0)))
     assert decision.kind == "allowed" and np.allclose(decision.plan[0], (0.25, 0.4)) and decision.reason == ""
     assert decision.margin > 0 and not decision.verified and decision.solver == ""
 
@@ -116,13 +105,13 @@ def test_far_from_everything_the_proposal_passes():
 def test_the_speed_is_cut_to_what_the_linear_model_allows():
     ready = Secas(known())
     for ahead in (0.25, 0.23, 0.21):
-        decision = ready.decide(request(seen(ahead), (0.25, 0.4)))
+        decision = ready.decide(request((0.25, 0.4), observation=seen(ahead)))
         allowed = (ahead - CLEARANCE) / REACT[0]  # of full speed
         assert decision.kind == "adjusted" and "sector 2" in decision.reason
         assert decision.plan[0] == pytest.approx((0.25 * allowed, 0.4), abs=1e-5)
         assert decision.margin == pytest.approx(0.0, abs=1e-5)
         assert not decision.plan[-1].any() and len(decision.plan) == GROUND.horizon
-    too_near = ready.decide(request(seen(0.15), (0.25, 0.4)))  # the correction would be to drive backwards
+    too_near = ready.decide(request((0.25, 0.4), observation=seen(0.15)))  # the correction would be to drive backwards
     assert too_near.plan[0] == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
 
 
@@ -153,7 +142,7 @@ def test_a_robot_with_a_slew_is_corrected_within_it():
     state = np.zeros(robot.state_dim)
     state[3] = 3.0
     observation = np.full(robot.task.observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
-    decision = ready.decide(request(observation, (5.0, 0.0, 0.0), before, state, robot))
+    decision = ready.decide(request((5.0, 0.0, 0.0), before, robot, observation, state))
     assert decision.kind == "adjusted"
     assert decision.plan[0] == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
     assert (np.abs(np.diff(decision.plan, axis=0)) <= 0.8 + 1e-9).all() and not decision.plan[-1].any()
@@ -177,7 +166,7 @@ def test_a_request_that_cannot_be_decided_on_is_refused(field, wrong):
 
 
 def test_a_proposal_that_is_not_finite_brakes():
-    decision = Secas(known()).decide(request(seen(3.0), (np.inf, np.nan), before=(0.2, 0.1)))
+    decision = Secas(known()).decide(request((np.inf, np.nan), observation=seen(3.0), before=(0.2, 0.1)))
     assert (decision.kind, decision.reason, decision.verified) == ("failsafe", NOT_FINITE, False)
     assert not decision.plan.any(), "the ground robot stops at once"
 
@@ -198,7 +187,7 @@ def test_a_model_of_another_shape_or_method_is_refused():
 
 def test_a_model_without_rays_has_those_of_the_robots_usual_task():
     """Older files do not hold the rays."""
-    asked = request(seen(0.25), (0.25, 0.3))
+    asked = request((0.25, 0.3), observation=seen(0.25))
     older = Secas(replace(known(), rays=None))
     assert np.array_equal(older.decide(asked).plan, Secas(known()).decide(asked).plan)
     with pytest.raises(BadModel, match="pretrain it again"):
