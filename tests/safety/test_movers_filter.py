@@ -41,6 +41,8 @@ def test_the_robot_stops_for_a_mover_that_comes_and_follows_one_that_leaves(read
     assert ready.decide(ask([walker(0.9, velocity=(-1.0, 0.0))])).kind != ALLOWED
     assert ready.decide(ask([walker(0.9, velocity=(1.0, 0.0))])).kind == ALLOWED
     assert ready.decide(request(obstacles=[Obstacle("cylinder", (0.9, 0.0), (0.2,))])).kind == ALLOWED
+    near = ready.decide(ask([walker(0.35)]))
+    assert near.kind in (ADJUSTED, FAILSAFE) and near.verified
 
 
 def test_a_mover_that_arrives_after_the_robot_stands_stops_no_plan(ready, model):
@@ -51,11 +53,6 @@ def test_a_mover_that_arrives_after_the_robot_stands_stops_no_plan(ready, model)
     assert 0.15 < 0.02 * (sum(soon) - sum(late)) < 0.4  # m: what a walker goes in a period, and its errors
     still = Obstacle("cylinder", (0.3, 0.0), (0.15,))
     assert ready.decide(ask([still, at[-1]])).kind != ALLOWED  # what stands is kept off to the end
-
-
-def test_no_obstacle_that_stands_does_not_mean_that_nothing_is_near(ready):
-    decision = ready.decide(ask([walker(0.35)]))
-    assert decision.kind in (ADJUSTED, FAILSAFE) and decision.verified
 
 
 def test_a_mover_that_breaks_its_bound_is_counted_and_the_robot_brakes(ready):

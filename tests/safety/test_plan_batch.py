@@ -1,6 +1,6 @@
 """Committed plans as arrays decide, widen and brake as one `BackupPlan` for each robot does."""
 
-from dataclasses import replace
+import math
 from typing import Any
 
 import numpy as np
@@ -67,35 +67,24 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
 
 
 class Broken:
-    """A filter whose answers a test spoils."""
+    """A filter that writes a value into a place of each batch of plans, or that fails as a whole."""
 
-    def __init__(self, spoil: Any) -> None:
-        self.robot, self.version, self._spoil = SAFETY.robot, SAFETY.version, spoil
+    def __init__(self, place: Any, value: float = math.nan) -> None:
+        self.robot, self.version, self._place, self._value = SAFETY.robot, SAFETY.version, place, value
 
     def decide_batch(self, requests: Any) -> DecisionArrays:
-        return self._spoil(SAFETY.decide_batch(requests))
+        if self._place is None:
+            raise BadRequest("state", "row 0: not finite")
+        answers = SAFETY.decide_batch(requests)
+        answers.plan[self._place] = self._value
+        return answers
 
 
-def beyond(answers: DecisionArrays) -> DecisionArrays:
-    answers.plan[0, 0] = 9.0
-    return answers
+BEYOND_BOUNDS, ENDLESS, NOT_FINITE, FAILING = Broken((0, 0), 9.0), Broken((0, -1), 0.2), Broken(0), Broken(None)
 
 
-def endless(answers: DecisionArrays) -> DecisionArrays:
-    answers.plan[0, -1] = 0.2
-    return answers
-
-
-def unknown(answers: DecisionArrays) -> DecisionArrays:
-    return replace(answers, plan=np.where(np.arange(2)[:, None, None] == 0, np.nan, answers.plan))
-
-
-def failing(answers: DecisionArrays) -> DecisionArrays:
-    raise BadRequest("state", "row 0: not finite")
-
-
-@pytest.mark.parametrize("spoil", [beyond, endless, unknown, failing, None])
-def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(spoil: Any) -> None:
+@pytest.mark.parametrize("broken", [BEYOND_BOUNDS, ENDLESS, NOT_FINITE, FAILING, None])
+def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: Broken | None) -> None:
     """As `BackupPlan.fallback`: the first row brakes; the second goes on, unless the filter failed as a whole."""
     plans, single = BackupPlanBatch(SAFETY, 2), InProcess(SAFETY)
     free = ObstacleArrays.of([Shapes.of([], 2)] * 2)
@@ -104,20 +93,20 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(spoil: A
     assert np.allclose(plans.decide(states, actions, free).inputs, actions)
     single.decide(states[0], actions[0], [], known_free=True)
     states[:, 0], states[:, 3] = 0.03, 0.19
-    if spoil is None:
+    if broken is None:
         actions[0, 1] = np.nan
     else:
-        plans.safety = Broken(spoil)  # type: ignore[assignment]
+        plans.safety = broken  # type: ignore[assignment]
     outcome = plans.decide(states, actions, free)
     single.backup_plan.measured(states[0])
     assert np.allclose(outcome.inputs[0], single.backup_plan.fallback())
-    assert outcome.decided.tolist() == [False, spoil is not failing] and outcome.failure
-    assert np.allclose(outcome.inputs[1], actions[1]) == (spoil is not failing)
+    assert outcome.decided.tolist() == [False, broken is not FAILING] and outcome.failure
+    assert np.allclose(outcome.inputs[1], actions[1]) == (broken is not FAILING)
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
 
 
 def test_plans_of_other_robots_are_not_kept_in_batches() -> None:
-    other = Broken(beyond)
+    other = Broken(None)
     other.robot = robot_named("ground-late")
     with pytest.raises(ValueError, match="one robot at a time"):
         BackupPlanBatch(other, 2)  # type: ignore[arg-type]

@@ -64,19 +64,15 @@ def test_a_reservation_that_passes_by_leaves_room_behind_it():
     assert room[0] < 0.2 and room[2] > 0.8
 
 
-def test_a_reservation_that_the_robot_touches_leaves_no_room():
-    here = Reservation.of(np.zeros((4, 2)), np.full((4, 2), 0.05), np.full(3, 0.1))
-    _, offsets = reservation_half_spaces(
-        OtherReservations.to([here]), np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2)
-    )
-    assert (offsets == -np.inf).all()
+def test_the_distances_of_reservations():
+    def at(x, half_width=0.0, radius=0.1):
+        return Reservation.of(np.full((4, 2), [x, 0.0]), np.full((4, 2), half_width), np.full(3, radius))
 
-
-@pytest.mark.parametrize("away", [0.2, 0.5, 2.0])
-def test_the_distances_of_reservations(away):
-    other = Reservation.of(np.full((4, 2), [away + 0.1, 0.0]), np.zeros((4, 2)), np.full(3, 0.1))
-    assert (OtherReservations.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
+    for away in (0.2, 0.5, 2.0):
+        other = at(away + 0.1)
+        assert (OtherReservations.to([other]).nearest(np.zeros(2))[0] < 1.0) == (away < 1.0)
+        assert other.distance(at(0.0, radius=0.05)) == pytest.approx(away - 0.05)
     assert OtherReservations.to([]) is None
-    assert other.distance(Reservation.of(np.zeros((4, 2)), np.zeros((4, 2)), np.full(3, 0.05))) == pytest.approx(
-        away - 0.05
-    )
+    touched = OtherReservations.to([at(0.0, 0.05)])
+    _, offsets = reservation_half_spaces(touched, np.zeros(2), np.zeros((3, 2)), 0.105, np.zeros(2))
+    assert (offsets == -np.inf).all(), "it leaves no room"

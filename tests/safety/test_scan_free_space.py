@@ -79,16 +79,18 @@ def test_every_point_of_an_obstacle_is_beyond_some_half_space(seed, drop):
         assert beyond.any(axis=1).all()
 
 
+WALL = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
+
+
 def test_a_wall_becomes_a_few_cells_and_leaves_the_space_before_it_free():
-    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
-    near = occupied_cells(taken(np.random.default_rng(0), wall), 1.0)
+    near = occupied_cells(taken(np.random.default_rng(0), WALL), 1.0)
     assert 5 <= len(near) <= 14
     normals, offsets = half_spaces(near, np.zeros(2), np.array([[0.1, 0.0]] * 3), 0.0, np.zeros(2), 0.2)
     assert offsets.max(axis=1).min() > 0.48
     assert ((normals[:, 0] @ [0.3, 0.3]) < offsets[:, 0]).all()
 
 
-def test_unknown_space_is_not_free():
+def test_unknown_space_is_not_free_except_behind_lone_beams():
     blind = Scan(np.zeros(360), FAN, (0.0, 0.0, 0.0))
     assert (gaps(blind)[2] == 0.0).all() and len(occupied_cells(blind, 1.0)) > 0
     none = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
@@ -96,18 +98,13 @@ def test_unknown_space_is_not_free():
     for scan in (blind, none, Scan(ahead, FAN, (0.0, 0.0, 0.0))):
         _, offsets = half_spaces(occupied_cells(scan, 1.0), np.zeros(2), np.array([[0.05, 0.0]]), 0.1, np.zeros(2), 0.2)
         assert offsets.min() < 0.0
-
-
-def test_a_dropped_beam_costs_no_free_space_nearby():
-    ranges = np.full(360, FAR)
-    ranges[[10, 100]] = 0.0
-    assert gaps(Scan(ranges, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.8
+    dropped = np.full(360, FAR)
+    dropped[[10, 100]] = 0.0
+    assert gaps(Scan(dropped, FAN, (0.0, 0.0, 0.0)))[2].min() > 1.8, "lone beams cost no free space nearby"
 
 
 def test_with_doubt_a_lone_false_range_frees_nothing():
-    rng = np.random.default_rng(0)
-    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
-    scan = taken(rng, wall)
+    scan = taken(np.random.default_rng(0), WALL)
     for first in (178, 179, 180):
         broken = scan.ranges.copy()
         broken[first : first + 3] = FAR
@@ -149,8 +146,7 @@ def test_a_lone_return_is_a_ghost_and_an_obstacle_of_the_least_width_is_not():
 
 
 def test_cells_that_may_move_grow_with_time():
-    wall = [Obstacle("wall", (0.5, 0.0), yaw=math.pi)]
-    still, moving = (occupied_cells(taken(np.random.default_rng(0), wall, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
+    still, moving = (occupied_cells(taken(np.random.default_rng(0), WALL, speed=s, age=0.1), 1.0) for s in (0.0, 1.6))
     at = (np.zeros(2), np.zeros((3, 2)), 0.0, np.zeros(2), 0.2)
     lost = half_spaces(still, *at)[1] - half_spaces(moving, *at)[1]
     assert np.allclose(lost, 1.6 * (0.1 + 0.2 * np.arange(1, 4)))

@@ -56,14 +56,10 @@ def test_two_rivals_read_each_the_observation_of_their_own_task():
                     rival.decide(question)
 
 
-def test_rivals_of_two_tasks_lie_in_two_files():
+def test_rivals_of_two_tasks_lie_in_two_files_and_two_policies_are_read_each_by_its_own_task():
     usual, other = (robot_with_task(name) for name in NAMES)
     paths = [method_path(robot, SECAS, ModelConfig()) for robot in (usual, robot_named("ground"), other)]
     assert paths[0].name == paths[1].name and paths[0] != paths[2]
-
-
-def test_two_policies_are_read_each_by_its_own_task():
-    usual, other = (robot_with_task(name) for name in NAMES)
     for own, foreign in ((usual, other), (other, usual)):
         stored = MLP.untrained(own, 0).encode()
         assert decode(stored, own).robot == own

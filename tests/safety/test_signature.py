@@ -62,6 +62,11 @@ def signed(model: ModelSet, keys: Path) -> SignedModel:
     return ModelSigner.load(keys).sign(model)
 
 
+@pytest.fixture
+def newer(model: ModelSet) -> ModelSet:
+    return replace(model, stands=3)
+
+
 def claimed(keys: Path, file: bytes, claim: bytes) -> SignedModel:
     """Return a file with any claim, which a trusted key signed."""
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
@@ -150,9 +155,9 @@ def test_a_restart_uses_the_newest_signed_model(model: ModelSet, signed, trust, 
 
 
 def test_the_times_of_files_and_a_clock_set_back_bring_no_older_model_into_use(
-    model: ModelSet, models: dict[tuple[str, str], ModelSet], trust, keys: Path, tmp_path: Path, monkeypatch
+    model: ModelSet, newer: ModelSet, trust, keys: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    older, newer, signer = model, models["set-membership", "direct"], ModelSigner.load(keys)
+    older, signer = model, ModelSigner.load(keys)
     paths = [archive_path(tmp_path, "ground", m.version) for m in (older, newer)]
     signer.sign(older).save(paths[0])
     monkeypatch.setattr(time, "time_ns", lambda: 1)
@@ -188,13 +193,13 @@ def test_a_key_in_a_folder_that_cannot_be_written_still_signs_in_order(model, tr
 
 
 def test_without_keys_a_restart_uses_the_model_that_a_service_used_last(
-    model: ModelSet, models: dict[tuple[str, str], ModelSet], tmp_path: Path
+    model: ModelSet, newer: ModelSet, tmp_path: Path
 ) -> None:
     registry = ModelRegistry(tmp_path, accept_bound=1.0)
-    for m in (model, models["set-membership", "direct"]):
+    for m in (model, newer):
         registry.install(m)
     os.utime(archive_path(tmp_path, "ground", model.version), (4e9, 4e9))
-    last = archive_path(tmp_path, "ground", models["set-membership", "direct"].version)
+    last = archive_path(tmp_path, "ground", newer.version)
     assert newest_model(tmp_path, "ground", None) == last
     for damage in (b"", b"\xff", b"../x", model.version.encode() + b"0"):
         (last.parent / "in_use").write_bytes(damage)
@@ -284,13 +289,11 @@ main(SafetySettings(bus, (Path(model),), Path(archive), accept_bound=1.0))
 """
 
 
-def test_a_service_accepts_only_signed_models_over_the_bus(
-    model: ModelSet, models: dict[tuple[str, str], ModelSet], tmp_path: Path
-) -> None:
+def test_a_service_accepts_only_signed_models_over_the_bus(model: ModelSet, newer: ModelSet, tmp_path: Path) -> None:
     """A certificate of `certify` gets a message through; what is in it has to be signed all the same."""
     keys, archive = keyring(tmp_path / "keys"), tmp_path / "archive"
     write_signer(keys)
-    path, newer, evil = tmp_path / "model.safetensors", models["set-membership", "direct"], shrunken(model)
+    path, evil = tmp_path / "model.safetensors", shrunken(model)
     ModelSigner.load(keys).sign(model).save(path)
     endpoint, notes = free_endpoint("tls"), dict[str, str]()
     settings = BusSettings(connect=(endpoint,), keys=keys)
