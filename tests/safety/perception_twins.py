@@ -35,38 +35,22 @@ def window_minimum(values, rows, beside):
     return least
 
 
-def shortest_returns(ranges, added, far, error):
-    returns = np.where(ranges > 0.0, np.maximum(np.minimum(ranges, far) - error, 0.0), -1.0)
-    return np.pad(returns, (added, (0, 0)), constant_values=-1.0).astype(np.float32)
-
-
-def mesh_maximum(returns):
-    meshes = np.maximum(np.maximum(returns, np.roll(returns, -1, axis=1)), np.float32(0.0))
-    meshes[:-1] = np.maximum(meshes[:-1], meshes[1:])
-    return meshes
-
-
-def without_ghosts(returns, meshes, share, error, rows, beside):
-    least = window_minimum(meshes, rows, beside)
-    sure = (returns / np.float32(share) + np.float32(error)).astype(float) * (1.0 + SINGLE) < least
-    return np.where((returns >= 0.0) & sure, np.float32(-1.0), returns)
-
-
 def single_beam_ranges(ranges, added, sensor, mesh_window, beam_window, scale):
     far, error, doubt = sensor
-    returns = shortest_returns(ranges, added, far, error)
     share, rows, beside = mesh_window
-    returns = without_ghosts(returns, mesh_maximum(returns), share, 2.0 * error, rows, beside)
+    returns = np.where(ranges > 0.0, np.maximum(np.minimum(ranges, far) - error, 0.0), -1.0)
+    returns = np.pad(returns, (added, (0, 0)), constant_values=-1.0).astype(np.float32)
+    meshes = np.maximum(np.maximum(returns, np.roll(returns, -1, axis=1)), np.float32(0.0))
+    meshes[:-1] = np.maximum(meshes[:-1], meshes[1:])
+    farthest = (returns / np.float32(share) + np.float32(2.0 * error)).astype(float) * (1.0 + SINGLE)
+    ghosts = (returns >= 0.0) & (farthest < window_minimum(meshes, rows, beside))
+    returns = np.where(ghosts, np.float32(-1.0), returns)
     if doubt or (returns < 0.0).any():
         return returns, np.empty((0, 0), np.float32)
     return returns, np.minimum(window_minimum(returns, *beam_window) * np.float32(scale[0]), np.float32(scale[1]))
 
 
 # --- shadow_kernels ---------------------------------------------------------------------------------------------------
-
-
-def rounding(extent):
-    return ROUNDING * max(1.0, extent / ROUNDING_EXTENT)
 
 
 def patch_minimum(free, columns_per_patch):
@@ -207,7 +191,7 @@ def path_planes(capsules, origin, plan, motion, margins, search):
     boxes = np.broadcast_to(boxes, (2, len(ends), 3)) - origin
     growth = motion[0] + motion[1] * np.arange(1.0, len(ends))
     first = group_periods(ends, SHARED)
-    rounded = rounding(capsules[EXTENT].max() + np.abs(boxes).max())
+    rounded = ROUNDING * max(1.0, (capsules[EXTENT].max() + np.abs(boxes).max()) / ROUNDING_EXTENT)
     gaps = group_gaps(capsules, ends, first)
     free = count_free_groups(ends, first, gaps, TOUCHING)
     none = np.zeros((1, 0, 3)), np.zeros((1, 0))

@@ -176,13 +176,10 @@ def test_tampered_model_sets_are_refused(model):
             ModelSet.decode(edited(model, metadata))
 
 
-def test_invalid_configurations_are_refused():
+def test_invalid_configurations_and_data_that_support_no_model_are_refused(data):
     for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
         with pytest.raises(ValueError, match=r"certificate|mode|envelope"):
             ModelConfig(**bad)
-
-
-def test_data_that_support_no_model_are_refused(data):
     with pytest.raises(BadData, match="trajectory"):
         fit_model_set(replace(data, trajectories=data.trajectories[:1]), ModelConfig())
     with pytest.raises(BadData, match="at least"):

@@ -72,20 +72,6 @@ def test_a_standing_robot_needs_no_verified_plan_when_a_mover_comes(ready):
     assert decision.kind == FAILSAFE and decision.verified and not decision.plan.any()
 
 
-def test_a_mover_with_speed_zero_counts_as_a_standing_obstacle(ready):
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        at = rng.uniform(-0.6, 0.6, 2)
-        if np.hypot(*at) < 0.35:
-            continue
-        still = Obstacle("cylinder", tuple(at), (0.2,))
-        stuck = replace(still, motion=Motion((0.0, 0.0), 0.0, speed=0.0))
-        action = rng.uniform(GROUND.low(), GROUND.high())
-        one, other = ready.decide(request(action=action, obstacles=[still])), ready.decide(ask([stuck], action=action))
-        assert one.kind == other.kind
-        assert np.allclose(one.plan, other.plan, atol=1e-3)
-
-
 def test_a_mover_out_of_reach_changes_no_bit_of_the_decision(ready):
     rng = np.random.default_rng(1)
     for _ in range(20):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.errors import BadShape
-from brakeline.messaging.moving_obstacles import MovingObstacles, split_moving
+from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
 from brakeline.safety.filter.halfspaces import half_spaces
@@ -168,11 +168,3 @@ def test_a_malformed_motion_is_refused(motion):
     with pytest.raises(BadShape) as error:
         Obstacle("sphere", (0.0, 0.0), (0.3,), motion=motion)
     assert error.value.field == "motion"
-
-
-def test_movers_are_separated_from_standing_obstacles():
-    still = Obstacle("sphere", (1.0, 0.0), (0.3,))
-    mover = replace(still, motion=Motion((1.0, 0.0), 0.0, speed=1.0))
-    shapes, movers = split_moving([still, mover, still], 2)
-    assert len(shapes) == 2 and movers is not None and len(movers) == 1
-    assert split_moving([still], 2)[1] is None

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
-from brakeline.messaging.scan import Scan
+from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.safety.perception.scan_free_space import gaps, half_spaces, occupied_cells
 from tests.messaging.test_obstacle import sample
 from tests.safety import ray_casting
@@ -152,6 +152,9 @@ def test_cells_that_may_move_grow_with_time():
     assert np.allclose(lost, 1.6 * (0.1 + 0.2 * np.arange(1, 4)))
 
 
+WRONG_BOUNDS = [0.0, 0.0, -0.1, 1.0], [np.nan, 0.0, 0.1, 1.0], [-1e300, 0.0, 0.1, 1.0]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -166,6 +169,11 @@ def test_cells_that_may_move_grow_with_time():
         {"age": math.inf},
         {"doubt": 1.5},
         {"ranges": np.full(360, 1200, np.uint16)},
+        {"tracks": BeamTracks(np.zeros(3, np.uint8), np.zeros((0, 4)))},
+        {"tracks": BeamTracks(np.ones(360, np.uint8), np.zeros((0, 4)))},
+        {"tracks": BeamTracks(np.zeros(360, np.int64), np.zeros((0, 4)))},
+        {"tracks": BeamTracks(np.ones(360, np.uint8), np.zeros((1, 3)))},
+        *({"tracks": BeamTracks(np.ones(360, np.uint8), np.array([bounds]))} for bounds in WRONG_BOUNDS),
     ],
 )
 def test_a_malformed_scan_is_refused(wrong):

@@ -96,14 +96,11 @@ def seen(ahead: float, beside: float = 3.5) -> np.ndarray:
     return np.concatenate([rays / 3.5, np.zeros(8)]).astype(np.float32)
 
 
-def test_far_from_everything_the_proposal_passes():
-    decision = Secas(known()).decide(request((0.25, 0.4), observation=seen(1.0)))
+def test_far_from_everything_the_proposal_passes_and_else_the_speed_is_cut_to_what_the_linear_model_allows():
+    ready = Secas(known())
+    decision = ready.decide(request((0.25, 0.4), observation=seen(1.0)))
     assert decision.kind == "allowed" and np.allclose(decision.plan[0], (0.25, 0.4)) and decision.reason == ""
     assert decision.margin > 0 and not decision.verified and decision.solver == ""
-
-
-def test_the_speed_is_cut_to_what_the_linear_model_allows():
-    ready = Secas(known())
     for ahead in (0.25, 0.23, 0.21):
         decision = ready.decide(request((0.25, 0.4), observation=seen(ahead)))
         allowed = (ahead - CLEARANCE) / REACT[0]  # of full speed
@@ -121,11 +118,8 @@ def test_a_robot_that_approaches_counts_as_nearer():
     assert still[2] == pytest.approx(-0.3, abs=1e-6)
     assert 0.04 < moving[2] - still[2] <= 0.25 * constraints.stopping
     assert moving[0] == pytest.approx(still[0], abs=0.05), "the side does not come nearer"
-
-
-def test_ranges_beyond_near_count_as_equal():
-    constraints, at_rest = Constraints(GROUND, GROUND.task.rays), np.zeros(5)
-    assert np.array_equal(constraints(seen(3.5), at_rest), constraints(seen(2.0, beside=1.0), at_rest))
+    far, less = constraints(seen(3.5), np.zeros(5)), constraints(seen(2.0, beside=1.0), np.zeros(5))
+    assert np.array_equal(far, less), "ranges beyond near count as equal"
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR])
@@ -136,13 +130,11 @@ def test_every_ray_is_in_one_sector(robot):
 
 
 def test_a_robot_with_a_slew_is_corrected_within_it():
-    robot = QUADROTOR
-    ready = Secas(known(g=(0.5, 0.0, 0.0), robot=robot))
-    before = np.array([3.0, 0.0, 0.0])
-    state = np.zeros(robot.state_dim)
+    before, state = np.array([3.0, 0.0, 0.0]), np.zeros(QUADROTOR.state_dim)
     state[3] = 3.0
-    observation = np.full(robot.task.observation_dim, 0.2)  # walls 2.4 m away all round: too near at that speed
-    decision = ready.decide(request((5.0, 0.0, 0.0), before, robot, observation, state))
+    walls = np.full(QUADROTOR.task.observation_dim, 0.2)  # 2.4 m away all round: too near at that speed
+    rival = Secas(known(g=(0.5, 0.0, 0.0), robot=QUADROTOR))
+    decision = rival.decide(request((5.0, 0.0, 0.0), before, QUADROTOR, walls, state))
     assert decision.kind == "adjusted"
     assert decision.plan[0] == pytest.approx((2.2, 0.0, 0.0), abs=1e-3), "as much less as the slew allows"
     assert (np.abs(np.diff(decision.plan, axis=0)) <= 0.8 + 1e-9).all() and not decision.plan[-1].any()
