@@ -8,26 +8,18 @@ import pytest
 from brakeline.deploy.data.rival_pretraining import BarrierConfig, PredictiveConfig, config_for, made_by, pretrain
 from brakeline.errors import BadModel, BadRequest
 from brakeline.messaging.obstacle import Obstacle, Shapes
-from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
 from brakeline.safety.methods import decode, ready
 from brakeline.safety.model.model_config import CBF, PSF
 from brakeline.safety.rivals.predictive_filter import PredictiveFilter
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
 from tests.robots import GROUND, QUADROTOR
+from tests.safety.asked import cylinder, request
 
 BARRIER = UnicycleBarrier(Pretrained(GROUND, CBF, {}, asdict(BarrierConfig(0.05, 1.0, 0.0))))
 PREDICTIVE = PredictiveFilter(Pretrained(GROUND, PSF, {}, asdict(PredictiveConfig(lag=0.05, margin=0.01))))
-FAST, STAND = np.array([0.25, 0.0]), np.zeros((3, 2))
-
-
-def request(*obstacles: Obstacle, action=FAST, state=(0.0, 0.0, 0.0, 0.0, 0.0), plan=STAND) -> Request:
-    shapes = Shapes.of(list(obstacles), 2)
-    return Request(np.array(state), np.array(action), np.zeros(2), plan, shapes, known_free=True)
-
-
-def post(x: float, y: float = 0.0) -> Obstacle:
-    return Obstacle("cylinder", (x, y), (0.1,))
+FAST = np.array([0.25, 0.0])  # the proposal by default
 
 
 def wall(x: float) -> Obstacle:
@@ -36,24 +28,24 @@ def wall(x: float) -> Obstacle:
 
 @pytest.mark.parametrize("method", [BARRIER, PREDICTIVE])
 def test_free_driving_passes(method):
-    for decision in (method.decide(request()), method.decide(request(post(2.0)))):
+    for decision in (method.decide(request()), method.decide(request(obstacles=[cylinder(2.0, 0.0)]))):
         assert decision.kind == ALLOWED and not decision.verified
         assert decision.plan.tolist() == [[0.25, 0.0], [0.0, 0.0], [0.0, 0.0]]
 
 
 @pytest.mark.parametrize("method", [BARRIER, PREDICTIVE])
-@pytest.mark.parametrize("obstacle", [post(0.24), Obstacle("box", (0.24, 0.0), (0.2, 0.2)), wall(0.14)])
+@pytest.mark.parametrize("obstacle", [cylinder(0.24, 0.0), Obstacle("box", (0.24, 0.0), (0.2, 0.2)), wall(0.14)])
 def test_a_proposal_at_an_obstacle_is_adjusted_whatever_its_shape(method, obstacle):
     """The surface is 0.14 m ahead of the centre of a body of 0.105 m."""
-    decision = method.decide(request(obstacle, state=(0.0, 0.0, 0.0, 0.25, 0.0)))
+    decision = method.decide(request(obstacles=[obstacle], state=(0.0, 0.0, 0.0, 0.25, 0.0)))
     assert decision.kind in (ADJUSTED, FAILSAFE) and decision.plan[0, 0] < 0.2 and decision.reason
 
 
 def test_the_barrier_keeps_its_row_at_an_obstacle():
-    near = BARRIER.decide(request(post(0.4)))
+    near = BARRIER.decide(request(obstacles=[cylinder(0.4, 0.0)]))
     h = 0.4 - 0.05 - 0.1 - 0.105 - 0.05
     assert near.kind == ADJUSTED and near.plan[0] == pytest.approx([h, 0.0], abs=1e-6)  # v <= α h
-    assert BARRIER.decide(request(post(0.2))).kind == FAILSAFE  # too near: only backwards would do
+    assert BARRIER.decide(request(obstacles=[cylinder(0.2, 0.0)])).kind == FAILSAFE  # too near: only backwards would do
 
 
 def test_the_predictive_filter_predicts_the_motion_with_its_lag():
@@ -72,7 +64,7 @@ def test_the_predictive_filter_predicts_the_motion_with_its_lag():
 
 def test_the_predictive_filter_finds_the_closest_clear_plan():
     """Straight at a wall, the fastest input that stops before it; a grid of inputs finds none that is closer."""
-    ask = request(wall(0.14), state=(0.0, 0.0, 0.0, 0.1, 0.0))
+    ask = request(obstacles=[wall(0.14)], state=(0.0, 0.0, 0.0, 0.1, 0.0))
     decision = PREDICTIVE.decide(ask)
     assert decision.kind == ADJUSTED and -1e-4 <= decision.margin < 1e-3 and not decision.plan[-1].any()
     away = np.linalg.norm((decision.plan[0] - FAST) / [0.25, 1.0])
@@ -85,14 +77,14 @@ def test_the_predictive_filter_finds_the_closest_clear_plan():
 
 def test_the_predictive_filter_goes_on_with_its_last_plan_where_it_finds_none():
     last = np.array([[0.05, 0.1], [0.02, 0.0], [0.0, 0.0]])
-    decision = PREDICTIVE.decide(request(post(0.2), state=(0.0, 0.0, 0.0, 0.25, 0.0), plan=last))
+    decision = PREDICTIVE.decide(request(obstacles=[cylinder(0.2, 0.0)], state=(0.0, 0.0, 0.0, 0.25, 0.0), plan=last))
     assert decision.kind == FAILSAFE and np.array_equal(decision.plan, last) and "last one" in decision.reason
 
 
 @pytest.mark.parametrize("method", [BARRIER, PREDICTIVE])
 def test_what_they_cannot_decide_is_refused_or_braked(method):
     assert method.decide(request(action=(np.nan, 0.0))).kind == FAILSAFE
-    broken = Shapes.of([post(0.4)], 2)
+    broken = Shapes.of([cylinder(0.4, 0.0)], 2)
     for name in ("center", "rho", "margin"):
         wrong = replace(broken, **{name: getattr(broken, name) * np.nan})
         with pytest.raises(BadRequest, match="NaN or infinity"):
