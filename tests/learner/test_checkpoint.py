@@ -56,34 +56,35 @@ def test_round_trip_and_only_the_latest_stays(tmp_path):
     assert checkpoint.exists(tmp_path)
 
 
-def test_missing_parts_are_named(tmp_path):
-    place = save(tmp_path, 1)
+BIG, MANIFEST = "big.safetensors", "manifest.json"
+DAMAGES = [
+    *((BIG, data, "big") for data in (lambda b: b[:-1], lambda b: b[:500] + b"?" + b[501:], lambda b: b"", None)),
+    *((MANIFEST, lambda b, text=text: text, "manifest") for text in (b"", b"[]", b"{")),
+    (MANIFEST, lambda b: json.dumps({"format": 99, "about": {}, "parts": {}}).encode(), "manifest"),
+    (MANIFEST, None, "manifest.json"),
+]
+
+
+@pytest.mark.parametrize(("file", "damage", "part"), DAMAGES)
+def test_damaged_and_missing_files_are_named(tmp_path, file, damage, part):
+    path = save(tmp_path, 1) / file
+    if damage is None:
+        path.unlink()
+    else:
+        path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(checkpoint.DamagedPart, match=part):
+        checkpoint.load(tmp_path, NAMES)
+
+
+def test_a_part_that_was_never_saved_is_named(tmp_path):
+    save(tmp_path, 1)
     with pytest.raises(checkpoint.DamagedPart) as caught:
         checkpoint.load(tmp_path, (*NAMES, "other"))
     assert caught.value.part == "other"
-    (place / "big.safetensors").unlink()
-    with pytest.raises(checkpoint.DamagedPart) as caught:
-        checkpoint.load(tmp_path, NAMES)
-    assert caught.value.part == "big"
-    (place / "manifest.json").unlink()
-    with pytest.raises(checkpoint.DamagedPart, match=r"manifest\.json"):
-        checkpoint.load(tmp_path, NAMES)
 
 
-@pytest.mark.parametrize("damage", [lambda b: b[:-1], lambda b: b[:500] + b"?" + b[501:], lambda b: b""])
-def test_damaged_parts_are_named(tmp_path, damage):
-    path = save(tmp_path, 1) / "big.safetensors"
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(checkpoint.DamagedPart) as caught:
-        checkpoint.load(tmp_path, NAMES)
-    assert caught.value.part == "big"
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", json.dumps({"format": 99, "about": {}, "parts": {}})])
-def test_damaged_manifest(tmp_path, text):
-    (save(tmp_path, 1) / "manifest.json").write_text(text)
-    with pytest.raises(checkpoint.DamagedPart, match="manifest"):
-        checkpoint.load(tmp_path, NAMES)
+def flipped(data: bytes, place: int, bit: int) -> bytes:
+    return data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :]
 
 
 @pytest.mark.parametrize("file", ["manifest.json", "manifest.sha256", "small.safetensors"])
@@ -91,8 +92,7 @@ def test_no_flipped_bit_is_restored(tmp_path, file):
     path = save(tmp_path, 1) / file
     whole, random = path.read_bytes(), Random(0)
     for _ in range(300):
-        place, bit = random.randrange(len(whole)), random.randrange(8)
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        path.write_bytes(flipped(whole, random.randrange(len(whole)), random.randrange(8)))
         with pytest.raises(checkpoint.DamagedPart):
             checkpoint.load(tmp_path, NAMES)
     path.write_bytes(whole)
@@ -104,7 +104,7 @@ def test_no_flipped_bit_of_latest_leads_to_a_fresh_start(tmp_path):
     path = tmp_path / "latest"
     whole = path.read_bytes()
     for place, bit in itertools.product(range(len(whole)), range(8)):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        path.write_bytes(flipped(whole, place, bit))
         assert checkpoint.exists(tmp_path)
         with suppress(checkpoint.DamagedPart):
             assert number_in(tmp_path) == 1

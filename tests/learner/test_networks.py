@@ -145,7 +145,7 @@ def test_learns_a_bandit(precision):
         hidden=(64, 64), batch=64, actor_rate=1e-3, critic_rate=1e-3, reward_scale=1.0, precision=precision
     )
     agent, batch, generator = TD3(2, 2, config, seed=0), Batch(64, 2, 2), np.random.default_rng(0)
-    for _ in range(1500):
+    for _ in range(700):
         s, a = generator.uniform(-0.8, 0.8, (64, 2)), generator.uniform(-1, 1, (64, 2))
         for array, value in zip(batch.arrays, (s, a, -((a - s) ** 2).sum(1, keepdims=True), 0.0, s, 0.0), strict=True):
             array[:] = value
@@ -154,7 +154,19 @@ def test_learns_a_bandit(precision):
     assert float((action - batch.observation).square().mean()) < 0.02
 
 
-@pytest.mark.parametrize("wrong", [{"batch": 0}, {"warmup": 1}, {"gamma": 1.5}, {"hidden": ()}, {"tau": 0.0}])
-def test_configurations_that_cannot_be(wrong):
-    with pytest.raises(ValueError):
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        *(
+            ({name: value}, name)
+            for name, value in {"batch": 0, "warmup": 1, "gamma": 1.5, "hidden": (), "tau": 0.0}.items()
+        ),
+        *(
+            ({"cost_limit": 0.1} | wrong, "cost_limit")
+            for wrong in ({"cost_limit": 1.0}, {"cost_limit": -0.1}, {"multiplier_rate": 0.0})
+        ),
+    ],
+)
+def test_configurations_that_cannot_be(wrong, named):
+    with pytest.raises(ValueError, match=named):
         TD3Config(**wrong)

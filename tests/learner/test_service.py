@@ -1,12 +1,11 @@
 """The process on a real bus, with an actor that makes its steps up."""
 
 import threading
-import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from brakeline.errors import Late, NoReply, Refused, UnknownRobot
@@ -41,14 +40,13 @@ def bus() -> Iterator[Bus]:
 
 
 class Actor:
-    """Publishes random steps as far as the flow allows."""
+    """Publishes steps as far as the flow allows."""
 
     def __init__(self, bus: Bus) -> None:
         self.bus, self.index, self.episode = bus, 0, 0
-        self.limit, self.done, self.incarnation = 0, False, 0
+        self.limit, self.done = 0, False
         self.versions: list[int] = []
         self.metrics: list[pb.LearnerMetrics] = []
-        self._moved = threading.Event()
         self._steps = bus.publisher(STEP, robot="ground")
         bus.subscribe(FLOW, lambda sample: self._heed(sample.message()), robot="ground")
         bus.subscribe(WEIGHTS, lambda sample: self.versions.append(sample.message().version), robot="ground")
@@ -56,48 +54,34 @@ class Actor:
 
     def _heed(self, flow: pb.Flow) -> None:
         self.limit, self.done = max(self.limit, flow.limit["actor-0"]), flow.done
-        self._moved.set()
 
     def join(self, **fields: object) -> pb.JoinReply:
         values = {"robot": "ground", "actor": "actor-0", "layout": GROUND.learning_layout(), "index": self.index}
-        join = pb.Join(**(values | {"episode": self.episode} | fields))
-        deadline = time.monotonic() + 20.0
-        while True:  # the learner is still starting
-            try:
-                reply = pb.JoinReply.FromString(self.bus.ask(JOIN, join.SerializeToString(), 5.0, robot="ground"))
-                break
-            except (NoReply, Late):
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
+        join = pb.Join(**(values | {"episode": self.episode} | fields)).SerializeToString()
+
+        def asked() -> pb.JoinReply | None:
+            with suppress(NoReply, Late):
+                return pb.JoinReply.FromString(self.bus.ask(JOIN, join, 5.0, robot="ground"))
+            return None
+
+        reply = until(asked, "the learner has started")
         if not reply.HasField("error"):
             self._heed(reply.flow)
-            self.episode, self.incarnation = reply.episode, reply.flow.incarnation
+            self.episode = reply.episode
         return reply
 
     def drive(self, steps: int) -> None:
-        """Up to `steps` more, or the end of the run."""
-        last = self.index + steps
-        deadline = time.monotonic() + 30.0
-        step = 0
+        """Publish up to `steps` more in episodes of 20 steps, or up to the end of the run."""
+        last, step, seen, action = self.index + steps, 0, [0.1] * 26, GROUND.low()
         while self.index < last and not self.done:
-            assert time.monotonic() < deadline, "the flow dried up"
             if self.index >= self.limit:
-                self._moved.wait(0.5)
-                self._moved.clear()
+                until(lambda: self.index < self.limit or self.done, "the flow goes on")
                 continue
-            if step == 0:
-                generator = np.random.default_rng([7, self.episode])
             self.index += 1
-            message = pb.Step(robot="ground", actor="actor-0", episode=self.episode, step=step, index=self.index)
-            message.observation.extend(generator.uniform(-1, 1, 26))
-            message.next_observation.extend(generator.uniform(-1, 1, 26))
-            message.action.extend(generator.uniform(GROUND.low(), GROUND.high()))
-            message.proposed.extend(message.action)
-            message.truncated = step == 19
-            step += 1
-            if message.truncated:
-                self.episode, step = self.episode + 1, 0
-            self._steps.put(message)
+            place = {"robot": "ground", "actor": "actor-0", "episode": self.episode, "step": step, "index": self.index}
+            moved = {"observation": seen, "next_observation": seen, "action": action, "proposed": action}
+            self._steps.put(pb.Step(**place, **moved, truncated=step == 19))
+            self.episode, step = (self.episode + 1, 0) if step == 19 else (self.episode, step + 1)
 
 
 def start(bus: Bus, out: Path, learner: LearnerConfig = CONFIG, resume: bool = False) -> threading.Thread:
@@ -143,7 +127,7 @@ def test_stopped_and_resumed(bus, tmp_path, loops):
     first.join(20.0)
     second = start(bus, tmp_path, resume=True)
     reply = actor.join()
-    assert reply.flow.incarnation != before and reply.episode == actor.episode
+    assert reply.flow.incarnation != before and reply.episode == 7
     actor.drive(10**6)
     second.join(20.0)
     assert actor.metrics[-1].done and actor.metrics[-1].steps == 300

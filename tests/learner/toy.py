@@ -28,8 +28,8 @@ TOY = replace(
 TOY = with_task(TOY, replace(GROUND.task, lidar=None, observation=("position [m]", "goal [m]")))
 CONFIG = LearnerConfig(
     td3=TD3Config(hidden=(32, 32), batch=32, n_step=2, warmup=60, actor_rate=1e-3, critic_rate=1e-3, reward_scale=1.0),
-    capacity=500,
-    steps=600,
+    capacity=200,
+    steps=240,
     lockstep=True,
 )
 
