@@ -19,9 +19,12 @@ NOT_COMPILED = {"NUMBA_DISABLE_JIT": "1"}
 PARTS = ("messaging", "sim", "safety", "actors", "learner", "logs", "deploy", "robots", "policies")
 
 
-@pytest.mark.parametrize("name", brakeline.__all__)
-def test_every_public_name_can_be_imported(name):
-    assert getattr(brakeline, name) is not None
+def printed(code: str, *options: str, **more) -> str:
+    """Return what code prints in an interpreter of its own."""
+    words = [sys.executable, *options, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, **({"cwd": ROOT} | more))
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
 
 
 def test_the_table_of_names_is_complete():
@@ -32,33 +35,36 @@ def test_the_table_of_names_is_complete():
         _ = brakeline.SaftyClient
 
 
-def test_a_client_imports_no_simulator_and_no_solver():
-    heavy = ("mujoco", "torch", "proxsuite", "scipy", "gymnasium", "matplotlib")
-    code = (
-        "import sys; from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground'); "
-        f"print([name for name in {heavy} if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.strip() == "[]"
+CLIENT = "from brakeline import Obstacle, SafetyClient, robot_named; robot_named('ground')"
+LAUNCHER = "import brakeline.deploy.run.launcher"  # it starts with every run, and loads model sets only to check them
 
 
-def test_a_launcher_imports_no_simulator_and_no_compiled_kernels():
-    """It starts with every run, and loads model sets only to check them."""
-    heavy = ("mujoco", "torch", "proxsuite", "numba", "scipy", "matplotlib")
-    code = f"import sys, brakeline.deploy.run.launcher; print([name for name in {heavy} if name in sys.modules])"
-    imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert imported.stdout.strip() == "[]"
+@pytest.mark.parametrize(("code", "other"), [(CLIENT, "gymnasium"), (LAUNCHER, "numba")], ids=["client", "launcher"])
+def test_a_client_and_a_launcher_import_no_simulator_no_solver_and_no_compiled_kernels(code, other):
+    heavy = ("mujoco", "torch", "proxsuite", "scipy", "matplotlib", other)
+    assert printed(f"{code}; import sys; print([name for name in {heavy} if name in sys.modules])") == "[]"
+
+
+@pytest.mark.parametrize("code", ["import gymnasium, brakeline", "import brakeline.envs, gymnasium"])
+def test_an_import_registers_the_environments(code):
+    """In either order. `tests/sim/test_navigation_env.py` makes them by their names."""
+    names = {"brakeline/Ground-v0", "brakeline/Quadrotor-v0"}
+    assert printed(f"{code}; print({names} <= gymnasium.registry.keys())") == "True"
+
+
+def pip(*words: str) -> None:
+    """Run pip on the checkout, or skip the test where it cannot build."""
+    options = ["--quiet", "--no-deps", "--no-build-isolation"]
+    done = subprocess.run([sys.executable, "-m", "pip", *words, *options], check=False, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"nothing can be built here: {done.stderr.strip().splitlines()[-1]}")
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """Unpack a wheel in a folder outside the checkout."""
     folder = tmp_path_factory.mktemp("wheel")
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
-    words = [sys.executable, "-m", "pip", "wheel", *options, str(ROOT)]
-    built = subprocess.run(words, check=False, capture_output=True, text=True)
-    if built.returncode:
-        pytest.skip(f"no wheel can be built here: {built.stderr.strip().splitlines()[-1]}")
+    pip("wheel", "--wheel-dir", str(folder), str(ROOT))
     site = folder / "site"
     zipfile.ZipFile(next(folder.glob("brakeline-*.whl"))).extractall(site)
     return site
@@ -68,11 +74,7 @@ def wheel(tmp_path_factory):
 def editable(tmp_path_factory):
     """Install the checkout in editable mode in a folder of its own."""
     site = tmp_path_factory.mktemp("editable")
-    options = ["--quiet", "--no-deps", "--no-build-isolation", "--target", str(site), "--editable", str(ROOT)]
-    words = [sys.executable, "-m", "pip", "install", *options]
-    done = subprocess.run(words, check=False, capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"nothing can be installed here: {done.stderr.strip().splitlines()[-1]}")
+    pip("install", "--target", str(site), "--editable", str(ROOT))
     return site
 
 
@@ -100,31 +102,16 @@ def test_a_users_own_modules_do_not_shadow_ours(install, crowded, request):
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
     clean |= NOT_COMPILED
     # -S: first the install under test, then the packages that it needs.
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=crowded,
-        env=clean,
-    )
-    assert done.returncode == 0, done.stderr
-    assert Path(done.stdout.strip()).is_relative_to(site if install == "wheel" else ROOT)
-
-
-@pytest.mark.parametrize("install", ["wheel", "editable"])
-def test_nothing_but_brakeline_is_installed(install, request):
-    site = request.getfixturevalue(install)
+    ours = Path(printed(code, "-S", cwd=crowded, env=clean))
+    assert ours.is_relative_to(site if install == "wheel" else ROOT)
     names = {path.name.partition("-")[0] for path in site.iterdir() if not path.name.startswith(("__", "bin"))}
-    assert names == {"brakeline"}
+    assert names == {"brakeline"}, "nothing else is installed"
 
 
 def outside(wheel: Path, code: str) -> str:
     """Return what code prints that runs with the wheel alone, outside the checkout."""
     run = f"import sys; sys.path.insert(0, {str(wheel)!r}); {code}"
-    words, environment = [sys.executable, "-P", "-c", run], os.environ | NOT_COMPILED
-    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=wheel.parent, env=environment)
-    return done.stdout.strip()
+    return printed(run, "-P", cwd=wheel.parent, env=os.environ | NOT_COMPILED)
 
 
 def test_a_wheel_has_everything(wheel):
@@ -141,24 +128,22 @@ def test_a_wheel_has_everything(wheel):
     assert {p for p in tracked.stdout.split() if p.endswith(".py")} <= files, "a package is missing in pyproject.toml"
 
 
-def test_the_trained_policies_are_found_outside_the_checkout(wheel):
-    code = (
-        "from brakeline.deploy.policy_loading import policy_named; "
-        "from brakeline.messaging.task import robot_with_task; "
-        "[policy_named('trained', robot_with_task(n), 0) for n in ('ground', 'quadrotor')]; "
-        "policy_named('trained-by-scan', robot_with_task('ground'), 0); import brakeline; print(brakeline.__file__)"
-    )
-    assert Path(outside(wheel, code)).is_relative_to(wheel)
-
-
-def test_the_shipped_model_sets_filter_outside_the_checkout(wheel):
+def test_the_shipped_model_sets_and_policies_work_outside_the_checkout(wheel):
     """A fresh machine with nothing but the package decides, and refuses what hits a wall."""
-    code = (
-        "from brakeline import Filter, InProcess, Obstacle; import numpy as np; "
-        "kinds = []; "
-        "ask = lambda robot, state, action, near: InProcess(Filter.load(robot)).decide(state, action, near).kind; "
-        "kinds.append(ask('ground', np.zeros(5), [0.2, 0.0], [Obstacle('cylinder', (2.0, 0.0), (0.1,))])); "
-        "kinds.append(ask('ground', np.zeros(5), [0.2, 0.0], [Obstacle('cylinder', (0.23, 0.0), (0.1,))])); "
-        "kinds.append(Filter.load('quadrotor').robot.name); print(kinds)"
-    )
-    assert outside(wheel, code) in (f"['allowed', '{kind}', 'quadrotor']" for kind in ("adjusted", "failsafe"))
+    code = """
+import numpy as np
+import brakeline
+from brakeline import Filter, InProcess, Obstacle
+from brakeline.deploy.policy_loading import policy_named
+from brakeline.messaging.task import robot_with_task
+ask = InProcess(Filter.load("ground"))
+for x in (2.0, 0.23):
+    print(ask.decide(np.zeros(5), [0.2, 0.0], [Obstacle("cylinder", (x, 0.0), (0.1,))]).kind)
+print(Filter.load("quadrotor").robot.name)
+for policy, robot in (("trained", "ground"), ("trained", "quadrotor"), ("trained-by-scan", "ground")):
+    policy_named(policy, robot_with_task(robot), 0)
+print(brakeline.__file__)
+"""
+    far, near, robot, place = outside(wheel, code).split("\n")
+    assert far == "allowed" and near in ("adjusted", "failsafe") and robot == "quadrotor"
+    assert Path(place).is_relative_to(wheel)

@@ -50,15 +50,23 @@ def test_the_reference_shows_docstrings_and_help(site: Path) -> None:
         assert f'id="{command}"' in line and f"usage: brakeline {command} " in line and entry.summary in line, command
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the site was not searched")
-def test_the_search_finds_in_pages_that_are_opened_as_files(site: Path, tmp_path: Path) -> None:
-    with Page(tmp_path) as page:
-        page.open((site / "faq.html").as_uri() + "?q=cite")
-        page.until("document.querySelectorAll('.md-search-result__item').length > 0")
-        assert _asked_elsewhere(page, site.as_uri()) == []
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: no page of the site was opened")
+    with Page(tmp_path_factory.mktemp("browser")) as page:
+        yield page
 
 
 @pytest.fixture
+def page(browser: Page) -> Page:
+    """The browser, which has asked for nothing and has not complained yet."""
+    browser.requests.clear()
+    browser.complaints.clear()
+    return browser
+
+
+@pytest.fixture(scope="module")
 def served(site: Path) -> Iterator[str]:
     """The address of the site."""
     handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
@@ -69,38 +77,35 @@ def served(site: Path) -> Iterator[str]:
         server.shutdown()
 
 
-def _asked_elsewhere(page: Page, address: str) -> list[str]:
+def asked_elsewhere(page: Page, address: str) -> list[str]:
     return [url for url in page.requests if not url.startswith((address, "data:", "blob:"))]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the site was not searched")
-def test_the_search_finds_and_nothing_is_asked_of_others(served: str, tmp_path: Path) -> None:
-    with Page(tmp_path) as page:
-        page.open(served + "index.html?q=committed+plan")
-        page.until("document.querySelectorAll('.md-search-result__item').length > 0")
-        shown = page.value("document.querySelector('.md-search-result__list').textContent")
-        assert "Glossary" in shown
-        assert _asked_elsewhere(page, served) == []
+@pytest.mark.parametrize("opened_as", ["file", "served"])
+def test_the_search_finds_and_nothing_is_asked_of_others(
+    page: Page, site: Path, request: pytest.FixtureRequest, opened_as: str
+) -> None:
+    address = f"{site.as_uri()}/" if opened_as == "file" else request.getfixturevalue("served")
+    page.open(f"{address}index.html?q=committed+plan")
+    page.until("document.querySelectorAll('.md-search-result__item').length > 0")
+    assert "Glossary" in page.value("document.querySelector('.md-search-result__list').textContent")
+    assert asked_elsewhere(page, address) == []
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: no code was copied")
-def test_every_command_of_the_tutorial_can_be_copied(served: str, tmp_path: Path) -> None:
-    with Page(tmp_path) as page:
-        page.open(served + "tutorial_4_policy.html")
-        page.until("document.querySelectorAll('.md-clipboard, .md-code__button').length > 0")
-        blocks = page.value("document.querySelectorAll('article pre').length")
-        assert page.value("document.querySelectorAll('.md-clipboard, .md-code__button').length") == blocks
-        assert page.value("document.querySelectorAll('article pre .k').length") > 0, "Python is highlighted"
+def test_every_command_of_the_tutorial_can_be_copied(page: Page, served: str) -> None:
+    page.open(served + "tutorial_4_policy.html")
+    page.until("document.querySelectorAll('.md-clipboard, .md-code__button').length > 0")
+    blocks = page.value("document.querySelectorAll('article pre').length")
+    assert page.value("document.querySelectorAll('.md-clipboard, .md-code__button').length") == blocks
+    assert page.value("document.querySelectorAll('article pre .k').length") > 0, "Python is highlighted"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: no formula was drawn")
-def test_formulas_and_figures_are_drawn_and_nothing_is_asked_of_others(served: str, tmp_path: Path) -> None:
-    with Page(tmp_path) as page:
-        page.open(served + "method.html")
-        formulas = page.value("document.querySelectorAll('.arithmatex').length")
-        assert formulas > 50
-        page.until(f"document.querySelectorAll('.arithmatex .katex').length == {formulas}")
-        assert page.value("document.querySelectorAll('.katex-error').length") == 0
-        assert page.value("[...document.querySelectorAll('article img')].filter(i => !i.naturalWidth).length") == 0
-        assert page.complaints == []
-        assert _asked_elsewhere(page, served) == []
+def test_formulas_and_figures_are_drawn_and_nothing_is_asked_of_others(page: Page, served: str) -> None:
+    page.open(served + "method.html")
+    formulas = page.value("document.querySelectorAll('.arithmatex').length")
+    assert formulas > 50
+    page.until(f"document.querySelectorAll('.arithmatex .katex').length == {formulas}")
+    assert page.value("document.querySelectorAll('.katex-error').length") == 0
+    assert page.value("[...document.querySelectorAll('article img')].filter(i => !i.naturalWidth).length") == 0
+    assert page.complaints == []
+    assert asked_elsewhere(page, served) == []
