@@ -5,7 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,13 @@ import pytest
 
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_runs
 from brakeline.logs.report_page import write
+from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, TOPICS
-from tests.browser import Page, drawn
+from tests.browser import CHROMIUM, Page, drawn
 from tests.logs.sample_log import mixed
 from tests.waiting import until
 
@@ -87,6 +88,39 @@ def report(analysis: LogAnalysis, tmp_path_factory: pytest.TempPathFactory) -> t
     path = tmp_path_factory.mktemp("report") / "report.html"
     write(path, analysis.figures(), analysis.by_label())
     return path, json.loads(json.dumps(analysis.figures()))
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: no page was opened")
+    with Page(tmp_path_factory.mktemp("browser")) as page:
+        yield page
+
+
+@pytest.fixture
+def tab(browser: Page) -> Iterator[Page]:
+    """A page of a browser that other tests have used, without what they left there."""
+    browser.complaints.clear()
+    browser.requests.clear()
+    yield browser
+    browser.media()
+    browser.size(1280, 900)
+
+
+def show(tab: Page, report: Path) -> None:
+    """Open a report, and wait until it is drawn."""
+    tab.open(report.as_uri())
+    tab.until("document.documentElement.dataset.drawn === 'yes'")
+
+
+@contextmanager
+def watched(tab: Page, server: LivePageServer) -> Iterator[None]:
+    """Open the live page, and leave it again before its server ends."""
+    tab.open(server.url)
+    tab.until("document.body.dataset.drawn > 0")
+    yield
+    tab.call("Page.navigate", url="about:blank")
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """All figures equal those of an independent reader; several logs; memory that does not grow."""
 
-import itertools
 import json
 import re
 import tracemalloc
@@ -12,7 +11,7 @@ import pytest
 from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
 from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
-from brakeline.logs.log_analysis import AnalysisOptions, RunAnalysis, analyse_runs
+from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, by_run, find, open_log
@@ -20,6 +19,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
 
 Two = tuple[list[dict[str, Any]], dict[str, Any]]
+Messages = list[tuple[str, Any]]
 
 
 @pytest.fixture(scope="module")
@@ -27,28 +27,40 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return mixed(tmp_path_factory.mktemp("logs") / "mixed")
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_every_figure_agrees_with_a_count_by_another_reader(tmp_path: Path, seed: int) -> None:
-    folder = mixed(tmp_path, seed)
-    expected = counted(decoded(find(folder)))
-    figures = analyse(folder)
+@pytest.fixture(scope="module")
+def messages(log: Path) -> Messages:
+    """The log's messages by another reader, with those that are there twice."""
+    return decoded(find(log))
+
+
+@pytest.fixture(scope="module")
+def analysis(log: Path) -> LogAnalysis:
+    return analyse_runs(log, AnalysisOptions(pictures=True, episode=3))
+
+
+@pytest.fixture(scope="module")
+def figures(analysis: LogAnalysis) -> dict[str, Any]:
+    return analysis.figures()
+
+
+def test_every_figure_agrees_with_a_count_by_another_reader(figures: dict[str, Any], messages: Messages) -> None:
+    expected = counted(messages)
     agree({name: figures[name] for name in expected}, expected)
     lost = sum(topic["missing"] for topic in figures["topics"].values())
     twice = sum(topic["duplicates"] for topic in figures["topics"].values())
     assert lost > 20 and twice > 20 and figures["collisions"] > 5 and figures["no_decision"]["Late"] > 5
 
 
-def test_robots_and_actors_add_up(log: Path) -> None:
-    figures = analyse(log)
+def test_robots_and_actors_add_up(figures: dict[str, Any]) -> None:
     assert set(figures["robots"]) == {"ground", "quadrotor"}
     for part in (figures["robots"], figures["actors"]):
         for name in ("steps", "episodes", "goals", "collisions", "interventions"):
             assert sum(row[name] for row in part.values()) == figures[name], name
 
 
-def test_training_rates_are_those_of_the_steps_in_each_bin(log: Path) -> None:
-    steps = [m for key, m in once(decoded(find(log))) if key.startswith("step/ground")]
-    training = analyse(log)["training"]["ground"]
+def test_training_rates_are_those_of_the_steps_in_each_bin(figures: dict[str, Any], messages: Messages) -> None:
+    steps = [m for key, m in once(messages) if key.startswith("step/ground")]
+    training = figures["training"]["ground"]
     for row in training["bins"]:
         own = steps[row["until"] - row["steps"] : row["until"]]
         assert row["adjusted"] == pytest.approx(sum(s.decision == 2 and not s.fallback for s in own) / len(own))
@@ -56,8 +68,12 @@ def test_training_rates_are_those_of_the_steps_in_each_bin(log: Path) -> None:
         assert row["episodes"] == sum(s.terminated or s.truncated for s in own)
         assert row["closest"] == min(s.clearance for s in own)
     assert training["bins"][-1]["until"] == len(steps)
+    ended = [step for step in steps if step.terminated or step.truncated]
+    last = training["last"]
+    assert last["episodes"] == min(100, len(ended)) > 20
+    assert last["goals"] == pytest.approx(sum(step.goal for step in ended[-100:]) / last["episodes"])
     newest, behind = 0, []
-    for key, message in once(decoded(find(log))):
+    for key, message in once(messages):
         if key == "metrics/ground" or key.startswith("step/ground"):
             newest = max(newest, message.weights_version)
         if key.startswith("step/ground"):
@@ -66,8 +82,7 @@ def test_training_rates_are_those_of_the_steps_in_each_bin(log: Path) -> None:
     assert training["staleness"]["max"] == max(behind) > 0
 
 
-def test_a_resumed_run_is_one_run_and_its_pause_is_not_counted(log: Path) -> None:
-    figures = analyse(log)
+def test_a_resumed_run_is_one_run_and_its_pause_is_not_counted(figures: dict[str, Any]) -> None:
     assert [Path(path).name for path in figures["log"]] == ["run.mcap", "run_0001.mcap"]
     assert list(figures["runs"]) == ["mixed"]
     first, last = (figures["segments"][place][edge] for place, edge in ((0, "start"), (1, "end")))
@@ -110,14 +125,6 @@ def test_a_process_of_an_earlier_run_is_not_silent_in_a_later_one(two: Two) -> N
     assert {p["ended"] for p in both["processes"].values()} == {"in order", "alive at the end of the log"}
 
 
-def test_the_headline_is_about_the_last_episodes(log: Path) -> None:
-    steps = [step for key, step in once(decoded(find(log))) if key.startswith("step/ground")]
-    ended = [step for step in steps if step.terminated or step.truncated]
-    last = analyse(log)["training"]["ground"]["last"]
-    assert last["episodes"] == min(100, len(ended)) > 20
-    assert last["goals"] == pytest.approx(sum(step.goal for step in ended[-100:]) / last["episodes"])
-
-
 def test_names_of_runs() -> None:
     paths = ["a/run.mcap", "a/run_0001.mcap", "a/other.mcap", "b/run.mcap", "c/a/run.mcap"]
     runs = by_run([Path(path) for path in paths])
@@ -139,12 +146,16 @@ def test_missing_segments_and_damage_are_reported(tmp_path: Path) -> None:
     assert figures["topics"]["step/ground/actor-0"]["missing"] > 0
 
 
-def test_the_table_of_an_episode_has_the_recorded_values(log: Path) -> None:
-    figures = analyse_runs(log, AnalysisOptions(episode=3, actor="actor-1")).figures()
-    (detail,) = figures["episode_detail"]
-    messages = once(decoded(find(log)))
-    steps = [m for key, m in messages if key == "step/ground/actor-1" and m.episode == 3]
-    asked = {m.request.step: m for key, m in messages if key == "exchange/ground/actor-1" and m.request.episode == 3}
+def test_the_table_of_an_episode_has_the_recorded_values(
+    log: Path, figures: dict[str, Any], messages: Messages
+) -> None:
+    assert len(figures["episode_detail"]) == 3, "of every actor"
+    (detail,) = (detail for detail in figures["episode_detail"] if detail["actor"] == "actor-1")
+    options = AnalysisOptions(episode=3, actor="actor-1")
+    assert [row["actor"] for row in analyse_runs(log, options).figures()["episode_detail"]] == ["actor-1"]
+    steps = [m for key, m in once(messages) if key == "step/ground/actor-1" and m.episode == 3]
+    exchanges = [m for key, m in once(messages) if key == "exchange/ground/actor-1"]
+    asked = {m.request.step: m for m in exchanges if m.request.episode == 3}
     assert [row["step"] for row in detail["rows"]] == [step.step for step in steps]
     for row, step in zip(detail["rows"], steps, strict=True):
         assert (row["reward"], row["clearance"], row["action"]) == (step.reward, step.clearance, list(step.action))
@@ -152,13 +163,12 @@ def test_the_table_of_an_episode_has_the_recorded_values(log: Path) -> None:
             assert row["decide_ms"] == asked[step.step].reply.decision.time_ms
     assert detail["closest"] == min(step.clearance for step in steps) and detail["start"] == [0.0, 0.0]
     assert "actor-1, episode 3" in printed(show_episode(detail), 200)
-    assert len(analyse_runs(log, AnalysisOptions(episode=3)).figures()["episode_detail"]) == 3, "of every actor"
 
 
-def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
-    pictures = analyse_runs(log, AnalysisOptions(pictures=True)).by_label()["mixed"][1]
+def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Messages) -> None:
+    pictures = analysis.by_label()["mixed"][1]
     closest: dict[tuple[str, int, int], float] = {}
-    for key, step in once(decoded(find(log))):
+    for key, step in once(messages):
         if key.startswith("step/ground"):
             place = key.rsplit("/", 1)[1], step.header.run, step.episode
             closest[place] = min(closest.get(place, 1e9), step.clearance)
@@ -174,21 +184,21 @@ def test_the_nearest_misses_are_the_nearest(log: Path) -> None:
     json.dumps(pictures, allow_nan=False)
 
 
-def test_it_is_shown_whole(log: Path) -> None:
-    text = printed(show(analyse(log), verbose=True))
+def test_it_is_shown_whole(figures: dict[str, Any]) -> None:
+    text = printed(show(figures, verbose=True))
     words = ("closest approach", "network", "95 %:", "over training", "half-width", "bound_step 0.003", "primal_inf")
     assert not [word for word in words if word not in text]
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
-    """Five times the messages need little more memory, for new bins of sketches. For gigabytes of messages, run
+    """Three times the messages need little more memory, for new bins of sketches. For gigabytes of messages, run
     `python -m benchmarks logs-2gb`."""
     held = []
-    for name, rounds in (("short", 35), ("long", 175)):
+    for name, rounds in (("short", 26), ("long", 78)):
         writer = Writer(3, losses=0.0)
         for number in range(rounds):
             writer.episode("actor-0", number)
-            if number % 35 == 34:
+            if number % 26 == 25:
                 writer.write(tmp_path / name / "run.mcap")
         tracemalloc.start()
         analysis = analyse_runs(tmp_path / name, AnalysisOptions(pictures=True))
@@ -196,16 +206,14 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
         tracemalloc.stop()
         _, pictures = analysis.by_label()[name]
         assert len(pictures["galleries"]["ground"]["episodes"]) <= SPREAD + 8 + 8 + 4 + 1
-    assert held[1] - held[0] < 2**20
+    assert held[1] - held[0] < 0.4 * 2**20
 
 
 def test_bins_become_wider_instead_of_more() -> None:
     training, timeline = LearningCurve(), ProcessTimeline()
     for k in range(40_000):
-        step = pb.Step(
-            actor="a", episode=k // 100, step=k % 100, decision=pb.ADJUSTED, terminated=k % 100 == 99, goal=True
-        )
-        step.goal = step.terminated
+        step = pb.Step(actor="a", episode=k // 100, step=k % 100, decision=pb.ADJUSTED)
+        step.terminated = step.goal = k % 100 == 99
         training.step(step)
         timeline.step(BEGIN + k * SECOND)
     figures = training.figures()
@@ -258,7 +266,7 @@ def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path:
     numbers = [record.message.header.sequence for record in log if record.topic == "step"]
     assert total - 50 <= sum(1 for _ in open_log(path)) < total and numbers == sorted(numbers)
     (cut,) = log.cuts
-    assert cut.lost > 0 and "byte" in str(cut) and len(list(itertools.pairwise(numbers))) == len(numbers) - 1
+    assert cut.lost > 0 and "byte" in str(cut)
     assert log.segments[0].messages == sum(1 for _ in open_log(path))
 
 

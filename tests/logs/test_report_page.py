@@ -1,11 +1,14 @@
-"""The report in a real browser: it draws without errors or requests, with the values of `--json`."""
+"""The report in a real browser: it draws without errors or requests, with the values of `--json`, and saves figures."""
 
+import csv
+import io
 import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -14,8 +17,11 @@ from brakeline.logs.log_analysis import LogAnalysis, analyse_runs
 from brakeline.logs.report_page import embedded, names, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
+from tests.logs.conftest import show
 from tests.logs.sample_log import ABOUT, mixed
 
+Report = tuple[Path, dict[str, Any]]
+Compared = tuple[Path, list[dict[str, Any]]]
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
 
 
@@ -42,7 +48,7 @@ def looked_up(figures: dict[str, Any], name: str) -> Any:
     raise KeyError(name)
 
 
-def test_the_tables_have_the_values_of_json_without_a_script(report: tuple[Path, dict[str, Any]]) -> None:
+def test_the_tables_have_the_values_of_json_without_a_script(report: Report) -> None:
     path, figures = report
     cells = Cells()
     cells.feed(path.read_text())
@@ -83,7 +89,7 @@ def test_it_says_in_words_how_sure_a_model_set_is(analysis: LogAnalysis) -> None
     assert "up to 60 %, if steps are independent." in whole
 
 
-def test_it_needs_no_network_and_no_other_file(report: tuple[Path, dict[str, Any]]) -> None:
+def test_it_needs_no_network_and_no_other_file(report: Report) -> None:
     text = report[0].read_text()
     assert "default-src 'none'" in text
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", text)
@@ -93,7 +99,7 @@ def test_it_needs_no_network_and_no_other_file(report: tuple[Path, dict[str, Any
     assert len(text) < 3_000_000
 
 
-def test_it_loads_without_a_complaint_or_a_request(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
+def test_it_loads_without_a_complaint_or_a_request(page: Page, report: Report) -> None:
     assert page.complaints == []
     assert [url for url in page.requests if not url.startswith(("file:", "data:"))] == []
     assert page.value("document.title") == "Brakeline: <b>mixed"
@@ -115,7 +121,7 @@ def test_a_decision_is_explained_by_a_sentence_arrows_and_an_edge(page: Page) ->
     assert "→ proposed" in shown["legend"] and "half-space that blocks the proposal" in shown["legend"]
 
 
-def test_everything_is_drawn(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
+def test_everything_is_drawn(page: Page, report: Report) -> None:
     figures = report[1]
     drawn = page.value("""({
         rates: document.querySelectorAll('#rates .whisker svg').length,
@@ -141,10 +147,16 @@ def test_parts_of_the_latency_are_chosen(page: Page) -> None:
     assert page.complaints == []
 
 
-def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[Path, dict[str, Any]]) -> None:
-    assert page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))") == sorted(
-        page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))")
-    ), "worst first, of all robots"
+def facts_of(page: Page) -> dict[str, str]:
+    """Return what the picker says of the episode and step that it shows."""
+    pairs = "[...document.querySelectorAll('#episode-facts dd')].map(d => [d.dataset.fact, d.textContent])"
+    facts: dict[str, str] = page.value(f"Object.fromEntries({pairs})")
+    return facts
+
+
+def test_the_picker_shows_the_episode_that_was_picked(page: Page) -> None:
+    closest = page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))")
+    assert closest == sorted(closest), "worst first, of all robots"
     data = page.value("data[0].galleries")
     every = [
         episode
@@ -154,36 +166,67 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page, report: tuple[
     assert page.value("document.querySelectorAll('#picker option').length") == len(every) > 10
     assert len(every) == sum(gallery["total"] for gallery in data.values()), "every episode is reachable"
 
-    def facts() -> dict[str, str]:
-        pairs = "[...document.querySelectorAll('#episode-facts dd')].map(d => [d.dataset.fact, d.textContent])"
-        orders: dict[str, str] = page.value(f"Object.fromEntries({pairs})")
-        return orders
-
     for place in (0, len(every) - 1, 3):
         choose = f"s.value = {place}; s.dispatchEvent(new Event('change'))"
         page.value(f"(() => {{ const s = document.querySelector('#picker select'); {choose} }})()")
-        said, episode = facts(), every[place]
+        said, episode = facts_of(page), every[place]
         assert (said["actor"], said["episode"], said["outcome"]) == (
             episode["actor"], str(episode["episode"]), episode["outcome"]
         )  # fmt: skip
         assert said["steps"] == str(episode["steps"]) and said["step"] == str(episode["first"] + episode["closest_at"])
     slide = "r.value = 1; r.dispatchEvent(new Event('input'))"
     page.value(f"(() => {{ const r = document.querySelector('#picker input'); {slide} }})()")
-    assert facts()["step"] == str(every[3]["first"] + every[3].get("at", [0, 1])[1])
+    assert facts_of(page)["step"] == str(every[3]["first"] + every[3].get("at", [0, 1])[1])
     page.value("document.querySelector('#picker button[aria-label=\"next episode\"]').click()")
-    assert facts()["episode"] == str(every[4]["episode"])
+    assert facts_of(page)["episode"] == str(every[4]["episode"])
     page.value("document.querySelectorAll('#near .card button')[2].click()")
     orders = [(robot, order) for robot in data for order in data[robot]["near"]]
     missed = [next(e for e in data[robot]["episodes"] if e["order"] == order) for robot, order in orders]
     near = sorted(missed, key=lambda episode: episode["closest"])[2]
-    assert (facts()["actor"], facts()["episode"]) == (near["actor"], str(near["episode"]))
+    assert (facts_of(page)["actor"], facts_of(page)["episode"]) == (near["actor"], str(near["episode"]))
     page.value("document.querySelector('#picker .play').click()")
     page.until("document.querySelector('#picker .play').textContent === 'play'")
     assert page.complaints == []
 
 
+SAVE = "window.save = (name, kind, text) => { window.saved = { name, kind, text }; }"
+
+
+def test_figures_and_their_data_are_saved(page: Page, report: Report) -> None:
+    page.value(SAVE)
+    buttons = "document.querySelector('[data-robot=ground] [data-chart=\"goals reached\"] .saves').children"
+    page.value(f"{buttons}[0].click()")
+    saved = page.value("saved")
+    picture = ElementTree.fromstring(saved["text"])
+    assert saved["name"] == "goals-reached.svg" and picture.tag == "{http://www.w3.org/2000/svg}svg"
+    words = [text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")]
+    assert "goals reached [share of episodes]" in words and "steps of all actors of the run" in words
+    page.value(f"{buttons}[1].click()")
+    saved = page.value("saved")
+    rows = list(csv.DictReader(io.StringIO(saved["text"])))
+    bins = [row for row in report[1]["training"]["ground"]["bins"] if row["goals"] is not None]
+    raw = [float(row["raw"]) for row in rows if row["raw"]]
+    assert saved["kind"] == "text/csv" and raw == pytest.approx([row["goals"] for row in bins])
+
+
+def test_an_episode_is_saved_as_it_is_shown(page: Page) -> None:
+    page.value(SAVE)
+    page.value("document.querySelector('#picker .course .saves').children[1].click()")
+    saved = page.value("saved")
+    rows = list(csv.DictReader(io.StringIO(saved["text"])))
+    facts = facts_of(page)
+    assert saved["name"] == "an-episode-over-time.csv"
+    assert len(rows) == int(facts["steps"])
+    now = next(row for row in rows if row["step"] == facts["step"])
+    assert f"{100 * float(now['clearance_m']):.3g} cm" == facts["clearance"]
+    assert facts["decision"].startswith(now["decision"])
+    for box in ("#picker .course", "#picker .split > div"):
+        page.value(f"document.querySelector('{box} .saves').children[0].click()")
+        assert ElementTree.fromstring(page.value("saved.text")).tag == "{http://www.w3.org/2000/svg}svg"
+
+
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """The report of three runs, the last one of another method, and the figures of each in `analyse --json`."""
     folder = tmp_path_factory.mktemp("compared")
     logs = [mixed(folder / name, seed, 12 + 4 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
@@ -195,14 +238,12 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[
 
 
 @pytest.fixture(scope="module")
-def comparison(compared: tuple[Path, list[dict[str, Any]]], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def comparison(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     with drawn(compared[0], tmp_path_factory.mktemp("browser")) as page:
         yield page
 
 
-def test_runs_are_laid_over_each_other_and_never_joined(
-    comparison: Page, compared: tuple[Path, list[dict[str, Any]]]
-) -> None:
+def test_runs_are_laid_over_each_other_and_never_joined(comparison: Page, compared: Compared) -> None:
     page, runs = comparison, compared[1]
     assert page.value("data.map(run => run.training.ground.bins.at(-1).until)") == [
         run["robots"]["ground"]["steps"] for run in runs
@@ -268,14 +309,11 @@ def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared:
 
 
 def test_keys_step_through_an_episode(page: Page) -> None:
-    step = (
-        "Number([...document.querySelectorAll('#episode-facts dd')].find(d => d.dataset.fact === 'step').textContent)"
-    )
     page.value("document.activeElement.blur()")
     page.value("document.querySelector('#picker .plots svg') && pickers.get(0).viewer.step(0)")
-    first = page.value(step)
+    first = int(facts_of(page)["step"])
     page.press("ArrowRight")
-    assert page.value(step) == first + 1
+    assert int(facts_of(page)["step"]) == first + 1
     page.until(f"location.hash.endsWith('step={first + 1}')")
     number = "document.querySelector('#picker select').value"
     before = int(page.value(number))
@@ -291,7 +329,7 @@ def test_keys_step_through_an_episode(page: Page) -> None:
     assert not page.value("document.getElementById('keys').open")
     page.value("document.getElementById('episode-map').focus()")
     page.press("End")
-    assert page.value(step) > first
+    assert int(facts_of(page)["step"]) > first
 
 
 @pytest.mark.parametrize("which", ["page", "comparison"])
@@ -322,14 +360,14 @@ def test_on_paper_pages_are_full(page: Page) -> None:
     assert pages <= 9
 
 
-def test_an_empty_log_has_a_page_too(tmp_path: Path) -> None:
+def test_an_empty_log_has_a_page_too(tab: Page, tmp_path: Path) -> None:
     open_segment(tmp_path / "run.mcap", {"run": {"method": TRICKS}, "odd": {TRICKS: TRICKS}}).finish()
     assert main(["analyse", str(tmp_path / "run.mcap"), "--html", str(tmp_path / "a" / "page.html"), "--json"]) == 0
     text = (tmp_path / "a" / "page.html").read_text()
     assert "alert(1)</script>" not in text
-    with drawn(tmp_path / "a" / "page.html", tmp_path / "browser") as page:
-        assert page.complaints == []
-        assert page.value("document.querySelectorAll('.none').length") == 6
+    show(tab, tmp_path / "a" / "page.html")
+    assert tab.complaints == []
+    assert tab.value("document.querySelectorAll('.none').length") == 6
 
 
 def test_numbers_are_for_people() -> None:
@@ -367,25 +405,23 @@ def hostile(path: Path, analysis: LogAnalysis) -> Path:
     return path
 
 
-def test_no_text_of_a_log_runs_as_a_script(tmp_path: Path, analysis: LogAnalysis) -> None:
+def test_no_text_of_a_log_runs_as_a_script(tab: Page, tmp_path: Path, analysis: LogAnalysis) -> None:
     path = hostile(tmp_path / "hostile.html", analysis)
     bare = tmp_path / "bare.html"  # without its policy: the escaping alone must do
     bare.write_text(re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", path.read_text()))
     for place in (bare, path):
-        with drawn(place, tmp_path / place.stem) as page:
-            assert page.value("document.querySelectorAll('img, svg script, main script').length") == 0
-            assert page.value("document.title").startswith("Brakeline: ")
-            assert page.complaints == []
+        show(tab, place)
+        assert tab.value("document.querySelectorAll('img, svg script, main script').length") == 0
+        assert tab.value("document.title").startswith("Brakeline: ")
+        assert tab.complaints == []
 
 
-def test_its_policy_lets_no_script_or_style_run_but_its_own(
-    report: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_its_policy_lets_no_script_or_style_run_but_its_own(tab: Page, report: Report, tmp_path: Path) -> None:
     policy = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', report[0].read_text())
     assert len(policy) == 1 and "unsafe" not in policy[0] and policy[0].count("'sha256-") == 2
     injected = tmp_path / "injected.html"
     tricks = "<script>document.title = 'owned'</script><img src='data:,' onerror=\"document.title = 'owned'\">"
     injected.write_text(report[0].read_text().replace("<main>", f"<main>{tricks}", 1))
-    with drawn(injected, tmp_path / "browser") as page:
-        assert page.value("document.title").startswith("Brakeline: ")
-        assert any("Content Security Policy" in complaint for complaint in page.complaints)
+    show(tab, injected)
+    assert tab.value("document.title").startswith("Brakeline: ")
+    assert any("Content Security Policy" in complaint for complaint in tab.complaints)
