@@ -16,7 +16,7 @@ from brakeline.logs.watch.foxglove_server import FoxgloveServer
 from brakeline.logs.watch.live_page_server import FILES, LivePageServer
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def server() -> Iterator[LivePageServer]:
     with LivePageServer(Dashboard().view) as server:
         yield server
@@ -44,7 +44,6 @@ def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> N
     assert status == 200 and json.loads(body)["robots"] == []
 
 
-@pytest.mark.parametrize("path", ["/", "/view.json", "/events", "/page.js", "/viewer.js", "/report.html"])
 @pytest.mark.parametrize(
     "headers",
     [
@@ -54,9 +53,10 @@ def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> N
     ],
     ids=str,
 )
-def test_a_foreign_page_is_rejected(server: LivePageServer, path: str, headers: dict[str, str]) -> None:
-    status, body = asked(server, path, **headers)
-    assert status == 403 and b"robots" not in body
+def test_a_foreign_page_is_rejected(server: LivePageServer, headers: dict[str, str]) -> None:
+    for path in ("/", "/view.json", "/events", "/page.js", "/viewer.js", "/report.html"):
+        status, body = asked(server, path, **headers)
+        assert status == 403 and b"robots" not in body, path
 
 
 def test_the_live_page_has_every_script_that_it_names(server: LivePageServer) -> None:
@@ -65,7 +65,7 @@ def test_the_live_page_has_every_script_that_it_names(server: LivePageServer) ->
     assert all(asked(server, name)[0] == 200 for name in FILES)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def live() -> Iterator[FoxgloveServer]:
     with FoxgloveServer() as live:
         yield live

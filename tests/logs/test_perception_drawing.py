@@ -2,13 +2,13 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from brakeline.logs import foxglove_scene
-from brakeline.logs.episode_sampler import EpisodeSampler
-from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
+from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_runs
 from brakeline.logs.report_page import write
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
@@ -20,9 +20,10 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import scan_message, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
-from tests.browser import CHROMIUM, Page
+from tests.browser import Page
+from tests.logs.conftest import Say, show, watched
 from tests.logs.sample_log import Writer
-from tests.logs.test_foxglove import Say, Studio, episode, step
+from tests.logs.test_foxglove import Studio, episode, step
 from tests.robots import GROUND, QUADROTOR
 
 FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -84,71 +85,61 @@ def test_of_a_range_image_so_few_hits_are_drawn_that_a_recorder_keeps_up(say: Sa
     assert np.allclose(away, 5.0)
 
 
-def test_the_live_page_has_the_perceived_surroundings(say: Say) -> None:
-    board = Dashboard()
-    for actor, x in (("a", 0.0), ("b", 2.0)):
-        board.add(say(f"episode/ground/{actor}", episode(actor)))
-        board.add(say(f"exchange/ground/{actor}", fleet_exchange(actor, x=x)))
+@pytest.fixture
+def drive(say: Say, tmp_path: Path) -> tuple[Dashboard, LogAnalysis]:
+    """Three steps of a fleet of two, on the live page and in the analysis of their log."""
+    writer, board = Writer(losses=0.0), Dashboard()
+
+    def put(key: str, message: Any) -> None:
+        writer.put(key, message)
+        board.add(say(key, message))
+
+    for actor in ("a", "b"):
+        put(f"episode/ground/{actor}", episode(actor))
+    for k in range(3):
+        for actor, x in (("a", 0.0), ("b", 2.0)):
+            put(f"exchange/ground/{actor}", fleet_exchange(actor, k, x))
+            put(f"step/ground/{actor}", step(k, pb.RECOVERING, actor, clearance=0.5, truncated=k == 2))
+    return board, analyse_runs(writer.write(tmp_path / "run.mcap"), AnalysisOptions(pictures=True))
+
+
+def test_the_live_page_and_the_report_have_the_perceived_surroundings(drive: tuple[Dashboard, LogAnalysis]) -> None:
+    board, analysis = drive
     a, b = board.view()["robots"]
     assert np.allclose(a["promises"], [[2.0, 0.0, 0.25, 0.35]] * 3) and np.allclose(b["promises"][0][0], 0.0)
     assert a["around"]["movers"] == [[1.0, 0.5, 0.2]] and len(a["around"]["swept"][0]) == 3
     assert len(a["around"]["free"]) > 50 < len(a["around"]["hits"])
-
-
-def test_the_report_has_the_perceived_surroundings() -> None:
-    gallery = EpisodeSampler(GROUND)
-    for actor, x in (("a", 0.0), ("b", 2.0)):
-        source = gallery.source(actor)
-        source.about.append(episode(actor))
-        source.exchanges.extend(fleet_exchange(actor, k, x) for k in range(3))
-    for k in range(3):
-        for actor in ("a", "b"):
-            gallery.step(gallery.source(actor), step(k, pb.RECOVERING, actor, clearance=0.5))
-    gallery.close()
-    figures = gallery.figures()
-    pictures = {item["actor"]: item for item in figures["episodes"]}
-    tube = pictures["a"]["tubes"][1]
-    assert tube["promises"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and pictures["b"]["tubes"][1]["promises"][0][0] == 0.0
+    [(_, pictures)] = analysis.by_label().values()
+    shown = {item["actor"]: item for item in pictures["galleries"]["ground"]["episodes"]}
+    tube = shown["a"]["tubes"][1]
+    assert tube["promises"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and shown["b"]["tubes"][1]["promises"][0][0] == 0.0
     assert tube["movers"] == [[1.0, 0.5, 0.2]] and 20 < len(tube["free"]) <= 48 and len(tube["hits"]) <= 90
-    assert pictures["a"]["kinds"] == "eee"
+    assert shown["a"]["kinds"] == "eee"
 
 
 def drawn(page: Page, name: str, *places: str) -> int:
     return int(page.value(f"document.querySelectorAll('{', '.join(f'{place} .{name}' for place in places)}').length"))
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: the pages were not looked at")
-def test_browsers_draw_the_perceived_surroundings(say: Say, tmp_path: Path) -> None:
-    writer, board = Writer(losses=0.0), Dashboard()
-    for actor in ("a", "b"):
-        writer.put(f"episode/ground/{actor}", episode(actor))
-        board.add(say(f"episode/ground/{actor}", episode(actor)))
-    for k in range(3):
-        for actor, x in (("a", 0.0), ("b", 2.0)):
-            after = step(k, pb.RECOVERING, actor, clearance=0.5, truncated=k == 2)
-            for topic, message in (("exchange", fleet_exchange(actor, k, x)), ("step", after)):
-                writer.put(f"{topic}/ground/{actor}", message)
-                board.add(say(f"{topic}/ground/{actor}", message))
-    analysis = analyse_runs(writer.write(tmp_path / "run.mcap"), AnalysisOptions(pictures=True))
+def test_browsers_draw_the_perceived_surroundings(
+    drive: tuple[Dashboard, LogAnalysis], tab: Page, tmp_path: Path
+) -> None:
+    board, analysis = drive
     path = tmp_path / "report.html"
     write(path, analysis.figures(), analysis.by_label())
-    with LivePageServer(board.view) as server, Page(tmp_path / "profile") as page:
-        page.open(path.as_uri())
-        page.until("document.documentElement.dataset.drawn === 'yes'")
-        page.value("document.querySelector('#picker [data-view=above]').click()")
-        shown = {
-            name: drawn(page, name, "#picker", ".episode-map") for name in ("free", "hit", "mover", "swept", "promise")
-        }
-        assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "promise": 3}
-        legend = page.value("document.querySelector('#picker').textContent")
-        assert "reserved by other robots" in legend and "recovering" in legend
-        page.open(server.url)
-        page.until("document.body.dataset.drawn > 0")
-        page.value("document.querySelectorAll('[data-view=above]').forEach(button => button.click())")
-        page.until("document.querySelectorAll('.stage svg').length === 2")
-        shown = {name: drawn(page, name, "#robots") for name in ("free", "mover", "swept", "promise")}
+    show(tab, path)
+    tab.value("document.querySelector('#picker [data-view=above]').click()")
+    shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in ("free", "hit", "mover", "swept", "promise")}
+    assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "promise": 3}
+    legend = tab.value("document.querySelector('#picker').textContent")
+    assert "reserved by other robots" in legend and "recovering" in legend
+    with LivePageServer(board.view) as server, watched(tab, server):
+        tab.value("document.querySelectorAll('[data-view=above]').forEach(button => button.click())")
+        tab.until("document.querySelectorAll('.stage svg').length === 2")
+        shown = {name: drawn(tab, name, "#robots") for name in ("free", "mover", "swept", "promise")}
         assert shown == {"free": 4, "mover": 4, "swept": 12, "promise": 12}, "two robots, each on two maps"
-        assert drawn(page, "hit", "#robots") > 100
-        assert "--recovering" in page.value("document.querySelector('#robots').innerHTML"), "recovering has its color"
-        assert not re.findall("NaN|undefined|Infinity|null", page.value("document.querySelector('#robots').innerHTML"))
-        assert page.complaints == []
+        assert drawn(tab, "hit", "#robots") > 100
+        robots = tab.value("document.querySelector('#robots').innerHTML")
+        assert "--recovering" in robots, "recovering has its color"
+        assert not re.findall("NaN|undefined|Infinity|null", robots)
+        assert tab.complaints == []

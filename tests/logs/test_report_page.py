@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.logs.log_analysis import LogAnalysis, analyse_runs
+from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_runs
 from brakeline.logs.report_page import embedded, names, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
@@ -227,14 +227,15 @@ def test_an_episode_is_saved_as_it_is_shown(page: Page) -> None:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
-    """The report of three runs, the last one of another method, and the figures of each in `analyse --json`."""
+    """The report of three runs, the last one of another method, and the figures of each."""
     folder = tmp_path_factory.mktemp("compared")
     logs = [mixed(folder / name, seed, 12 + 4 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ABOUT, "run", ABOUT["run"] | {"method": "none", "certificate": ""})
         logs.append(mixed(folder / "c", 3, 10, later=5e4))
-    assert main(["analyse", *map(str, logs), "--html", str(folder / "page.html"), "--json"]) == 0
-    return folder / "page.html", [json.loads(json.dumps(analyse_runs(log).figures())) for log in logs]
+    analysis = analyse_runs(logs, AnalysisOptions(pictures=True))
+    write(folder / "page.html", analysis.figures(), analysis.by_label())
+    return folder / "page.html", [figures for figures, _ in analysis.by_label().values()]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 from matplotlib.figure import Figure
 
 from brakeline.deploy.run.episode_render import Film, Frame, _FilmAxes
@@ -15,7 +14,7 @@ from brakeline.logs.watch.dashboard import RobotPanel
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import robot_named
 from tests.arenas import staged_arena
-from tests.browser import CHROMIUM, Page
+from tests.browser import Page
 from tests.robots import GROUND
 
 ROOT = Path(__file__).parents[2]
@@ -33,28 +32,21 @@ def test_a_film_draws_the_body_at_its_heading() -> None:
     drawn = _FilmAxes(film, Figure().subplots())._body(AT, HEADING, "allowed")
     middles = np.array([circle.center for circle in drawn[:2]])
     assert np.allclose(middles, [(1.0, 2.11), (1.0, 1.89)]) and [c.radius for c in drawn[:2]] == [0.155, 0.155]
-    assert (
-        np.allclose(drawn[2].get_xydata()[1], (1.0, 2.0 + CAR.front_extent))
-        and pytest.approx(0.265) == CAR.front_extent
-    )
+    assert np.allclose(drawn[2].get_xydata()[1], (1.0, 2.265))
 
 
 def test_pages_have_all_discs_of_the_body() -> None:
-    assert body_discs(CAR) == [[0.11, 0.0, 0.155], [-0.11, 0.0, 0.155]] and body_discs(GROUND) == [
-        [0.0, 0.0, GROUND.footprint]
-    ]
+    assert body_discs(CAR) == [[0.11, 0.0, 0.155], [-0.11, 0.0, 0.155]]
+    assert body_discs(GROUND) == [[0.0, 0.0, GROUND.footprint]]
     assert RobotPanel(CAR, "actor-0").view()["discs"] == body_discs(CAR)
 
 
-def test_the_report_draws_the_body_at_its_heading(tmp_path: Path) -> None:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the report was not driven in a browser")
+def test_the_report_draws_the_body_at_its_heading(tab: Page, tmp_path: Path) -> None:
     script = "\n".join(map(viewer_file, ("svg.js", "plan.js")))
     (tmp_path / "page.html").write_text(f"<!doctype html><body></body><script>{script}</script>")
     view = "{ x: (a) => 100 * a, y: (a) => -100 * a, per: 100, pick: ([x, y]) => [x, y] }"
     episode = f"{{ pose: [1, 2, Math.PI / 2], footprint: {CAR.footprint}, discs: {body_discs(CAR)} }}"
-    with Page(tmp_path / "browser") as page:
-        page.open((tmp_path / "page.html").as_uri())
-        page.value(f"document.body.innerHTML = '<svg>' + bodyMarks({view}, {episode}).join('') + '</svg>'")
-        seen = "[...document.querySelectorAll('circle')].map((c) => ['cx', 'cy', 'r'].map((n) => +c.getAttribute(n)))"
-        assert np.allclose(page.value(seen), [(100, -211, 15.5), (100, -189, 15.5)])
+    tab.open((tmp_path / "page.html").as_uri())
+    tab.value(f"document.body.innerHTML = '<svg>' + bodyMarks({view}, {episode}).join('') + '</svg>'")
+    seen = "[...document.querySelectorAll('circle')].map((c) => ['cx', 'cy', 'r'].map((n) => +c.getAttribute(n)))"
+    assert np.allclose(tab.value(seen), [(100, -211, 15.5), (100, -189, 15.5)])

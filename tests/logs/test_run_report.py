@@ -1,6 +1,5 @@
 """The live page of a run that has ended links to the run's report, and stays as long as somebody has it open."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,10 @@ from brakeline.deploy.run.live_page import LivePage
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
 from brakeline.logs.watch.run_report import RunReport
-from tests.browser import CHROMIUM, Page
+from tests.browser import Page
+from tests.logs.conftest import watched
 from tests.logs.sample_log import mixed
+from tests.waiting import until
 
 HOSTILE = '"><img src=x onerror="document.title=\'owned\'"><script>document.title="owned"</script>\''
 RUNNING: dict[str, Any] = {"run": HOSTILE, "method": "ddpc", "arena": "default", "seed": "0", "steps": "10"}
@@ -35,9 +36,13 @@ def shown() -> dict[str, Any]:
     return Dashboard().view() | named | {"run": dict(RUNNING), "lines": [HOSTILE], "processes": {HOSTILE: "alive"}}
 
 
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return mixed(tmp_path_factory.mktemp("logs") / "run", episodes=4)
+
+
 @pytest.fixture
-def server(shown: dict[str, Any], tmp_path: Path) -> Iterator[LivePageServer]:
-    log = mixed(tmp_path / "run", episodes=6)
+def server(shown: dict[str, Any], log: Path) -> Iterator[LivePageServer]:
     with LivePageServer(lambda: shown, report=RunReport(log)) as server:
         yield server
 
@@ -62,22 +67,18 @@ def test_without_a_log_the_answer_says_what_to_do(shown: dict[str, Any], tmp_pat
 
 
 def test_the_page_links_to_the_report_which_draws_itself(
-    server: LivePageServer, shown: dict[str, Any], tmp_path: Path
+    tab: Page, server: LivePageServer, shown: dict[str, Any]
 ) -> None:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: the live page was not looked at")
-    with Page(tmp_path / "browser") as page:
-        page.open(server.url)
-        page.until("document.body.dataset.drawn > 0")
-        assert page.value("document.getElementById('report').hidden")
-        page.until("document.querySelectorAll('[data-history] svg').length === 4")
-        assert page.value("document.querySelectorAll('img, body script:not([src])').length") == 0, "names are text"
-        assert page.value("document.title") == "brakeline: live" and page.complaints == []
+    with watched(tab, server):
+        assert tab.value("document.getElementById('report').hidden")
+        tab.until("document.querySelectorAll('[data-history] svg').length === 4")
+        assert tab.value("document.querySelectorAll('img, body script:not([src])').length") == 0, "names are text"
+        assert tab.value("document.title") == "brakeline: live" and tab.complaints == []
         shown["run"]["outcome"] = "finished"
-        page.until("!document.getElementById('report').hidden")
-        page.open(page.value("document.querySelector('#report a').href"))
-        page.until("document.documentElement.dataset.drawn === 'yes'")
-        assert page.value("document.querySelectorAll('#near .card').length") > 0 and page.complaints == []
+        tab.until("!document.getElementById('report').hidden")
+        tab.open(tab.value("document.querySelector('#report a').href"))
+        tab.until("document.documentElement.dataset.drawn === 'yes'")
+        assert tab.value("document.querySelectorAll('#near .card').length") > 0 and tab.complaints == []
 
 
 def test_the_page_stays_while_it_is_open(server: LivePageServer, tmp_path: Path) -> None:
@@ -90,7 +91,4 @@ def test_the_page_stays_while_it_is_open(server: LivePageServer, tmp_path: Path)
     with urlopen(server.url + "events", timeout=10.0) as events:
         events.readline()
         assert page._open_pages() == 1
-    deadline = time.monotonic() + 10.0
-    while page._open_pages() and time.monotonic() < deadline:
-        pass
-    assert page._open_pages() == 0
+    until(lambda: page._open_pages() == 0, "the page is closed")
