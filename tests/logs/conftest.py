@@ -119,8 +119,10 @@ def watched(tab: Page, server: LivePageServer) -> Iterator[None]:
     """Open the live page, and leave it again before its server ends."""
     tab.open(server.url)
     tab.until("document.body.dataset.drawn > 0")
-    yield
-    tab.call("Page.navigate", url="about:blank")
+    try:
+        yield
+    finally:
+        tab.call("Page.navigate", url="about:blank")
 
 
 @pytest.fixture(scope="module")

@@ -25,17 +25,17 @@ def path(tmp_path: Path) -> Path:
     return log.path
 
 
-def test_a_whole_log_has_no_damage(path: Path) -> None:
-    log = open_log(path)
-    assert len(list(log)) == 30 and log.cuts == []
-    assert count_by_key(path) == {KEY: 30}
+def flipped(data: bytes, place: int, bit: int) -> bytes:
+    return data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :]
 
 
 def test_each_flipped_bit_is_named(path: Path) -> None:
+    log = open_log(path)
+    assert len(list(log)) == 30 and log.cuts == [], "whole, there is no damage"
     whole, random = path.read_bytes(), Random(0)
     places = [*(random.randrange(len(whole)) for _ in range(150)), whole.index(b"seed"), len(whole) - 1]
     for place in places:
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << random.randrange(8)]) + whole[place + 1 :])
+        path.write_bytes(flipped(whole, place, random.randrange(8)))
         log = open_log(path)
         try:
             read = len(list(log))
@@ -47,11 +47,11 @@ def test_each_flipped_bit_is_named(path: Path) -> None:
 
 
 def test_counts_by_the_summary_are_right_or_by_the_messages(path: Path) -> None:
+    assert count_by_key(path) == {KEY: 30}
     whole, random = path.read_bytes(), Random(1)
     summary = whole.rindex(b"seed")
     for _ in range(40):
-        place = random.randrange(summary, len(whole))
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << random.randrange(8)]) + whole[place + 1 :])
+        path.write_bytes(flipped(whole, random.randrange(summary, len(whole)), random.randrange(8)))
         assert count_by_key(path)[KEY] <= 30
     path.write_bytes(whole[:-1])
     assert count_by_key(path) == {KEY: 30}

@@ -61,39 +61,35 @@ def test_an_adjusted_action_is_described(robot, action, instead, normal, said):
 
 @pytest.mark.parametrize(
     ("heading", "normal", "where"),
-    [
-        (0.0, (1, 0), "to the wall ahead"),
-        (0.0, (0, 1), "to the wall on the left"),
-        (np.pi / 2, (1, 0), "to the wall on the right"),
-        (3.0, (1, 0), "to the wall behind"),
-    ],
+    [(0.0, (1, 0), "ahead"), (0.0, (0, 1), "on the left"), (1.6, (1, 0), "on the right"), (3.0, (1, 0), "behind")],
 )
 def test_where_it_is_is_told_as_the_robot_looks(heading, normal, where):
     decision = answered(GROUND, pb.FAILSAFE, (0.0, 0.0), "wall", normal=normal)
     said = sentence(GROUND, asked(GROUND, (0.25, 0.0), heading), decision)
-    assert (
-        said == f"braked along the plan verified before: as proposed, the stop would have come 3 cm too close {where}"
-    )
+    assert said == f"braked along the plan verified before: as proposed, {TOO_CLOSE} wall {where}"
 
 
-def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified():
-    def said(**more):
-        return sentence(GROUND, asked(GROUND, (0.25, 0.0)), answered(GROUND, **{"action": (0.0, 0.0), **more}))
+OTHER = [
+    ({"room": 0.004}, "within 4 mm of the cylinder ahead, too near to move from there"),
+    (
+        {"room": 0.004, "for_clearance": True},
+        "4 mm of the cylinder ahead: verified, but nearer than the clearance margin",
+    ),
+    (
+        {"by": "unseen", "room": -0.12, "after": 0.2, "normal": (0, 1)},
+        "it (after 0.2 s) would have come 12 cm too close to what is not seen on the left",
+    ),
+    ({"kind": pb.FAILSAFE, "by": "", "verified": False}, "braked, though no plan is verified: why not"),
+    ({"kind": pb.FAILSAFE, "by": "moving cylinder", "normal": ()}, "the moving cylinder is touched already"),
+    ({"kind": pb.RECOVERING, "by": ""}, "slowly backs out"),
+    ({"kind": pb.ALLOWED, "by": ""}, "as proposed"),
+]
 
-    assert "within 4 mm of the cylinder ahead, too near to move from there" in said(
-        kind=pb.ADJUSTED, room=0.004, normal=(1, 0)
-    )
-    assert said(kind=pb.ADJUSTED, room=0.004, normal=(1, 0), for_clearance=True) == (
-        "stopped: going on, the stop would have come within 4 mm of the cylinder ahead: verified, but nearer than the "
-        "clearance margin"
-    )
-    assert "it (after 0.2 s) would have come 12 cm too close to what is not seen on the left" in said(
-        kind=pb.ADJUSTED, by="unseen", room=-0.12, after=0.2, normal=(0, 1)
-    )
-    assert said(kind=pb.FAILSAFE, by="", verified=False) == "braked, though no plan is verified: why not"
-    assert "the moving cylinder is touched already" in said(kind=pb.FAILSAFE, by="moving cylinder")
-    assert said(kind=pb.RECOVERING, by="").startswith("slowly backs out")
-    assert said(kind=pb.ALLOWED, by="") == "as proposed"
+
+@pytest.mark.parametrize(("decided", "said"), OTHER)
+def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified(decided, said):
+    decision = answered(GROUND, **{"kind": pb.ADJUSTED, "action": (0.0, 0.0), "normal": (1, 0)} | decided)
+    assert said in sentence(GROUND, asked(GROUND, (0.25, 0.0)), decision)
 
 
 def test_arrows_go_where_the_inputs_go():

@@ -15,6 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from brakeline.deploy.commands.watch_command import show_received
+from brakeline.logs import segment
 from brakeline.logs.foxglove import MOST_ACTORS, FoxgloveConverter
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
@@ -47,38 +48,38 @@ HOSTILE = [
 ]
 
 
-def record(path: Path, samples: list[Sample], rejected: RejectedMessages | None = None) -> Recording:
+def record(path: Path, samples: list[Sample]) -> Recording:
     inbox = Inbox()
-    recording = Recording(LogSettings(path, derive=FoxgloveConverter().from_sample), inbox, rejected)
+    recording = Recording(LogSettings(path, derive=FoxgloveConverter().from_sample), inbox)
     for one in samples:
         inbox.put(one)
     recording.finish()
     return recording
 
 
-@pytest.mark.parametrize("hostile", HOSTILE, ids=lambda one: one.key)
-def test_the_recorder_stores_malformed_messages_and_goes_on(hostile: Sample, say: Say, tmp_path: Path) -> None:
+def test_the_recorder_stores_malformed_messages_and_goes_on(say: Say, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     good = say("log/a", pb.LogLine(text="after it"))
-    recording = record(path, [hostile, good])
-    assert recording.recorded.total() == 2
+    recording = record(path, [*HOSTILE, good])
+    assert recording.recorded.total() == len(HOSTILE) + 1
     log = open_log(path)
-    payloads = [payload for _, _, _, payload in log.rows()]
-    assert hostile.payload in payloads and good.payload in payloads and not log.cuts
+    payloads = {payload for _, _, _, payload in log.rows()}
+    assert {one.payload for one in (*HOSTILE, good)} <= payloads and not log.cuts
     decoded = open_log(path)
     assert [record.message.text for record in decoded if record.topic == "log"][-1] == "after it"
-    assert decoded.malformed >= (hostile.payload == b"\xff\xff")
+    assert decoded.malformed >= 1
 
 
-def test_66000_keys_do_not_end_a_recording(tmp_path: Path) -> None:
-    rejected = RejectedMessages()
-    samples = [sample(LOG, pb.LogLine(text="x"), source=f"a{number}") for number in range(66_000)]
-    inbox = Inbox()
-    for one in samples:
-        inbox.put(one)
+def test_more_keys_than_a_file_can_number_do_not_end_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert MOST_CHANNELS < 2**16
+    monkeypatch.setattr(segment, "MOST_CHANNELS", 50)
+    rejected, inbox = RejectedMessages(), Inbox()
+    for number in range(70):
+        inbox.put(sample(LOG, pb.LogLine(text="x"), f"a{number}"))
     Recording(LogSettings(tmp_path / "run.mcap"), inbox, rejected).finish()
-    assert sum(1 for _ in open_log(tmp_path).rows()) == MOST_CHANNELS
-    assert rejected.count > 0
+    assert sum(1 for _ in open_log(tmp_path).rows()) == 50 and rejected.count > 0
 
 
 @pytest.mark.parametrize(("received", "published"), [(-1, 0), (0, -1), (2**64, 0), (0, 2**64)])
@@ -98,18 +99,6 @@ MALFORMED = [
     ),
     sample(LOG, pb.LogLine(level="ERROR", text="\n")),
 ]
-
-
-@pytest.mark.parametrize("malformed", MALFORMED, ids=lambda one: one.key)
-def test_watch_skips_malformed_messages(malformed: Sample, say: Say) -> None:
-    board, rejected = Dashboard(), RejectedMessages()
-    step = pb.Step(robot="ground", actor="b", state=[1.0, 0.0, 0.0, 0.0, 0.0])
-    inbox = Inbox()
-    for sample in (malformed, say("step/ground/b", step)):
-        inbox.put(sample)
-    show_received(inbox, board, None, rejected)
-    shown = {robot["actor"]: robot for robot in json.loads(encode(board.view()))["robots"]}
-    assert shown["b"]["pose"] == [1.0, 0.0, 0.0]
 
 
 def test_watch_and_foxglove_go_on_after_hostile_messages(say: Say) -> None:

@@ -2,7 +2,6 @@
 
 import io
 
-import pytest
 from rich.console import Console
 
 from brakeline.logs.stacking_table import StackingTable
@@ -18,19 +17,12 @@ def printed(**console):
     return file.getvalue()
 
 
-def test_a_table_in_a_file_has_its_full_width(monkeypatch):
+def test_a_table_has_its_full_width_in_a_file_and_is_stacked_where_less_is_allowed(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     (row,) = (line for line in printed().splitlines() if CELLS[0] in line)
     assert all(cell in row for cell in CELLS)
-
-
-@pytest.mark.parametrize("width", [40, 80])
-def test_a_table_wider_than_the_terminal_is_stacked(width):
-    text = printed(force_terminal=True, width=width, no_color=True)
-    assert "column 5:" in text
-    assert max(map(len, text.splitlines())) < width + 40  # and colours
-
-
-def test_the_variable_columns_limits_the_width_of_a_file(monkeypatch):
+    for width in (40, 80):
+        text = printed(force_terminal=True, width=width, no_color=True)
+        assert "column 5:" in text and max(map(len, text.splitlines())) < width + 40  # and colours
     monkeypatch.setenv("COLUMNS", "80")
     assert "column 5:" in printed() and "not short" in printed().replace("\n", " ")
