@@ -1,5 +1,6 @@
 """A decision in a sentence: what was done, why, and where it was, for robots of several kinds."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -73,23 +74,24 @@ OTHER = [
     ({"room": 0.004}, "within 4 mm of the cylinder ahead, too near to move from there"),
     (
         {"room": 0.004, "for_clearance": True},
-        "4 mm of the cylinder ahead: verified, but nearer than the clearance margin",
+        "^stopped: going on, the stop would have come within 4 mm of the cylinder ahead: verified, but nearer than the "
+        "clearance margin$",
     ),
     (
         {"by": "unseen", "room": -0.12, "after": 0.2, "normal": (0, 1)},
-        "it (after 0.2 s) would have come 12 cm too close to what is not seen on the left",
+        r"it \(after 0.2 s\) would have come 12 cm too close to what is not seen on the left",
     ),
-    ({"kind": pb.FAILSAFE, "by": "", "verified": False}, "braked, though no plan is verified: why not"),
+    ({"kind": pb.FAILSAFE, "by": "", "verified": False}, "^braked, though no plan is verified: why not$"),
     ({"kind": pb.FAILSAFE, "by": "moving cylinder", "normal": ()}, "the moving cylinder is touched already"),
-    ({"kind": pb.RECOVERING, "by": ""}, "slowly backs out"),
-    ({"kind": pb.ALLOWED, "by": ""}, "as proposed"),
+    ({"kind": pb.RECOVERING, "by": ""}, "^slowly backs out"),
+    ({"kind": pb.ALLOWED, "by": ""}, "^as proposed$"),
 ]
 
 
 @pytest.mark.parametrize(("decided", "said"), OTHER)
 def test_what_is_near_but_not_too_near_what_is_not_seen_and_what_is_unverified(decided, said):
     decision = answered(GROUND, **{"kind": pb.ADJUSTED, "action": (0.0, 0.0), "normal": (1, 0)} | decided)
-    assert said in sentence(GROUND, asked(GROUND, (0.25, 0.0)), decision)
+    assert re.search(said, sentence(GROUND, asked(GROUND, (0.25, 0.0)), decision))
 
 
 def test_arrows_go_where_the_inputs_go():

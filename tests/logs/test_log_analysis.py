@@ -3,6 +3,7 @@
 import json
 import re
 import tracemalloc
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -280,20 +281,25 @@ def test_console_output_is_complete_at_any_width(two: Two, columns: int) -> None
     assert str(both["goals"]) not in re.findall(r"(?m)^goals +(\d+)", shown), "several runs are not pooled"
 
 
-def test_steps_after_a_gap_are_in_the_curves(tmp_path: Path) -> None:
-    """A recorder that was cut off stores steps before the learner's message that permits them."""
+def test_steps_after_a_gap_count_once_the_learners_permission_is_known(tmp_path: Path) -> None:
+    """A recorder that was killed hears the actor before it hears the learner; what nobody permits never counts."""
     writer = Writer(losses=0.0)
 
-    def learner(limit: int) -> None:
+    def add(limit: int, indices: Iterable[int]) -> dict[str, Any]:
+        """Add a learner's message and steps; return the figures of the log so far."""
         writer.put("metrics/ground", pb.LearnerMetrics(robot="ground", limit={"actor-0": limit}))
+        for index in indices:
+            step = pb.Step(robot="ground", actor="actor-0", episode=1, step=index, index=index, state=[0.1] * 5)
+            step.decision = pb.ADJUSTED
+            writer.put("step/ground/actor-0", step)
+        writer.write(tmp_path / "run.mcap")
+        figures = RunAnalysis("gap", Log(find(tmp_path)), AnalysisOptions(pictures=True)).figures()
+        assert figures["steps"] == sum(row["steps"] for row in figures["training"]["ground"]["bins"])
+        return figures
 
-    learner(20)
-    for index in (1, 2, *range(4001, 4006)):
-        step = pb.Step(robot="ground", actor="actor-0", episode=1, step=index, index=index, state=[0.1] * 5)
-        step.decision = pb.ADJUSTED
-        writer.put("step/ground/actor-0", step)
-    learner(4010)
-    writer.write(tmp_path / "run.mcap")
-    run = RunAnalysis("gap", Log([tmp_path / "run.mcap"]), AnalysisOptions(pictures=True))
-    figures = run.figures()
-    assert figures["steps"] == 7 == sum(row["steps"] for row in figures["training"]["ground"]["bins"])
+    figures = add(20, (1, 2, 3, *range(4036, 4046)))
+    assert (figures["steps"], figures["refused"]) == (3, 10)
+    figures = add(4050, (4046, 4046, *range(9_000, 9_100)))
+    assert (figures["steps"], figures["refused"]) == (14, 101)
+    figures = add(4060, ())
+    assert (figures["steps"], figures["refused"]) == (14, 101)

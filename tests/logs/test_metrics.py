@@ -1,21 +1,16 @@
 """Figures equal counts made by hand. Those of a whole log: `test_log_analysis.py`, by another reader."""
 
 import itertools
-import json
 import math
 import random
 from pathlib import Path
 
-import pytest
-
 from brakeline.logs.decision_stats import DecisionStats, merge_decisions
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
-from brakeline.logs.figure_tables import analyse, for_clearance, show
+from brakeline.logs.figure_tables import for_clearance, show
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.metrics import Metrics
-from brakeline.logs.recorder import entry
 from brakeline.logs.run_plots import draw
-from brakeline.logs.segment import open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import LOG
@@ -86,28 +81,21 @@ def test_a_listener_of_few_topics_misses_only_these(say: Say) -> None:
     assert "step/ground/a" not in metrics.topics()
 
 
-def test_processes_learners_and_round_trips(say: Say) -> None:
+def test_processes_and_learners(say: Say) -> None:
     metrics = Metrics()
     for sample in (
         say("health/a", pb.Health(process="a", figures={"rate": 1.0}), run=1),
         say("health/a", pb.Health(process="a", notes={"model": "v2"}, last=True), run=2),
         say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=5)),
         say("metrics/ground", pb.LearnerMetrics(robot="ground", updates=9, critic_loss=0.5, updates_per_s=100.0)),
-        say("exchange/ground/a", pb.Exchange(round_trip_ms=1.0)),
-        say("exchange/ground/a", pb.Exchange(request=pb.Request(action=[float("nan"), 0.0]), round_trip_ms=3.0)),
-        say("exchange/ground/a", pb.Exchange(failure="Late: no answer within 60 ms")),
+        say("exchange/ground/a", pb.Exchange(request=pb.Request(action=[math.nan, 0.0]), round_trip_ms=3.0)),
     ):
         put(metrics, sample)
     figures = metrics.figures()
-    process = figures["processes"]["a"]
+    process, learner = figures["processes"]["a"], figures["learners"]["ground"]
     assert (process["starts"], process["alive"], process["notes"]) == (2, False, {"model": "v2"})
-    assert figures["learners"]["ground"]["updates"] == 9
-    assert figures["learners"]["ground"]["critic_loss"] == 0.5
-    assert figures["round_trip_ms"]["p50"] == pytest.approx(1.0, rel=0.005)
-    assert figures["round_trip_ms"]["mean"] == 2.0
-    assert figures["no_decision"] == {"Late": 1}
-    assert figures["not_finite"] == 1
-    assert figures["seconds"] == 6.0
+    assert (learner["updates"], learner["critic_loss"]) == (9, 0.5)
+    assert figures["not_finite"] == 1 and figures["seconds"] == 4.0
 
 
 def run_of_two_actors(say: Say) -> dict[str, list[Sample]]:
@@ -132,26 +120,6 @@ def test_the_figures_do_not_depend_on_how_actors_are_interleaved(say: Say) -> No
     assert one.figures() == two.figures()
 
 
-def test_analyse_and_a_live_listener_compute_the_same_figures(tmp_path: Path, say: Say) -> None:
-    samples = run_of_two_actors(say)
-    live = Metrics()
-    about = {"method": "ddpc", "certificate": "residual", "arena": "default", "seed": "7"}
-    segment = open_segment(tmp_path / "run.mcap", {"run": about})
-    for sample in samples["a"] + samples["b"]:
-        put(live, sample)
-        segment.save([entry(sample)])
-    segment.finish()
-    figures = analyse(tmp_path)
-    assert {name: figures[name] for name in live.figures()} == live.figures()
-    assert [figures[name] for name in ("method", "policy", "seed")] == ["ddpc", None, 7]
-    assert figures["cuts"] == [] and figures["malformed"] == 0
-    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
-    assert math.isfinite(figures["steps_per_s"])
-    text = printed(show(figures), 140)
-    for expected in ("280", "method ddpc, certificate residual", "step/ground/a", "adjusted"):
-        assert expected in text
-
-
 def test_learning_curves_are_drawn(tmp_path: Path, say: Say) -> None:
     training = LearningCurve()
     for step in some_steps() * 20:
@@ -166,27 +134,3 @@ def test_times_that_are_none_warn_nobody() -> None:
     decision = pb.Decision(kind=pb.ALLOWED, queue_ms=math.inf, time_ms=math.inf)
     decisions.exchange(pb.Exchange(round_trip_ms=math.inf, reply=pb.Reply(decision=decision)))
     assert merge_decisions([decisions]).figures()["latency_ms"]["allowed"]["network"] is None
-
-
-def test_steps_after_a_gap_of_the_log_count_once_the_learners_permission_is_known() -> None:
-    """A recorder that was killed hears the actor before it hears the learner; what nobody permits never counts."""
-    metrics = Metrics()
-
-    def step(index: int) -> None:
-        message = pb.Step(robot="ground", actor="actor-0", episode=1, step=index, index=index)
-        metrics.add("step/ground/actor-0", message)
-
-    def learner(limit: int) -> None:
-        metrics.add("learner/ground", pb.LearnerMetrics(robot="ground", limit={"actor-0": limit}))
-
-    learner(20)
-    for index in (1, 2, 3, *range(4036, 4046)):
-        step(index)
-    assert (metrics.figures()["steps"], metrics.figures()["refused"]) == (3, 10)
-    learner(4050)
-    assert (metrics.figures()["steps"], metrics.figures()["refused"]) == (13, 0)
-    for index in (4046, 4046, *range(9_000, 15_000)):
-        step(index)
-    learner(4060)
-    figures = metrics.figures()
-    assert (figures["steps"], figures["refused"]) == (14, 6001)
