@@ -18,9 +18,8 @@ GAMMA = 0.9
 
 def move(episode: int, step: int, reward: float, terminated: bool = False, truncated: bool = False) -> ActorStep:
     name = np.array([episode, step], np.float32)  # a vector that says which step it is of
-    return ActorStep(
-        episode, step, name, name, name, reward, 0.0, name + np.array([0, 1], np.float32), terminated, truncated
-    )
+    after = name + np.array([0, 1], np.float32)
+    return ActorStep(episode, step, name, name, name, reward, 0.0, after, terminated, truncated)
 
 
 @given(st.lists(st.integers(0, 30)))
@@ -97,10 +96,7 @@ def expected_transitions(arrived: list[ActorStep], n: int) -> list[Transition]:
 
 
 def comparable(transitions: list[Transition]) -> list[tuple]:
-    return sorted(
-        (*t.observation.tolist(), round(t.reward, 9), round(t.discount, 12), *t.next_observation.tolist())
-        for t in transitions
-    )
+    return sorted((*t.observation, round(t.reward, 9), round(t.discount, 12), *t.next_observation) for t in transitions)
 
 
 @given(episodes(), st.integers(1, 4), st.booleans())
@@ -128,30 +124,25 @@ def test_actors_do_not_mix():
 
 def test_a_straggler_stands_for_itself():
     windows = NStepWindows(3, GAMMA)
-    windows.push("a", move(0, 0, 1.0))
-    (cut,) = windows.push("a", move(0, 2, 3.0))
-    (late,) = windows.push("a", move(0, 1, 2.0))
-    assert (cut.reward, cut.discount) == (1.0, GAMMA)
-    assert (late.reward, late.discount) == (2.0, GAMMA)
+    closed = [t for number in (0, 2, 1) for t in windows.push("a", move(0, number, 1.0 + number))]
+    assert [(t.reward, t.discount) for t in closed] == [(1.0, GAMMA), (2.0, GAMMA)]
 
 
 def transition(number: float) -> Transition:
-    return Transition(
-        np.full(3, number, np.float32), np.full(1, -number, np.float32), number, 0.5, np.ones(3, np.float32)
-    )
+    seen, action = np.full(3, number, np.float32), np.full(1, -number, np.float32)
+    return Transition(seen, action, number, 0.5, np.ones(3, np.float32))
 
 
 @given(st.integers(1, 12), st.integers(1, 40))
 def test_replay_holds_the_newest_also_when_restored(capacity, count):
     replay, restored, batch = ReplayBuffer(capacity, 3, 1), ReplayBuffer(capacity, 3, 1), Batch(256, 3, 1)
-    for number in range(count):
-        if number == count - 1:
-            restored.restore(replay.state())
-            restored.insert(transition(number))
+    for number in range(count - 1):
         replay.insert(transition(number))
-    replay.sample(np.random.default_rng(0), batch)
+    restored.restore(replay.state())
     again = Batch(256, 3, 1)
-    restored.sample(np.random.default_rng(0), again)
+    for buffer, sampled in ((replay, batch), (restored, again)):
+        buffer.insert(transition(count - 1))
+        buffer.sample(np.random.default_rng(0), sampled)
     assert all((a == b).all() for a, b in zip(batch.arrays, again.arrays, strict=True))
     assert len(replay) == min(capacity, count)
     stored = set(range(max(0, count - capacity), count))
@@ -185,12 +176,7 @@ def test_a_corrected_step_is_two_lessons():
     moves = [ActorStep(0, i, ends[0], ends[0], ends[1], 1.0, 0.25, ends[1], False, i == 1) for i in range(2)]
     windows = NStepWindows(2, 0.5, "both")
     first = windows.push("a", moves[0]) + windows.push("a", moves[1])
-    assert [(t.action[0], t.reward) for t in first] == [
-        (0.0, 1.0 + 0.5 * 0.75),
-        (1.0, 0.75 + 0.5 * 0.75),
-        (0.0, 1.0),
-        (1.0, 0.75),
-    ]
+    assert [(*t.action, t.reward) for t in first] == [(0.0, 1.375), (1.0, 1.125), (0.0, 1.0), (1.0, 0.75)]
     single = NStepWindows(1, 0.5, "executed").push("a", moves[0])
     assert [(t.action[0], t.reward) for t in single] == [(0.0, 0.75)]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,41 +31,38 @@ CONFIG = LearnerConfig(
     steps=240,
     lockstep=True,
 )
+NAME, LENGTH = "actor-0", 20  # of the actor, and of its episodes [steps]
 
 
 @dataclass
 class ToyActor:
     """A point that is pushed along a line, 1 m/s downstream all the time, and shall stay at a goal.
 
-    Episode e draws from SeedSequence(seed, actor, e) and from nothing else, as the real actors' do.
+    Each episode draws from its own number and from nothing else, as the real actors' do.
     """
 
     learner: Learner
-    name: str = "actor-0"
-    seed: int = 5
     index: int = 0
     episode: int = 0
     rewards: list[float] = field(default_factory=list)  # of the episodes, per step
 
     def join(self) -> pb.JoinReply:
-        reply = self.learner.join(
-            pb.Join(robot="toy", actor=self.name, layout=TOY.learning_layout(), index=self.index, episode=self.episode)
-        )
+        place = {"index": self.index, "episode": self.episode}
+        reply = self.learner.join(pb.Join(robot="toy", actor=NAME, layout=TOY.learning_layout(), **place))
         self.episode = reply.episode
         return reply
 
-    def play(self, give_way: Callable[[], None], length: int = 20) -> bool:
-        """One episode; `give_way` lets the learner do its part. False: the run is over."""
-        key = [self.seed, int(self.name[-1]), self.episode]
-        generator = np.random.default_rng(np.random.SeedSequence(key))
+    def play(self) -> bool:
+        """One episode; before each step, the learner does its part. False: the run is over."""
+        generator = np.random.default_rng([5, self.episode])
         position, goal = generator.uniform(-1, 1, 2)
         total = 0.0
-        for number in range(length):
-            give_way()
+        for number in range(LENGTH):
+            settle(self.learner)
             flow = self.learner.flow()
             if flow.done:
                 return False
-            assert flow.limit[self.name] > self.index
+            assert flow.limit[NAME] > self.index
             message = self.learner.weights()
             assert message.version == flow.weights_version
             policy = policy_weights.decode(message.file, TOY)
@@ -76,23 +72,13 @@ class ToyActor:
             reward = -abs(position - goal)
             total += reward
             self.index += 1
-            step = pb.Step(
-                robot="toy",
-                actor=self.name,
-                episode=self.episode,
-                step=number,
-                index=self.index,
-                observation=before,
-                proposed=action,
-                action=action,
-                next_observation=[position, goal],
-                reward=reward + 0.5,
-                penalty=0.5,
-                truncated=number == length - 1,
-                weights_version=flow.weights_version,
-            )
+            step = pb.Step(robot="toy", actor=NAME, episode=self.episode, step=number, index=self.index)
+            step.observation[:], step.next_observation[:] = before, [position, goal]
+            step.proposed[:] = step.action[:] = action
+            step.reward, step.penalty = reward + 0.5, 0.5
+            step.truncated, step.weights_version = number == LENGTH - 1, flow.weights_version
             self.learner.insert(step)
-        self.rewards.append(total / length)
+        self.rewards.append(total / LENGTH)
         self.episode += 1
         return True
 
@@ -108,6 +94,6 @@ def settle(learner: Learner) -> None:
 def run(learner: Learner, actor: ToyActor, episodes: int = 10**6) -> None:
     """`episodes` of them, or up to the end of the run."""
     for _ in range(episodes):
-        if not actor.play(lambda: settle(learner)):
+        if not actor.play():
             return
     settle(learner)

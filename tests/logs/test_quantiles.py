@@ -17,10 +17,10 @@ VALUES = st.lists(st.floats(-1e6, 1e6).filter(lambda x: x == 0.0 or abs(x) > 1e-
 
 
 def filled(values: list[float]) -> QuantileSketch:
-    histogram = QuantileSketch()
+    sketch = QuantileSketch()
     for value in values:
-        histogram.add(value)
-    return histogram
+        sketch.add(value)
+    return sketch
 
 
 @given(VALUES, st.floats(0.0, 100.0))
@@ -95,10 +95,11 @@ def test_the_poisson_interval_is_garwoods(count: int, of: int) -> None:
 
 
 def test_without_a_trial_there_is_no_interval() -> None:
-    assert clopper_pearson(0, 0) is None and poisson(0, 0) is None and ClusteredProportion().interval() is None
-    alone = ClusteredProportion()
-    alone.add(3, 10)
-    assert alone.interval() is None
+    assert clopper_pearson(0, 0) is None and poisson(0, 0) is None
+    clustered = ClusteredProportion()
+    assert clustered.interval() is None
+    clustered.add(3, 10)
+    assert clustered.interval() is None
 
 
 def test_intervals_by_episode_cover_the_true_rate_and_intervals_by_step_do_not() -> None:
