@@ -148,9 +148,9 @@ def test_what_cannot_start_is_an_error(bus, tmp_path):
 
 def test_unwritable_checkpoints_do_not_end_the_run(bus, tmp_path):
     (tmp_path / checkpoint.CHECKPOINT).write_text("a file where a folder belongs")
-    thread, actor = start(bus, tmp_path), Actor(bus)
+    thread, actor = start(bus, tmp_path, replace(CONFIG, steps=120, checkpoint_every=40)), Actor(bus)
     actor.join()
     actor.drive(10**6)
     thread.join(20.0)
-    assert actor.metrics[-1].steps == 300
+    assert actor.metrics[-1].steps == 120
     assert MLP.load(tmp_path / POLICY).version == actor.metrics[-1].weights_version
