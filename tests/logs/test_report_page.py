@@ -25,20 +25,19 @@ Compared = tuple[Path, list[dict[str, Any]]]
 TRICKS = "</script><script>alert(1)</script><!-- \u2028"
 
 
-def looked_up(figures: dict[str, Any], name: str) -> Any:
-    """Return the figure with a dotted name; keys may contain dots and slashes."""
-    if name in figures:
-        return figures[name]
-    for key in figures:
-        if name.startswith(f"{key}.") and isinstance(figures[key], dict):
-            return looked_up(figures[key], name[len(key) + 1 :])
-    raise KeyError(name)
+def flattened(figures: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield figures by their dotted names."""
+    for name, value in figures.items():
+        yield prefix + name, value
+        if isinstance(value, dict):
+            yield from flattened(value, f"{prefix}{name}.")
 
 
 def test_the_tables_have_the_values_of_json_without_a_script(report: Report) -> None:
     path, figures = report
     shown = re.findall(r'data-figure="([^"]*)"\s+data-value="([^"]*)"', path.read_text())
     values = {unescape(name): json.loads(unescape(value)) for name, value in shown}
+    flat = dict(flattened(figures))
     containment = {"violations.count": "violations", "violations.of": "steps"}
     for name, value in values.items():
         rate, _, part = name.partition(".")
@@ -47,7 +46,7 @@ def test_the_tables_have_the_values_of_json_without_a_script(report: Report) -> 
         elif part == "of":
             assert value in (figures["steps"], figures["episodes"]), name
         else:
-            assert value == looked_up(figures, rate if part == "count" else name), name
+            assert value == flat[rate if part == "count" else name], name
     wanted = {"goals", "collisions", "closest_approach", "intervals.goals", "latency_ms.adjusted.solve.p99"}
     assert wanted <= values.keys()
     assert sum(name.startswith("topics.") for name in values) == 3 * len(figures["topics"])
@@ -141,11 +140,8 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page) -> None:
     closest = page.value("[...document.querySelectorAll('#near .card')].map(c => Number(c.dataset.closest))")
     assert closest == sorted(closest), "worst first, of all robots"
     data = page.value("data[0].galleries")
-    every = [
-        episode
-        for gallery in data.values()
-        for episode in sorted(gallery["episodes"] + gallery["rest"], key=lambda episode: int(episode["order"]))
-    ]
+    galleries = [gallery["episodes"] + gallery["rest"] for gallery in data.values()]
+    every = [episode for gallery in galleries for episode in sorted(gallery, key=lambda one: int(one["order"]))]
     assert page.value("document.querySelectorAll('#picker option').length") == len(every) > 10
     assert len(every) == sum(gallery["total"] for gallery in data.values()), "every episode is reachable"
 
@@ -153,9 +149,8 @@ def test_the_picker_shows_the_episode_that_was_picked(page: Page) -> None:
         choose = f"s.value = {place}; s.dispatchEvent(new Event('change'))"
         page.value(f"(() => {{ const s = document.querySelector('#picker select'); {choose} }})()")
         said, episode = facts_of(page), every[place]
-        assert (said["actor"], said["episode"], said["outcome"]) == (
-            episode["actor"], str(episode["episode"]), episode["outcome"]
-        )  # fmt: skip
+        for name in ("actor", "episode", "outcome"):
+            assert said[name] == str(episode[name])
         assert said["steps"] == str(episode["steps"]) and said["step"] == str(episode["first"] + episode["closest_at"])
     slide = "r.value = 1; r.dispatchEvent(new Event('input'))"
     page.value(f"(() => {{ const r = document.querySelector('#picker input'); {slide} }})()")
@@ -240,9 +235,10 @@ def test_runs_are_laid_over_each_other_and_never_joined(comparison: Page, compar
     assert sorted(range(3), key=lambda k: edges[k]) == sorted(range(3), key=lambda k: steps[k]), "each from its own 0"
     shown = page.value("[...document.querySelectorAll('.tile [data-figure=goals]')].map(t => Number(t.dataset.value))")
     assert shown == [run["goals"] for run in runs], "nothing is pooled"
-    page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
+    choose = "document.querySelector('#learning-controls input[data-run=b]').click()"
+    page.value(choose)
     assert page.value(f"{lines}.map(line => line.dataset.run)") == ["a", "c"]
-    page.value("document.querySelector('#learning-controls input[data-run=b]').click()")
+    page.value(choose)
     page.value("document.getElementById('bands').click()")
 
 
@@ -276,12 +272,11 @@ def test_groups_have_their_scores_profiles_and_differences(comparison: Page) -> 
     assert names == ["method", "certificate"]
 
 
-def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page, compared: tuple[Path, Any]) -> None:
+def test_a_run_is_chosen_and_its_own_parts_are_shown(comparison: Page) -> None:
     page = comparison
     visible = "[...document.querySelectorAll('div.run')].filter(d => d.offsetHeight > 0).map(d => d.dataset.run)"
     assert page.value(visible) == ["a"]
-    choose = "(s => { s.value = '2'; s.dispatchEvent(new Event('change')) })(document.getElementById('run'))"
-    page.value(choose)
+    page.value("(s => { s.value = '2'; s.dispatchEvent(new Event('change')) })(document.getElementById('run'))")
     assert page.value(visible) == ["c"]
     assert page.value("document.querySelectorAll('#run2-near .card svg').length") > 4
     assert page.value("document.querySelectorAll('#run2-rates .whisker svg').length") == 8
@@ -306,11 +301,10 @@ def test_keys_step_through_an_episode(page: Page) -> None:
     page.press("p")
     assert int(page.value(number)) == before
     page.press("?")
-    assert page.value(
-        "document.getElementById('keys').open && document.getElementById('keys').textContent.length > 200"
-    )
+    keys = "document.getElementById('keys')"
+    assert page.value(f"{keys}.open && {keys}.textContent.length > 200")
     page.press("?")
-    assert not page.value("document.getElementById('keys').open")
+    assert not page.value(f"{keys}.open")
     page.value("document.getElementById('episode-map').focus()")
     page.press("End")
     assert int(facts_of(page)["step"]) > first
@@ -319,7 +313,7 @@ def test_keys_step_through_an_episode(page: Page) -> None:
 @pytest.mark.parametrize("which", ["page", "comparison"])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1400])
-def test_layouts_hold(request: pytest.FixtureRequest, which: str, width: int, scheme: str, tmp_path: Path) -> None:
+def test_layouts_hold(request: pytest.FixtureRequest, which: str, width: int, scheme: str) -> None:
     page: Page = request.getfixturevalue(which)
     page.size(width, 900)
     page.media("screen", scheme)

@@ -89,7 +89,5 @@ def test_time_stamps_go_on_evenly_when_the_clock_is_set(monkeypatch: pytest.Monk
         monkeypatch.setattr(time, "time_ns", lambda: real() + HOUR)
         publisher.put(pb.Step())
         until(lambda: len(samples) == 2, "another step")
-    sent = [sample.message().header.wall_time for sample in samples]
-    received = [sample.received for sample in samples]
-    for first, second in (sent, received):
+    for first, second in zip(*((s.message().header.wall_time, s.received) for s in samples), strict=True):
         assert 0 <= second - first < HOUR / 2

@@ -74,11 +74,9 @@ def test_names_of_segments() -> None:
 
 def test_a_truncated_file_yields_its_intact_messages_and_reports_the_damage(tmp_path: Path, say: Say) -> None:
     run = tmp_path / "run.mcap"
-    portions = [[say("log/a", pb.LogLine(text="x" * 50)) for _ in range(20)] for _ in range(5)]
-    segment = open_segment(run, {})
-    ends = []
-    for portion in portions:
-        segment.save([entry(sample) for sample in portion])
+    segment, ends = open_segment(run, {}), []
+    for _ in range(5):
+        segment.save([entry(say("log/a", pb.LogLine(text="x" * 50))) for _ in range(20)])
         ends.append(segment.size)
     segment.finish()
     whole = run.read_bytes()
@@ -87,8 +85,7 @@ def test_a_truncated_file_yields_its_intact_messages_and_reports_the_damage(tmp_
         cut.write_bytes(whole[:size])
         log = open_log(cut)
         assert len(list(log)) >= 20 * sum(end <= size for end in ends), size
-        assert len(log.cuts) == 1, size
-        assert log.cuts[0].lost < size
+        assert len(log.cuts) == 1 and log.cuts[0].lost < size, size
     assert open_log(run).cuts == []
 
 
@@ -114,14 +111,10 @@ def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
 
 def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Path) -> None:
     """A flight's log has JSON channels, at which the strict reader stops."""
-    text = json.dumps({"type": 2}).encode()
     segment = open_segment(tmp_path / "run.mcap", {})
-    segment.save(
-        [
-            Entry("log/a", pb.LogLine, pb.LogLine(process="a").SerializeToString(), 1, 1, 1),
-            Entry("mavlink/1/1/HEARTBEAT", "application/json;mavlink", text, 2, 2, 0),
-        ]
-    )
+    line, text = pb.LogLine(process="a").SerializeToString(), json.dumps({"type": 2}).encode()
+    heartbeat = Entry("mavlink/1/1/HEARTBEAT", "application/json;mavlink", text, 2, 2, 0)
+    segment.save([Entry("log/a", pb.LogLine, line, 1, 1, 1), heartbeat])
     segment.finish()
     with (tmp_path / "run.mcap").open("rb") as file, pytest.raises(DecoderNotFoundError):
         list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())

@@ -106,10 +106,8 @@ def test_without_webgl_the_page_says_so_and_draws_the_plan(tab: Page, report: tu
 
 def test_links_arrive_at_the_episode_and_its_step(page: Page) -> None:
     top = "document.getElementById('episodes').getBoundingClientRect().top"
-    item = (
-        "(p => p.all.find(i => i.robot === 'ground' && !i.episode.at && i.episode.steps > 9).episode)(pickers.get(0))"
-    )
-    actor, number = page.value(f"{item}.actor"), page.value(f"{item}.episode")
+    found = "pickers.get(0).all.find(i => i.robot === 'ground' && !i.episode.at && i.episode.steps > 9).episode"
+    actor, number = page.value(f"(e => [e.actor, e.episode])({found})")
     for place, step in (("step=7", "7"), (f"time={4 * GROUND.period}", "4")):
         page.value("scrollTo(0, 0)")
         page.value(f"location.hash = '#episode-{number}&actor={actor}&{place}'")
