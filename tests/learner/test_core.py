@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from brakeline.errors import CheckpointError, DamagedPart
+from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
@@ -210,3 +212,30 @@ def test_figures():
     assert (metrics.steps, metrics.steps_per_s, metrics.updates, metrics.updates_per_s) == (100, 50.0, 40, 20.0)
     assert metrics.critic_loss > 0.0 and metrics.staleness == 0.0 and metrics.limiter_error == 0.0
     assert learner.metrics().steps_per_s == 0.0
+
+
+LIMITED = replace(CONFIG, td3=replace(CONFIG.td3, cost_limit=0.1, multiplier_rate=4.0))
+
+
+def test_the_multiplier_rises_with_collisions_and_falls_to_zero_without():
+    learner, _ = started(LIMITED)
+    values = []
+    for index, collided in enumerate((True, False, True, *[False] * 20), start=1):
+        learner.insert(step(index, episode=index - 1, step=0, terminated=True, collision=collided))
+        values.append(learner._td3.cost_weight)
+    assert values[:3] == pytest.approx([3.6, 3.2, 6.8]) and values[-1] == 0.0
+    free, _ = started(CONFIG)
+    free.insert(step(1, terminated=True, collision=True))
+    assert free._td3.cost_weight == 0.0
+
+
+def test_a_resumed_run_keeps_the_multiplier(tmp_path):
+    learner, _ = started(LIMITED)
+    learner.insert(step(1, terminated=True, collision=True))
+    learner.save(tmp_path)
+    resumed = Learner(TOY, LIMITED)
+    resumed.restore(tmp_path)
+    assert resumed._td3.cost_weight == learner._td3.cost_weight == pytest.approx(3.6)
+    for wrong in ("3.6", float("nan"), -1.0):
+        with pytest.raises(ValueError, match="no multiplier"):
+            LagrangeMultiplier(0.1, 1.0).restore(PartState({}, {"value": wrong}))

@@ -122,6 +122,13 @@ def test_actors_do_not_mix():
     assert transition.reward == pytest.approx(1.0 + GAMMA)
 
 
+def test_the_cost_of_a_window_is_discounted_like_its_reward():
+    windows = NStepWindows(3, GAMMA)
+    moves = [move(0, 0, 1.0), move(0, 1, 1.0), move(0, 2, 1.0, terminated=True)._replace(collision=True)]
+    closed = [transition for each in moves for transition in windows.push("a", each)]
+    assert [transition.cost for transition in closed] == pytest.approx([0.81, 0.9, 1.0])
+
+
 def test_a_straggler_stands_for_itself():
     windows = NStepWindows(3, GAMMA)
     closed = [t for number in (0, 2, 1) for t in windows.push("a", move(0, number, 1.0 + number))]

@@ -299,7 +299,7 @@ def test_steps_after_a_gap_count_once_the_learners_permission_is_known(tmp_path:
 
     figures = add(20, (1, 2, 3, *range(4036, 4046)))
     assert (figures["steps"], figures["refused"]) == (3, 10)
-    figures = add(4050, (4046, 4046, *range(9_000, 9_100)))
-    assert (figures["steps"], figures["refused"]) == (14, 101)
+    figures = add(4050, (4046, 4046, *range(9_000, 10_100)))
+    assert (figures["steps"], figures["refused"]) == (14, 1101)
     figures = add(4060, ())
-    assert (figures["steps"], figures["refused"]) == (14, 101)
+    assert (figures["steps"], figures["refused"]) == (14, 1101)

@@ -207,10 +207,10 @@ def test_an_episode_is_saved_as_it_is_shown(page: Page) -> None:
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """The report of three runs, the last one of another method, and the figures of each."""
     folder = tmp_path_factory.mktemp("compared")
-    logs = [mixed(folder / name, seed, 12 + 4 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
+    logs = [mixed(folder / name, seed, 4 + 2 * seed, later=1e4 * seed) for seed, name in enumerate(("a", "b"), 1)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ABOUT, "run", ABOUT["run"] | {"method": "none", "certificate": ""})
-        logs.append(mixed(folder / "c", 3, 10, later=5e4))
+        logs.append(mixed(folder / "c", 3, 5, later=5e4))
     analysis = analyse_runs(logs, AnalysisOptions(pictures=True))
     write(folder / "page.html", analysis.figures(), analysis.by_label())
     return folder / "page.html", [figures for figures, _ in analysis.by_label().values()]
