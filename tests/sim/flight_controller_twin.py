@@ -1,4 +1,4 @@
-"""The twin of `sim/kernels/flight_kernels.py`: the quadrotor's flight controller in plain Python, with queues.
+"""The twin of the flight controller in `sim/kernels/flight_kernels.py`, with vectors, matrices and queues.
 
 ENU, SI units; body axes x forward, y left, z up.
 """
@@ -8,231 +8,102 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from brakeline.sim.kernels.flight_kernels import AIRFRAME, GAINS, GRAVITY, STOPPED, Gains
+import numpy as np
+from scipy.spatial.transform import Rotation
 
-Vector = tuple[float, float, float]
+from brakeline.messaging.obstacle import Array
+from brakeline.sim.kernels.flight_kernels import (
+    AIRFRAME,
+    EASE,
+    GAINS,
+    GRAVITY,
+    LAGS,
+    OUTER,
+    OUTER_EVERY,
+    RAMP,
+    ROUND,
+    STOPPED,
+)
 
-STILL: Vector = (0.0, 0.0, 0.0)
-
-
-class MovingAverage:
-    """The moving average `value` of the last samples."""
-
-    __slots__ = ("_samples", "_share", "_size", "_sum", "value")
-
-    def __init__(self, samples: int) -> None:
-        self._size, self._share = samples, 1.0 / samples
-        self.fill(0.0)
-
-    def fill(self, value: float) -> None:
-        """Set all samples to one value."""
-        self._samples = deque([value] * self._size)
-        self._sum, self.value = value * self._size, value
-
-    def push(self, value: float) -> float:
-        """Add a sample; return the change of the average."""
-        change = value - self._samples.popleft()
-        self._samples.append(value)
-        self._sum += change
-        self.value = self._sum * self._share
-        return change * self._share
+MIXER = np.array([[-1, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])  # torques of each rotor about x, y and z
 
 
-class VelocityAxis:
-    """One axis of the outer loop: reference, velocity control, hold.
-
-    The reference is the setpoint after three moving averages in a row, over `ramp`, `round` and `ease` seconds. A
-    staircase with a step every `ramp` seconds becomes a straight line, so the acceleration has no ripple. `round`
-    bounds the jerk and `ease` the snap. The reference forgets the past after the sum of the three times, so the closed
-    loop is nearly linear and has a short memory.
-
-    Attributes:
-        target: m/s, the setpoint after the limit of its jumps.
-        velocity: m/s, the reference, delayed by the lag of the acceleration.
-        integral: m/s², the integral term.
-        hold: m, the position to hold; None while following a velocity.
-    """
-
-    __slots__ = (
-        "_allowance", "_eased", "_gains", "_jerk", "_late", "_period", "_ramped", "_rounded", "_velocity", "hold",
-        "integral", "target", "velocity",
-    )  # fmt: skip
-
-    def __init__(self, gains: Gains, period: float, lag: float) -> None:
-        """Start at rest.
-
-        Args:
-            period: time between two updates [s].
-            lag: time until the vehicle reaches a commanded acceleration [s].
-        """
-        self._gains, self._period = gains, period
-        times = (gains.ramp, gains.round, gains.ease, gains.ease)
-        self._ramped, self._rounded, self._eased, self._jerk = (MovingAverage(round(t / period)) for t in times)
-        self._late = deque([0.0] * max(round(lag / period), 1))
-        self.integral = 0.0
-        self.reset(0.0)
-
-    def reset(self, velocity: float) -> None:
-        """Start in steady state at a velocity [m/s]; keep the integral."""
-        self.target = self.velocity = self._velocity = velocity
-        self._ramped.fill(velocity)
-        for mean in (self._rounded, self._eased, self._jerk):
-            mean.fill(0.0)
-        self._late = deque([velocity] * len(self._late))
-        self._allowance = self._gains.jump
-        self.hold: float | None = None
-
-    def follow(self, setpoint: float) -> tuple[float, float]:
-        """Move the reference on by one period; return its jerk [m/s³] and snap [m/s⁴]."""
-        g, period = self._gains, self._period
-        allowance = min(self._allowance + g.acceleration * period, g.jump)
-        change = min(max(setpoint - self.target, -allowance), allowance)
-        self.target += change
-        self._allowance = allowance - abs(change)
-        slope = self._ramped.push(self.target) / period
-        jerk = self._rounded.push(slope) / period
-        self._eased.push(self._rounded.value)
-        snap = self._jerk.push(jerk) / period
-        self._velocity += self._eased.value * period
-        self._late.append(self._velocity)
-        self.velocity = self._late.popleft()
-        return self._jerk.value, snap
-
-    def acceleration(self, position: float, velocity: float) -> float:
-        """Return the commanded acceleration [m/s²] without gravity and drag, from estimated position and velocity."""
-        g = self._gains
-        wanted = self.velocity
-        if self.hold is not None:
-            wanted += g.position * (self.hold - position)
-        error = wanted - velocity
-        integral = self.integral + g.integral * self._period * error
-        self.integral = min(max(integral, -g.integral_limit), g.integral_limit)
-        return self._eased.value + g.velocity * error + self.integral
+def push(samples: deque[Array], value: Array) -> Array:
+    """Replace the oldest sample of a moving average, and return the change of the average."""
+    change: Array = (value - samples[0]) / len(samples)
+    samples.append(value)
+    return change
 
 
 class FlightController:
-    """Follows velocity setpoints; at the setpoint zero, the vehicle stops and holds its position.
+    """The controller at rest. `setpoint`: m/s; `yaw` (its reference), `yaw_goal`: rad; `yaw_rate`: rad/s."""
 
-    Attributes:
-        setpoint: (x, y, z) m/s.
-        yaw: rad from east, the reference of the heading.
-        yaw_goal: rad from east, the heading that the reference turns to.
-        yaw_rate: rad/s; if not zero, the reference turns at this rate.
-    """
+    def __init__(self) -> None:
+        self.setpoint, self.target, self.reference, self.velocity, self.integral = np.zeros((5, 3))
+        self.allowance, self.hold = np.full(3, GAINS.jump), None
+        self.yaw = self.yaw_goal = self.yaw_rate = self.turn = 0.0
+        self.ramped, self.rounded, self.eased, self.jerk = (
+            deque(np.zeros((size, 3)), size) for size in (RAMP, ROUND, EASE, EASE)
+        )
+        self.delayed = [deque([0.0] * size) for size in LAGS]
+        self.updates = 0
 
-    def __init__(self, period: float, outer_every: int) -> None:
-        """Start at rest.
-
-        Args:
-            period: time between two updates [s].
-            outer_every: updates of the attitude loop for each update of the velocity loop.
-        """
-        self.gains, self.body = GAINS, AIRFRAME
-        self._period, self._outer_every = period, outer_every
-        outer = period * outer_every
-        g = self.gains
-        self.x, self.y, self.z = (VelocityAxis(g, outer, lag) for lag in g.lags)
-        self.reset()
-
-    def reset(self, yaw: float = 0.0) -> None:
-        """Start at rest with a heading [rad]."""
-        self.setpoint: Vector = STILL
-        self.yaw, self.yaw_goal, self.yaw_rate = yaw, yaw, 0.0
-        self._turn = 0.0  # rad/s, of the yaw reference
-        for axis in (self.x, self.y, self.z):
-            axis.reset(0.0)
-            axis.integral = 0.0
-        self._force: Vector = (0.0, 0.0, GRAVITY)
-        self._force_rate = self._force_curve = STILL
-        self._count = 0
-
-    def update(
-        self, position: Vector, velocity: Vector, attitude: tuple[float, float, float, float], rates: Vector
-    ) -> tuple[float, float, float, float]:
-        """Return the thrusts [N] of the four rotors for an estimated state.
-
-        Args:
-            position: m, in the world.
-            velocity: m/s, in the world.
-            attitude: quaternion (w, x, y, z), world from body.
-            rates: rad/s, of the body about its own axes.
-        """
-        if self._count == 0:
-            self._count = self._outer_every
+    def update(self, position: Array, velocity: Array, attitude: Array, rates: Array) -> Array:
+        """Return the rotors' thrusts (4,) [N] for an estimated state; attitude: (w, x, y, z), world from body."""
+        if self.updates % OUTER_EVERY == 0:
             self._velocity_loop(position, velocity)
-        self._count -= 1
-        return self._attitude_loop(attitude, rates)
+        self.updates += 1
+        return self._attitude_loop(Rotation.from_quat(attitude, scalar_first=True).as_matrix(), rates)
 
-    def _velocity_loop(self, position: Vector, velocity: Vector) -> None:
-        """Update the wanted specific force and its first two derivatives."""
-        g, x, y, z = self.gains, self.x, self.y, self.z
-        px, py, pz = position
-        ux, uy, uz = self.setpoint
-        (jx, sx), (jy, sy), (jz, sz) = x.follow(ux), y.follow(uy), z.follow(uz)
-        vx, vy, vz = x.velocity, y.velocity, z.velocity
-        if ux or uy or uz:
-            x.hold = y.hold = z.hold = None
-        elif x.hold is None and abs(vx) < STOPPED and abs(vy) < STOPPED and abs(vz) < STOPPED:
-            x.hold, y.hold, z.hold = px, py, pz
-        drag = g.known_drag * (
-            self.body.drag_linear + self.body.drag_quadratic * math.sqrt(vx * vx + vy * vy + vz * vz)
-        )
-        fx = x.acceleration(px, velocity[0]) + drag * vx
-        fy = y.acceleration(py, velocity[1]) + drag * vy
-        fz = z.acceleration(pz, velocity[2]) + drag * vz + GRAVITY
-        fz = max(fz, 0.2 * GRAVITY)
-        steepest = math.tan(g.tilt_limit) * fz
-        level = math.hypot(fx, fy)
-        if level > steepest:
-            fx, fy = fx * steepest / level, fy * steepest / level
-        self._force, self._force_rate, self._force_curve = (fx, fy, fz), (jx, jy, jz), (sx, sy, sz)
-        self._steer_yaw(self._period * self._outer_every)
+    def _velocity_loop(self, position: Array, velocity: Array) -> None:
+        """Update the wanted specific force and its first two derivatives, and the reference of the heading."""
+        g = GAINS
+        allowance = np.minimum(self.allowance + g.acceleration * OUTER, g.jump)
+        change = np.clip(self.setpoint - self.target, -allowance, allowance)
+        self.target, self.allowance = self.target + change, allowance - np.abs(change)
+        slope = push(self.ramped, self.target) / OUTER
+        jerk = push(self.rounded, slope) / OUTER
+        push(self.eased, np.mean(self.rounded, axis=0))
+        snap = push(self.jerk, jerk) / OUTER
+        feedforward = np.mean(self.eased, axis=0)
+        self.reference = self.reference + feedforward * OUTER
+        for axis, delayed in enumerate(self.delayed):
+            delayed.append(self.reference[axis])
+            self.velocity[axis] = delayed.popleft()
 
-    def _steer_yaw(self, period: float) -> None:
-        """Turn the yaw reference towards its goal, within the limit of the yaw rate."""
-        limit = self.gains.yaw_rate_limit
+        if self.setpoint.any():
+            self.hold = None
+        elif self.hold is None and (np.abs(self.velocity) < STOPPED).all():
+            self.hold = position
+        wanted = self.velocity + (0.0 if self.hold is None else g.position * (self.hold - position))
+        integral = self.integral + g.integral * OUTER * (wanted - velocity)
+        self.integral = np.clip(integral, -g.integral_limit, g.integral_limit)
+        drag = g.known_drag * (AIRFRAME.drag_linear + AIRFRAME.drag_quadratic * np.linalg.norm(self.velocity))
+        force = feedforward + g.velocity * (wanted - velocity) + self.integral + drag * self.velocity
+        force[2] = max(force[2] + GRAVITY, 0.2 * GRAVITY)
+        force[:2] *= min(math.tan(g.tilt_limit) * force[2] / math.hypot(*force[:2], 1e-9), 1.0)
+        self.force = force, np.mean(self.jerk, axis=0), snap
+
         if self.yaw_rate:
-            self.yaw_goal = self.yaw + self.yaw_rate * period
+            self.yaw_goal = self.yaw + self.yaw_rate * OUTER
         remaining = math.remainder(self.yaw_goal - self.yaw, math.tau)
-        self._turn = min(max(remaining / period, -limit), limit)
-        self.yaw += self._turn * period
+        self.turn = min(max(remaining / OUTER, -g.yaw_rate_limit), g.yaw_rate_limit)
+        self.yaw += self.turn * OUTER
 
-    def _attitude_loop(
-        self, attitude: tuple[float, float, float, float], rates: Vector
-    ) -> tuple[float, float, float, float]:
-        """Return the rotors' thrusts [N] that turn the body towards the wanted force."""
-        g, body = self.gains, self.body
-        w, x, y, z = attitude
-        fx, fy, fz = self._force
-        jx, jy, jz = self._force_rate
-        sx, sy, sz = self._force_curve
-        # the body's x and y axes in the world
-        xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)
-        yx, yy, yz = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)
-        upright = max(1.0 - 2.0 * (x * x + y * y), 0.3)  # cosine of the tilt
-        # the wanted force in the body's axes
-        bx, by = xx * fx + xy * fy + xz * fz, yx * fx + yy * fy + yz * fz
-        size = math.sqrt(fx * fx + fy * fy + fz * fz)
-        limit = g.rate_limit
-        p = -g.attitude * by / size - (yx * jx + yy * jy + yz * jz) / size
-        q = g.attitude * bx / size + (xx * jx + xy * jy + xz * jz) / size
-        r = g.yaw * math.remainder(self.yaw - math.atan2(xy, xx), math.tau) + self._turn
-        p, q = min(max(p, -limit), limit), min(max(q, -limit), limit)
-        ix, iy, iz = body.inertia
-        p_dot, q_dot = -(yx * sx + yy * sy + yz * sz) / size, (xx * sx + xy * sy + xz * sz) / size
-        roll = ix * (g.rate * (p - rates[0]) + p_dot) / (4.0 * body.arm)
-        pitch = iy * (g.rate * (q - rates[1]) + q_dot) / (4.0 * body.arm)
-        turn = 0.3 * g.rate * iz * (r - rates[2]) / (4.0 * body.rotor_torque)
-        turn = min(max(turn, -1.0), 1.0)
-        low, high = body.least_thrust, body.most_thrust
-        lift = min(max(0.25 * body.mass * fz / upright, low + 0.5), high - 1.0)  # height has priority
-        # at the rotors' limits, reduce the torques, not the lift
-        needed, room = abs(roll) + abs(pitch) + abs(turn), min(lift - low, high - lift)
-        if needed > room:
-            roll, pitch, turn = roll * room / needed, pitch * room / needed, turn * room / needed
-        return (
-            lift - roll - pitch - turn,
-            lift + roll + pitch - turn,
-            lift + roll - pitch + turn,
-            lift - roll + pitch + turn,
-        )
+    def _attitude_loop(self, axes: Array, rates: Array) -> Array:
+        """Return the thrusts that turn the body, whose axes are the columns of `axes`, towards the wanted force."""
+        g, body, low, high = GAINS, AIRFRAME, AIRFRAME.least_thrust, AIRFRAME.most_thrust
+        force, jerk, snap = (vector @ axes for vector in self.force)
+        size = np.linalg.norm(force)
+        tilt = np.clip((g.attitude * force + jerk)[:2] / size, -g.rate_limit, g.rate_limit)
+        heading = math.atan2(axes[1, 0], axes[0, 0])
+        wanted = np.array([-tilt[1], tilt[0], g.yaw * math.remainder(self.yaw - heading, math.tau) + self.turn])
+        towards = np.array([-snap[1] / size, snap[0] / size, 0.0])
+        leverage = 4.0 * np.array([body.arm, body.arm, body.rotor_torque])
+        torques = body.inertia * (g.rate * np.array([1.0, 1.0, 0.3]) * (wanted - rates) + towards) / leverage
+        torques[2] = min(max(torques[2], -1.0), 1.0)
+        lift = 0.25 * body.mass * self.force[0][2] / max(axes[2, 2], 0.3)
+        lift = min(max(lift, low + 0.5), high - 1.0)  # height has priority
+        room, needed = min(lift - low, high - lift), float(np.abs(torques).sum())
+        thrusts: Array = lift + MIXER @ torques * min(room / needed, 1.0)
+        return thrusts

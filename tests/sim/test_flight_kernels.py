@@ -16,12 +16,12 @@ TICKS = 10  # of a period
 @pytest.mark.fast
 def test_the_controller_is_its_twin_bit_for_bit() -> None:
     """Along random motions, with holds, jumps of the setpoint, a turning heading and saturated rotors."""
-    rng, mine, twin = np.random.default_rng(0), FlightController(), flight_controller_twin.FlightController(0.005, 2)
+    rng, mine, twin = np.random.default_rng(0), FlightController(), flight_controller_twin.FlightController()
     thrusts, qpos, qvel, errors = np.zeros(4), np.zeros(7), np.zeros(6), np.zeros(9)
     for step in range(1600):
         if step % 200 == 0:
             setpoint = rng.uniform(-6.0, 6.0, 3) * (rng.random() < 0.6)
-            mine.setpoint = twin.setpoint = tuple(setpoint.tolist())
+            mine.setpoint, twin.setpoint = tuple(setpoint.tolist()), setpoint
             yaw, rate = float(rng.uniform(-7.0, 7.0)), float(rng.choice([0.0, 0.5]))
             mine.turn_to(yaw)
             mine.turn_at(rate)
@@ -30,10 +30,8 @@ def test_the_controller_is_its_twin_bit_for_bit() -> None:
         qpos[:3], qpos[3:] = rng.normal(0.0, 2.0, 3), attitude / np.linalg.norm(attitude)
         qvel[:3], qvel[3:], errors[:6] = rng.normal(0.0, 3.0, 3), rng.normal(0.0, 2.0, 3), rng.normal(0.0, 0.01, 6)
         mine.update(qpos, qvel, errors, thrusts)
-        position, velocity = (qpos[:3] + errors[:3]).tolist(), (qvel[:3] + errors[3:6]).tolist()
-        assert thrusts.tolist() == pytest.approx(
-            twin.update(position, velocity, qpos[3:].tolist(), qvel[3:].tolist()), abs=1e-12
-        )
+        expected = twin.update(qpos[:3] + errors[:3], qvel[:3] + errors[3:6], qpos[3:], qvel[3:])
+        assert thrusts == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.fast
