@@ -1,19 +1,13 @@
 """Drawn arenas keep the numbers of their kind and have a path from start to goal."""
 
-import math
-from heapq import heappop, heappush
-from itertools import pairwise, product
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import arena_kind, draw_arena
+from brakeline.sim.arena_generator import arena_kind, draw_arena, goal_sequence
 from tests.robots import GROUND, QUADROTOR, ROBOTS
 from tests.sim.outline_twin import gaps
 
@@ -21,11 +15,7 @@ ALL = [(ROBOTS[robot], name) for robot in ROBOTS for name in ROBOTS[robot].task.
 each_arena = pytest.mark.parametrize(("robot", "name"), ALL, ids=[f"{robot.name}-{name}" for robot, name in ALL])
 
 
-def pillar(x: float, y: float, radius: float) -> Obstacle:
-    return Obstacle(CYLINDER, (x, y), (radius,))
-
-
-def arena(name: str, seed: int, robot: Robot = GROUND) -> Arena:
+def arena(name: str, seed: int, robot: RobotWithTask = GROUND) -> Arena:
     return draw_arena(name, np.random.default_rng(seed), robot)
 
 
@@ -34,46 +24,8 @@ def ends(drawn: Arena) -> np.ndarray:
     return np.array([drawn.start[: drawn.dim], drawn.goal])
 
 
-def find_path(drawn: Arena, clearance: float) -> np.ndarray | None:
-    """Return the cell centres of a path from start to goal over cells with a clearance, by greedy best-first search."""
-    grid = drawn.clearance_map
-    start, goal = (tuple(cell) for cell in grid.index(ends(drawn)).tolist())
-    before = {start: start}
-    queue = [(math.dist(start, goal), start)]
-    while queue and goal not in before:
-        _, here = heappop(queue)
-        for step in product((-1, 0, 1), repeat=drawn.dim):
-            cell = tuple(a + b for a, b in zip(here, step, strict=True))
-            inside = all(0 <= c < n for c, n in zip(cell, grid.shape, strict=True))
-            if inside and cell not in before and grid.clearance[cell] >= clearance:
-                before[cell] = here
-                heappush(queue, (math.dist(cell, goal), cell))
-    if goal not in before:
-        return None
-    cells = [goal]
-    while cells[-1] != start:
-        cells.append(before[cells[-1]])
-    return grid.centres[np.ravel_multi_index(np.array(cells).T, grid.shape)]
-
-
 @each_arena
-@settings(max_examples=6, deadline=None)
-@given(seed=st.integers(0, 2**32))
-def test_every_drawn_arena_has_a_path_with_its_clearance(robot: Robot, name: str, seed: int) -> None:
-    drawn = arena(name, seed, robot)
-    needed = robot.footprint + arena_kind(robot, name).path_clearance
-    half_step = 0.5 * drawn.clearance_map.cell * np.sqrt(drawn.dim)
-    way = find_path(drawn, float(np.hypot(needed, half_step)))
-    assert way is not None
-    way = np.concatenate(([drawn.goal], way, [drawn.start[: drawn.dim]]))
-    fine = np.concatenate([np.linspace(a, b, 12) for a, b in pairwise(way)])
-    # from start and goal to the centres of their cells the clearance falls by at most that distance
-    assert drawn.shapes.distance(fine[12:-12]).min() >= needed - 1e-9
-    assert drawn.shapes.distance(fine).min() >= needed - half_step
-
-
-@each_arena
-def test_a_drawn_arena_keeps_the_numbers_of_its_kind(robot: Robot, name: str) -> None:
+def test_a_drawn_arena_keeps_the_numbers_of_its_kind(robot: RobotWithTask, name: str) -> None:
     kind = arena_kind(robot, name)
     smallest_gaps = []
     for seed in range(25):
@@ -85,6 +37,7 @@ def test_a_drawn_arena_keeps_the_numbers_of_its_kind(robot: Robot, name: str) ->
         start, goal = ends(drawn)
         assert np.linalg.norm(goal - start) >= kind.goal_distance
         assert drawn.shapes.distance(ends(drawn)).min() >= robot.footprint + kind.start_clearance
+        assert drawn.clearance_map.connected(start, goal, robot.footprint + kind.path_clearance)
         low, high = np.array(drawn.bounds).T
         assert (ends(drawn) > low).all() and (ends(drawn) < high).all()
         plans = [plan(obstacle) for obstacle in placed]
@@ -120,16 +73,17 @@ def test_obstacles_in_space_stand_hang_and_float_between_floor_and_ceiling() -> 
     assert 10 < hanging < 40
 
 
-def test_the_default_arenas_have_their_documented_numbers() -> None:
-    counts = [len(arena("default", seed).obstacles) - 4 for seed in range(40)]
-    assert (min(counts), max(counts)) == (6, 10)
-    kind = arena_kind(GROUND, "default")
-    assert (kind.half_width, kind.goal_distance, kind.goal_radius, kind.step_limit) == (2.5, 1.5, 0.25, 300)
-    assert kind.path_clearance == 0.05
-    kind = arena_kind(QUADROTOR, "default")
-    assert arena("default", 0, QUADROTOR).bounds == ((-20.0, 20.0), (-20.0, 20.0), (0.0, 10.0))
-    assert (kind.goal_distance, kind.goal_radius, kind.step_limit) == (12.0, 1.0, 200)
-    assert arena("tall", 0, QUADROTOR).bounds[2] == (0.0, 30.0)
+@pytest.mark.parametrize("robot", [GROUND, QUADROTOR.in_real_time()], ids=lambda robot: robot.name)
+def test_a_goal_sequence_leads_from_goal_to_goal(robot: RobotWithTask) -> None:
+    drawn, kind = draw_arena("default", np.random.default_rng(5), robot), arena_kind(robot, "default")
+    start = drawn.start[: drawn.dim]
+    for stage in goal_sequence(drawn, 6, np.random.default_rng(6), robot):
+        assert stage.start == start and stage.obstacles == drawn.obstacles
+        assert np.linalg.norm(np.subtract(stage.goal, start)) >= kind.goal_distance
+        assert stage.shapes.distance(np.array(stage.goal)).min() >= robot.footprint + kind.start_clearance
+        assert stage.clearance_map is drawn.clearance_map
+        assert stage.clearance_map.connected(start, stage.goal, robot.footprint + kind.path_clearance)
+        start = stage.goal
 
 
 def test_the_generator_determines_the_arena() -> None:

@@ -49,15 +49,6 @@ def test_the_robot_stops_from_full_speed_within_a_period() -> None:
     assert moved(vehicle, 0.0, 0.0) < 1e-4
 
 
-def test_the_robot_stands_still_at_zero_input() -> None:
-    vehicle = robot()
-    drive(vehicle, 0.25, 0.5, 5)
-    drive(vehicle, 0.0, 0.0, 2)
-    before = vehicle.true.copy()
-    drive(vehicle, 0.0, 0.0, 50)
-    assert vehicle.true[:3] == pytest.approx(before[:3], abs=2e-5)
-
-
 @pytest.mark.parametrize("speed", [0.05, 0.15, 0.25])
 def test_the_speed_is_that_of_the_input(speed: float) -> None:
     vehicle = robot()
@@ -177,7 +168,7 @@ def test_collisions_agree_with_the_geometry() -> None:
     env = environment(GROUND, "dense", 0)
     policies = [scripted(name, GROUND, np.random.default_rng(0)) for name in ("adversary", "random", "greedy")]
     collisions = 0
-    for episode in range(45):
+    for episode in range(15):
         observation, info = env.reset(options={"episode_seed": episode})
         done = False
         while not done:
@@ -188,7 +179,7 @@ def test_collisions_agree_with_the_geometry() -> None:
             assert np.linalg.norm(info["true_state"][:2]) < 4.0
             done = terminated or truncated
         collisions += info["collision"]
-    assert collisions > 30
+    assert collisions > 10
 
 
 def test_every_geom_lies_within_the_footprint() -> None:

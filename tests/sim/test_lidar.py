@@ -1,69 +1,87 @@
-"""Ranges agree with the distances to the shapes along the beams."""
+"""MuJoCo's geoms have the distances of the shapes, and our ranges, of one robot or many, are those of MuJoCo's rays."""
 
+import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, rotate
+from brakeline.messaging.obstacle import CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
+from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.batch.obstacle_batch import ObstacleBatch
 from brakeline.sim.lidar import Lidar
+from brakeline.sim.mujoco_obstacles import HEIGHT, add_obstacles, map_model
 from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR
 
 PLANE, SPACE = GROUND.task.rays, QUADROTOR.task.rays
-SAMPLES = 60  # along a beam
+REACH = 3.0  # m
+SAME = 1e-9  # rounding
 
 
-def agree(arena: Arena, rays: LidarRays, origin: np.ndarray, heading: float) -> None:
-    """Check that each beam ends on a surface or at the full range, in free space up to there."""
-    ranges = Lidar(arena, rays).cast(origin, heading)
-    directions = rotate(rays.directions, heading)
-    hit = ranges < rays.range
-    assert (ranges <= rays.range).all()
-    ends = origin + ranges[:, None] * directions
-    assert arena.shapes.distance(ends[hit]).min(axis=0, initial=1.0) == pytest.approx(np.zeros(hit.sum()), abs=1e-6)
-    shares = np.linspace(0.0, 1.0, SAMPLES)[:, None]
-    before = origin + (shares * (ranges - 1e-6))[..., None] * directions
-    assert arena.shapes.distance(before).min() > 0.0
+def geom_distances(arena: Arena, points: np.ndarray) -> np.ndarray:
+    """Return MuJoCo's distances (n, p) from points (p, 3) to the geoms of the obstacles, at most `REACH`."""
+    spec = mujoco.MjSpec()
+    add_obstacles(spec, arena)
+    probe = spec.worldbody.add_body(name="probe", mocap=True)
+    probe.add_geom(name="probe", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(1e-3, 0.0, 0.0))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    geoms = [model.geom(f"obstacle {i}").id for i in range(len(arena.obstacles))]
+    measured = np.empty((len(geoms), len(points)))
+    for j, point in enumerate(points):
+        data.mocap_pos[0] = point
+        mujoco.mj_kinematics(model, data)
+        for i, geom in enumerate(geoms):
+            measured[i, j] = mujoco.mj_geomDistance(model, data, geom, model.geom("probe").id, REACH, None) + 1e-3
+    return measured
 
 
-def random_flat(rng: np.random.Generator) -> Arena:
-    obstacles = [Obstacle(WALL, (-2.0, 0.3), yaw=float(rng.uniform(-0.5, 0.5)))]
-    for _ in range(int(rng.integers(0, 8))):
-        position = tuple(rng.uniform(-3.0, 3.0, 2))
-        if rng.random() < 0.5:
-            obstacles.append(Obstacle(CYLINDER, position, (float(rng.uniform(0.05, 0.6)),)))
-        else:
-            obstacles.append(Obstacle(BOX, position, tuple(rng.uniform(0.1, 1.0, 2)), float(rng.uniform(-4.0, 4.0))))
-    return staged_arena(*obstacles)
+@pytest.mark.parametrize(
+    ("robot", "name", "heights"), [(QUADROTOR, "dense", ()), (GROUND, "dense", (0.01, HEIGHT - 0.01))]
+)
+def test_geoms_have_the_distances_of_their_shapes(robot: RobotWithTask, name: str, heights: tuple[float, ...]) -> None:
+    """In the plane, geoms stand on the floor: the distance is the same at every height."""
+    arena = draw_arena(name, np.random.default_rng(4), robot)
+    low, high = np.array(arena.bounds).T
+    points = np.random.default_rng(0).uniform(low, high, (60, arena.dim))
+    exact = arena.shapes.distance(points)
+    points, exact = points[exact.min(axis=0) > 0.0], exact[:, exact.min(axis=0) > 0.0]
+    for at in [np.column_stack((points, np.full(len(points), height))) for height in heights] or [points]:
+        assert geom_distances(arena, at) == pytest.approx(np.minimum(exact, REACH + 1e-3), abs=2e-3)
+    with pytest.raises(ValueError, match="no sphere"):
+        add_obstacles(mujoco.MjSpec(), staged_arena(Obstacle(SPHERE, (0.0, 1.0), (0.5,))))
 
 
-def random_solid(rng: np.random.Generator) -> Obstacle:
-    position = tuple(rng.uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 8.0)))
-    kind = (BOX, CYLINDER, SPHERE)[int(rng.integers(3))]
-    size = tuple(rng.uniform(0.3, 2.0, {BOX: 3, CYLINDER: 2, SPHERE: 1}[kind]))
-    return Obstacle(kind, position, size, float(rng.uniform(-4.0, 4.0)) if kind == BOX else 0.0)
+def mujoco_ranges(arena: Arena, rays: LidarRays, origin: np.ndarray, heading: float) -> np.ndarray:
+    """Return the ranges (R,) [m] from a point (d,) by one ray of MuJoCo after the other: the kernel's twin."""
+    model, data = map_model(arena)
+    point, beams = np.full(3, 0.5 * HEIGHT), np.zeros((len(rays.directions), 3))
+    point[: arena.dim], beams[:, : arena.dim] = origin, rotate(rays.directions, heading)
+    hit = np.zeros(1, np.int32)
+    ranges = np.array([mujoco.mj_ray(model, data, point, beam, None, 1, -1, hit, None) for beam in beams])
+    return np.minimum(np.where(ranges < 0.0, rays.range, ranges), rays.range)
 
 
-@given(st.integers(0, 2**32), st.floats(-3.1, 3.1))
-def test_in_the_plane_beams_end_at_the_first_surface(seed: int, heading: float) -> None:
-    rng = np.random.default_rng(seed)
-    arena = random_flat(rng)
-    origin = rng.uniform(-1.5, 1.5, 2)
-    if arena.shapes.distance(origin).min() > 0.0:
-        agree(arena, PLANE, origin, heading)
-
-
-@settings(deadline=None)
-@given(st.integers(0, 2**32), st.sampled_from([0.0, 0.7]))
-def test_in_space_beams_end_at_the_first_surface(seed: int, heading: float) -> None:
-    rng = np.random.default_rng(seed)
-    arena = staged_arena(*(random_solid(rng) for _ in range(8)), half_width=10.0, height=8.0, goal=(4.0, 4.0, 4.0))
-    origin = rng.uniform((-9.0, -9.0, 0.5), (9.0, 9.0, 7.5))
-    if arena.shapes.distance(origin).min() > 0.0:
-        agree(arena, SPACE, origin, heading)
+@pytest.mark.parametrize(("robot", "arena"), [(GROUND, "dense"), (GROUND, "open"), (QUADROTOR, "dense")])
+def test_ranges_are_those_of_mujoco(robot: RobotWithTask, arena: str) -> None:
+    """Within 1e-9, from random points and headings, also from inside an obstacle."""
+    rng, rays, kind = np.random.default_rng(0), robot.task.rays, robot.task.arenas[arena]
+    arenas = [draw_arena(arena, rng, robot) for _ in range(8)]
+    batch, d = ObstacleBatch(8, kind), robot.position_dim
+    for row, one in enumerate(arenas):
+        batch.put(row, one)
+    low, high = np.array(arenas[0].bounds).T
+    rows, points = np.arange(8), rng.uniform(low + 0.1, high - 0.1, (8, d))
+    for turn in rng.uniform(-np.pi, np.pi, 5):
+        beams = np.tile(rotate(rays.directions, turn), (8, 1, 1))
+        ranges = batch.cast(rows, points, beams, rays.range)
+        for row, one in enumerate(arenas):
+            assert np.abs(ranges[row] - mujoco_ranges(one, rays, points[row], turn)).max() <= SAME
+            assert (ranges[row] == Lidar(one, rays).cast(points[row], turn)).all()
+    clear = [Shapes.of(one.obstacles, d).distance(points[row]).min() for row, one in enumerate(arenas)]
+    assert np.abs(batch.clearance(rows, points[:, None])[:, 0] - clear).max() <= SAME
 
 
 def test_ranges_in_the_plane_are_exact() -> None:

