@@ -14,6 +14,6 @@ def station(request: pytest.FixtureRequest) -> Station:
 @pytest.fixture(params=["px4", "ardupilot"])
 def flying(request: pytest.FixtureRequest) -> Station:
     """Return a station whose vehicle flies and follows setpoints without a limit of acceleration."""
-    station = Station(request.param, parameters=AT_ONCE[request.param])
-    station.into_the_air()
+    station = Station(request.param, airborne=True, parameters=AT_ONCE[request.param])
+    station.follow_setpoints()
     return station

@@ -79,18 +79,20 @@ class Station:
         east, north, up = self.autopilot.vehicle.state()[3:6]
         return np.array([north, east, -up])
 
-    def into_the_air(self) -> None:
+    def follow_setpoints(self) -> None:
+        """Change to the mode that follows setpoints."""
+        self.setpoint(0, 0, 0)
+        assert self.command(MODE, 1, OFFBOARD if self.autopilot.rules.name == "px4" else GUIDED) == ACCEPTED
+
+    def take_off(self) -> None:
         """Take off, and change to the mode that follows setpoints."""
         self.wait(2.0)
-        if self.autopilot.rules.name == "px4":
-            assert self.command(ARM, 1) == ACCEPTED
-            assert self.command(TAKEOFF, *[0.0] * 6, math.nan) == ACCEPTED
-            self.wait(6.0)
-            self.setpoint(0, 0, 0)
-            assert self.command(MODE, 1, OFFBOARD) == ACCEPTED
-        else:
-            assert self.command(MODE, 1, GUIDED) == ACCEPTED
-            assert self.command(ARM, 1) == ACCEPTED
-            assert self.command(TAKEOFF, *[0.0] * 6, 3.0) == ACCEPTED
-            self.wait(6.0)
+        px4 = self.autopilot.rules.name == "px4"
+        if not px4:
+            self.follow_setpoints()
+        assert self.command(ARM, 1) == ACCEPTED
+        assert self.command(TAKEOFF, *[0.0] * 6, math.nan if px4 else 3.0) == ACCEPTED
+        self.wait(6.0)
+        if px4:
+            self.follow_setpoints()
         assert self.flight.landed is LandedState.IN_AIR

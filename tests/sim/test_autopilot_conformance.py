@@ -1,24 +1,29 @@
-"""The embedded autopilot answers the requests of the conformance benchmark by its rules."""
+"""The embedded autopilot answers the requests of the conformance benchmark by its rules, in simulated time."""
 
 from __future__ import annotations
 
 import pytest
 
-from benchmarks import autopilot_conformance, sitl
-from benchmarks.autopilot_conformance import embedded, on_the_ground
+from benchmarks import sitl
+from benchmarks.autopilot_conformance import on_the_ground
 from benchmarks.ground_station import Station
 from brakeline.deploy.run.autopilot_run import AutopilotSettings, open_field, vehicle
-from brakeline.messaging.byte_links import open_link
+from brakeline.sim.autopilot.endpoint import Autopilot
+
+
+class SimulatedLink:
+    """A link to an autopilot in this process, and the clock of that autopilot."""
+
+    def __init__(self, autopilot: Autopilot) -> None:
+        self.send, self.receive, self.sleep = autopilot.receive, autopilot.take, autopilot.advance
+        self.monotonic = lambda: autopilot.flight.time
 
 
 def test_an_embedded_one_answers_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autopilot_conformance, "ASKED", ("LOCAL_POSITION_NED", "ODOMETRY"))  # 1.5 s each
-    with embedded("ardupilot") as url:
-        link = open_link(url)
-        try:
-            answers = on_the_ground(Station(link, 1), "ardupilot")
-        finally:
-            link.close()
+    link = SimulatedLink(vehicle(AutopilotSettings("", "ardupilot"), open_field(), 1))
+    for module in ("ground_station", "autopilot_conformance"):
+        monkeypatch.setattr(f"benchmarks.{module}.time", link)
+    answers = on_the_ground(Station(link, 1), "ardupilot")  # type: ignore[arg-type]
     assert (answers["arm, armed already"], answers["disarm"]) == ("accepted", "accepted")
     assert answers["LOCAL_POSITION_NED at 20 Hz"] == "accepted, comes"
     assert answers["ODOMETRY at 20 Hz"] == "failed, does not come"

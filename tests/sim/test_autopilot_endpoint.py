@@ -22,17 +22,21 @@ def test_the_heartbeat_names_the_autopilot_once_a_second(station: Station) -> No
     assert beats[0].get_msgbuf()[0] == 0xFD  # MAVLink 2
 
 
-def test_the_vehicle_takes_off_lands_and_disarms(flying: Station) -> None:
-    height = flying.autopilot.vehicle.state()[2]
-    assert height == pytest.approx({"px4": 2.55, "ardupilot": 3.05}[flying.autopilot.rules.name], abs=0.25)
-    assert flying.command(ARM, 0) == flying.autopilot.rules.refusal  # not in the air
-    assert flying.command(LAND) == ACCEPTED
-    flying.wait(1.0)
-    assert flying.flight.landed is LandedState.LANDING
-    flying.wait(10.0)
-    assert flying.flight.landed is LandedState.ON_GROUND and not flying.flight.armed
-    assert not flying.autopilot.vehicle.collided
-    assert "Landing detected" in flying.texts()
+def test_the_vehicle_takes_off_lands_and_disarms(station: Station) -> None:
+    """Afterwards a PX4 returns to the mode before. An ArduCopter stays in its landing mode, as the real one."""
+    rules = station.autopilot.rules
+    station.take_off()
+    height = station.autopilot.vehicle.state()[2]
+    assert height == pytest.approx({"px4": 2.55, "ardupilot": 3.05}[rules.name], abs=0.25)
+    assert station.command(ARM, 0) == rules.refusal  # not in the air
+    assert station.command(LAND) == ACCEPTED
+    station.wait(1.0)
+    assert station.flight.landed is LandedState.LANDING and station.flight.mode is Mode.LAND
+    station.wait(10.0)
+    assert station.flight.landed is LandedState.ON_GROUND and not station.flight.armed
+    assert station.flight.mode is {"px4": Mode.OFFBOARD, "ardupilot": Mode.LAND}[rules.name]
+    assert not station.autopilot.vehicle.collided
+    assert "Landing detected" in station.texts()
 
 
 def test_arming_is_refused_before_the_estimate_is_ready_and_in_land_mode(station: Station) -> None:
@@ -145,28 +149,23 @@ def test_the_vehicle_follows_velocities_in_the_body_frame(flying: Station) -> No
     assert flying.autopilot.telemetry.heading() == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("frame", "mask", "velocity"),
-    [
-        (mavlink.MAV_FRAME_GLOBAL, gs.VELOCITY, (1, 0, 0)),
-        (mavlink.MAV_FRAME_BODY_FRD, gs.VELOCITY, (1, 0, 0)),
-        (gs.LOCAL, 0x0FFF & ~0x200, (1, 0, 0)),  # nothing to fly
-        (gs.LOCAL, 0x0C3F, (1, 0, 0)),  # an acceleration
-        (gs.LOCAL, 0x0E07, (1, 0, 0)),  # a force
-        (gs.LOCAL, gs.VELOCITY | 0x20, (1, 0, 0)),  # two axes of three
-        (gs.LOCAL, gs.VELOCITY, (math.nan, 0, 0)),
-    ],
-)
-def test_setpoints_with_a_wrong_frame_or_mask_are_ignored(
-    flying: Station, frame: int, mask: int, velocity: tuple[float, float, float]
-) -> None:
-    flying.fly(0, 1.5, 0)
-    flying.received.clear()
-    reached = flying.fly(*velocity, frame=frame, mask=mask, seconds=6.0)
-    assert reached == pytest.approx(np.zeros(3), abs=0.1)  # no valid setpoint came within the timeout
-    if flying.autopilot.rules.name == "px4":
-        assert "SET_POSITION_TARGET_LOCAL_NED" in flying.texts()
-        assert flying.flight.mode is Mode.POSITION
+def test_setpoints_with_a_wrong_frame_or_mask_are_ignored(flying: Station) -> None:
+    for frame, mask, speed in (
+        (mavlink.MAV_FRAME_GLOBAL, gs.VELOCITY, 1.0),
+        (mavlink.MAV_FRAME_BODY_FRD, gs.VELOCITY, 1.0),
+        (gs.LOCAL, 0x0FFF & ~0x200, 1.0),  # nothing to fly
+        (gs.LOCAL, 0x0C3F, 1.0),  # an acceleration
+        (gs.LOCAL, 0x0E07, 1.0),  # a force
+        (gs.LOCAL, gs.VELOCITY | 0x20, 1.0),  # two axes of three
+        (gs.LOCAL, gs.VELOCITY, math.nan),
+    ):
+        assert flying.fly(0, 1.5, 0)[1] == pytest.approx(1.5, abs=0.1) and flying.flight.mode is Mode.OFFBOARD
+        flying.received.clear()
+        reached = flying.fly(speed, 0, 0, frame=frame, mask=mask, seconds=6.0)
+        assert reached == pytest.approx(np.zeros(3), abs=0.1)  # no valid setpoint came within the timeout
+        if flying.autopilot.rules.name == "px4":
+            assert "SET_POSITION_TARGET_LOCAL_NED" in flying.texts()
+            assert flying.flight.mode is Mode.POSITION
 
 
 def test_setpoints_in_another_mode_have_no_effect() -> None:
@@ -179,8 +178,9 @@ def test_an_arducopter_follows_setpoints_with_its_acceleration(
     acceleration: float | None, speed: float, way: float
 ) -> None:
     """With the default parameters it takes seconds to follow a setpoint, and as long to stop, as a real ArduCopter."""
-    station = Station("ardupilot", parameters={} if acceleration is None else {"WPNAV_ACCEL": acceleration})
-    station.into_the_air()
+    parameters = {} if acceleration is None else {"WPNAV_ACCEL": acceleration}
+    station = Station("ardupilot", airborne=True, parameters=parameters)
+    station.follow_setpoints()
     station.fly(0, 3, 0, seconds=1.0)
     assert station.autopilot.vehicle.controller.setpoint[0] == pytest.approx(speed, abs=0.15)
     station.fly(0, 3, 0, seconds=4.0)
@@ -212,29 +212,17 @@ def test_the_vehicle_holds_after_its_setpoints_stop(flying: Station, timeout: fl
 
 @pytest.mark.parametrize(("action", "mode"), [(0, Mode.POSITION), (4, Mode.LAND), (5, Mode.HOLD)])
 def test_a_parameter_of_px4_sets_the_mode_after_lost_setpoints(action: float, mode: Mode) -> None:
-    station = Station("px4", parameters={"COM_OBL_RC_ACT": action})
-    station.into_the_air()
+    station = Station("px4", airborne=True, parameters={"COM_OBL_RC_ACT": action})
+    station.follow_setpoints()
     station.fly(0, 1, 0)
     station.wait(1.5)
     assert station.flight.mode is mode
 
 
-def test_a_landed_px4_returns_to_the_mode_before(flying: Station) -> None:
-    """An ArduCopter stays in its landing mode, as the real one."""
-    rules = flying.autopilot.rules.name
-    flying.fly(0, 0, 0, seconds=0.2)
-    assert flying.command(MODE, 1, *{"px4": (4, 6), "ardupilot": (gs.COPTER_LAND,)}[rules]) == ACCEPTED
-    assert flying.flight.mode is Mode.LAND
-    flying.wait(12.0)
-    assert not flying.flight.armed
-    assert flying.flight.mode is {"px4": Mode.OFFBOARD, "ardupilot": Mode.LAND}[rules]
-
-
 def test_setpoints_take_effect_again_after_a_loss_unless_another_mode_was_chosen(flying: Station) -> None:
     """As with a real PX4, a pause of the sender does not end the flight."""
     flying.fly(0, 3, 0)
-    flying.wait(4.0)
-    flying.wait(0.1)
+    flying.wait(4.1)
     assert flying.flight.setpoint.velocity == (0.0, 0.0, 0.0)
     assert flying.fly(0, 3, 0)[1] == pytest.approx(3.0, abs=0.1) and flying.flight.mode is Mode.OFFBOARD
     flying.wait(4.0)
