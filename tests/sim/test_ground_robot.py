@@ -1,4 +1,4 @@
-"""The ground robot's motion without disturbances, and its collisions."""
+"""The ground robot: its motion with disturbances and without, its collisions, its sensors and their fusion."""
 
 import math
 
@@ -8,14 +8,15 @@ import pytest
 
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadInput
-from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
+from brakeline.messaging.obstacle import BOX, CYLINDER, Array, Obstacle
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
-from brakeline.sim.ground_estimator import NoiseLevels
-from brakeline.sim.ground_robot import MODEL, SAMPLE_TIME, WHEEL_RADIUS, GroundRobot
+from brakeline.sim.ground_estimator import CUT, Estimator, cut_normal, steady_gain, wrap
+from brakeline.sim.ground_realtime import RealtimeGroundRobot
+from brakeline.sim.ground_robot import MODEL, SAMPLE_TIME, WHEEL_RADIUS, GroundRobot, NoiseLevels
 from brakeline.sim.scripted_policies import scripted
-from brakeline.sim.sim_conditions import ProcessNoise
-from brakeline.sim.vehicle import Period
+from brakeline.sim.sim_conditions import Conditions, ProcessNoise
+from brakeline.sim.vehicle import Period, Vehicle
 from tests.arenas import staged_arena as room
 from tests.robots import GROUND
 
@@ -204,3 +205,138 @@ def test_samples_without_a_look_at_contacts_have_the_same_motion_to_the_bit() ->
             assert not physics.advance(at_rest=False, apart=apart)
         motions.append(np.concatenate((physics.data.qpos, physics.data.qvel, physics.data.qacc_warmstart)))
     assert np.array_equal(*motions)
+
+
+SAMPLE, RADIUS, SAMPLES = 0.02, 0.033, 10
+
+
+def estimator(noise: NoiseLevels, seed: int = 0) -> Estimator:
+    return Estimator(noise, np.random.default_rng(seed), np.zeros(3), np.zeros(2), RADIUS, SAMPLE)
+
+
+def test_noise_is_cut_off_and_otherwise_normal() -> None:
+    draws = cut_normal(np.random.default_rng(0), 0.5, (50_000,))
+    assert np.abs(draws).max() <= CUT * 0.5
+    assert draws.mean() == pytest.approx(0.0, abs=0.005)
+    assert draws.std() == pytest.approx(0.5 * 0.8796, rel=0.01)  # of a normal distribution cut at 2 sigma
+    assert (cut_normal(np.random.default_rng(0), 0.0, (5,)) == 0.0).all()
+
+
+@pytest.mark.parametrize(("drift", "fix"), [(0.001, 0.005), (0.01, 0.005)])
+def test_the_steady_gain_is_the_limit_of_the_kalman_gain(drift: float, fix: float) -> None:
+    variance = 1.0
+    for _ in range(1000):
+        prior = variance + drift**2
+        gain = prior / (prior + fix**2)
+        variance = (1.0 - gain) * prior
+    assert steady_gain(drift, fix) == pytest.approx(gain, rel=1e-9)
+
+
+def test_dead_reckoning_of_an_arc_without_noise() -> None:
+    sensors = estimator(NoiseLevels(scale=0.0))
+    speed, turn = 0.2, 0.5
+    times = SAMPLE * np.arange(1, SAMPLES + 1)
+    wheels = np.outer(times, [speed - 0.08 * turn, speed + 0.08 * turn]) / RADIUS
+    angle = turn * times
+    path = np.stack((np.sin(angle), 1.0 - np.cos(angle)), axis=1) * speed / turn
+    reading = sensors.update(wheels, np.full(SAMPLES, turn), np.array([*path[-1], angle[-1]]))
+    tick = 2.0 * math.pi / 4096 * RADIUS
+    assert reading.path == pytest.approx(path, abs=2.0 * tick)
+    assert reading.turned == pytest.approx(angle[-1])
+    assert reading.measured == pytest.approx([*path[-1], angle[-1], speed, turn], abs=2.0 * tick / SAMPLE)
+
+
+def test_speed_and_turn_rate_come_from_the_last_samples() -> None:
+    sensors = estimator(NoiseLevels(scale=0.0))
+    steps = np.where(np.arange(SAMPLES) < 5, 0.0, 0.2 * SAMPLE / RADIUS)
+    wheels = np.cumsum(np.stack((steps, steps), axis=1), axis=0)
+    rates = np.where(np.arange(SAMPLES) < 5, 0.5, 0.0)
+    measured = sensors.update(wheels, rates, np.zeros(3)).measured
+    assert measured[3] == pytest.approx(0.2, abs=0.003)
+    assert measured[4] == 0.0
+
+
+def test_fusion_is_better_than_a_fix_and_within_its_bound() -> None:
+    noise, errors = NoiseLevels(), []
+    for seed in range(8):
+        sensors = estimator(noise, seed)
+        for _ in range(200):
+            reading = sensors.update(np.zeros((SAMPLES, 2)), np.zeros(SAMPLES), np.zeros(3))
+            errors.append(reading.measured)
+    error = np.array(errors)
+    assert (np.abs(error) <= GROUND.measurement_bound).all()
+    assert (error[:, :3].std(axis=0) < 0.5 * np.array([0.005, 0.005, 0.01])).all()
+    assert (error[:, :3].std(axis=0) > 0.1 * np.array([0.005, 0.005, 0.01])).all()
+
+
+def test_the_heading_wraps() -> None:
+    assert wrap(3.0 * math.pi) == pytest.approx(-math.pi)
+    sensors = Estimator(
+        NoiseLevels(scale=0.0), np.random.default_rng(0), np.array([0, 0, 3.1]), np.zeros(2), RADIUS, SAMPLE
+    )
+    reading = sensors.update(np.zeros((SAMPLES, 2)), np.full(SAMPLES, 0.5), np.array([0.0, 0.0, wrap(3.2)]))
+    assert reading.measured[2] == pytest.approx(wrap(3.2))
+
+
+STAND, AHEAD, CURVE = np.zeros(2), np.array([0.25, 0.0]), np.array([0.2, 0.4])
+
+
+def disturbed(seed: int) -> GroundRobot:
+    """Return a robot in an empty room, with the errors and disturbances that come with it."""
+    return GroundRobot(room(half_width=20.0), np.random.default_rng(seed))
+
+
+def after(vehicle: Vehicle, input: Array, periods: int) -> Array:
+    """Return the true state after driving at an input."""
+    for _ in range(periods):
+        vehicle.step(input)
+    return vehicle.true
+
+
+def test_the_same_inputs_give_another_true_motion_under_each_seed() -> None:
+    """After five seconds straight ahead at 0.25 m/s, which are 1.23 m."""
+    ends = np.array([after(disturbed(seed), AHEAD, 25) for seed in range(10)])
+    assert len(np.unique(ends, axis=0)) == 10
+    along, across, heading = ends[:, :3].std(axis=0)
+    assert 0.004 < along < 0.02 and 0.03 < across < 0.12 and 0.05 < heading < 0.2
+    assert np.abs(ends[:, 1]).max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_robot_at_rest_stays_at_rest(seed: int) -> None:
+    vehicle = disturbed(seed)
+    start = vehicle.true.copy()
+    assert np.abs(after(vehicle, STAND, 25) - start).max() < 2e-5
+    after(vehicle, CURVE, 5)
+    stopped = after(vehicle, STAND, 3).copy()
+    assert np.abs(after(vehicle, STAND, 25) - stopped).max() < 1e-4
+
+
+def test_disturbances_change_no_other_number_of_an_episode() -> None:
+    """They have a generator of their own, so sensors err as without them."""
+    rngs = [np.random.default_rng(3) for _ in range(2)]
+    robots = [GroundRobot(room(), rng, process_noise=noise) for rng, noise in zip(rngs, (None, EVEN), strict=True)]
+    assert (robots[0].measured == robots[1].measured).all()
+    assert rngs[0].random() == rngs[1].random()
+
+
+def test_a_robot_in_real_time_has_the_disturbances_of_one_in_lockstep() -> None:
+    arena = room()
+    lockstep = GroundRobot(arena, np.random.default_rng(5))
+    realtime = RealtimeGroundRobot(arena, np.random.default_rng(5))
+    for input in (AHEAD, CURVE, STAND, STAND, STAND, CURVE):
+        realtime.drive(input)
+        for _ in range(lockstep.samples):
+            realtime.advance()
+        assert np.abs(lockstep.step(input).true - realtime.true).max() < 1e-9
+
+
+def test_the_scale_is_a_condition_that_a_run_logs() -> None:
+    told = Conditions(NoiseLevels(), process_noise=ProcessNoise(scale=0.5)).describe()
+    assert told["process_scale"] == "0.5" and told["process_motor_gain"] == "0.01" and told["scale"] == "1"
+
+
+@pytest.mark.parametrize("wrong", [{"scale": -1.0}, {"scale": float("nan")}, {"wheel_correlation": 0.0}])
+def test_noise_that_is_no_number_or_negative_is_refused(wrong):
+    with pytest.raises(ValueError, match="process noise"):
+        ProcessNoise(**wrong)
