@@ -1,29 +1,38 @@
-"""Clients that send slowly, or nothing, keep nobody from the metrics, the live page and the Foxglove server."""
+"""Clients that send slowly, or nothing, keep nobody from the metrics, the live page and the Foxglove server. What is
+scraped is what the processes say; what the dashboard and the autoscaler ask for is exported.
+"""
 
+import contextlib
+import http.client
+import json
+import re
 import socket
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from brakeline.logs.watch import websocket_gate
 from brakeline.logs.watch.live_page_server import MOST_STREAMS, LivePageServer
 from brakeline.logs.watch.websocket_gate import WebSocketGate
 from brakeline.messaging import http_server
+from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.http_server import MOST_CLIENTS, ConnectionSlots
-from brakeline.messaging.metrics_endpoint import MetricsServer, ProcessStatus
+from brakeline.messaging.metrics_endpoint import FIGURES, MetricsServer, ProcessStatus
+from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.topics import LOG
+from tests.waiting import until
 
 CROWD = 3 * MOST_CLIENTS
 
 
 def view() -> dict[str, object]:
     return {"robots": []}
-
-
-def status() -> ProcessStatus:
-    return ProcessStatus("safety-0", True, True, True, {}, {})
 
 
 @pytest.fixture(params=["metrics", "page"])
@@ -33,7 +42,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[tuple[int, str]]:
         with LivePageServer(view) as page:
             yield int(page.url.rsplit(":", 1)[1].strip("/")), "/view.json"
         return
-    server = MetricsServer("0", status)
+    server = MetricsServer("0", everything)
     yield server.port, "/live"
     server.close()
 
@@ -51,17 +60,13 @@ def connect() -> Iterator[Callable[[int, bytes], socket.socket]]:
         yield make
 
 
-def get(port: int, path: str) -> int:
-    return int(urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10.0).status)
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET /metrics HT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"], ids=repr)
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"], ids=repr)
 def test_a_crowd_that_sends_no_whole_request_keeps_nobody_out(
     served: tuple[int, str], connect: Callable[[int, bytes], socket.socket], sent: bytes
 ) -> None:
     port, path = served
     crowd = [connect(port, sent) for _ in range(CROWD)]
-    assert get(port, path) == 200
+    assert get(port, path)
     assert crowd[0].recv(1) == b"", "the one that waited longest had to go"
 
 
@@ -93,7 +98,7 @@ def test_pages_that_stay_open_leave_places_for_short_requests(
         asking = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
         answers = [connect(port, asking).recv(12) for _ in range(MOST_STREAMS + 1)]
         assert answers == [b"HTTP/1.1 200"] * MOST_STREAMS + [b"HTTP/1.1 503"]
-        assert get(port, "/view.json") == 200
+        assert get(port, "/view.json")
 
 
 def test_a_crowd_before_the_foxglove_server_keeps_nobody_out(
@@ -136,26 +141,105 @@ def test_the_one_that_waited_longest_gives_way_and_one_that_is_served_does_not()
             end.close()
 
 
-@pytest.mark.parametrize("path", ["/metrics", "/live", "/ready", "/elsewhere"])
-@pytest.mark.parametrize(
-    "headers",
-    [{"Host": "evil"}, {"Host": "evil:9100"}, {"Host": "127.0.0.1.evil.com"}, {"Origin": "http://evil"}],
-    ids=str,
-)
-def test_a_foreign_page_does_not_read_the_metrics(path: str, headers: dict[str, str]) -> None:
+def ask(port: int, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
+    """Return the status and the text of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    with contextlib.closing(connection):
+        return answer.status, answer.read()
+
+
+def test_a_foreign_page_does_not_read_the_metrics_and_a_scraper_names_the_machine(exposed) -> None:
     """By DNS rebinding a page of `evil` reaches this machine, and names `evil` as the host."""
-    server = MetricsServer("0", status)
-    request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", headers=headers)
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(request, timeout=10.0)
-    assert refused.value.code == 403 and b"brakeline" not in refused.value.read()
-    server.close()
+    port = exposed(everything())
+    for host in ("evil", "evil:9100", "127.0.0.1.evil.com", ""):
+        headers = {"Host": host} if host else {"Origin": "http://evil"}
+        for path in ("/metrics", "/live", "/ready", "/elsewhere"):
+            status, text = ask(port, path, headers)
+            assert status == 403 and b"brakeline" not in text, (headers, path)
+    for host in ("localhost:9100", "10.1.2.3:9100", "[fd00::1]:9100", socket.gethostname()):
+        assert b"brakeline_connected" in ask(port, "/metrics", {"Host": host})[1], host
 
 
-@pytest.mark.parametrize("host", ["localhost:9100", "10.1.2.3:9100", "[fd00::1]:9100", socket.gethostname()])
-def test_a_scraper_names_the_machine_or_its_address_at_any_port(host: str) -> None:
-    server = MetricsServer("0", status)
-    request = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={"Host": host})
-    with urllib.request.urlopen(request, timeout=10.0) as answer:
-        assert b"brakeline_connected" in answer.read()
-    server.close()
+DEPLOY = Path(__file__).parents[2] / "deploy"
+
+
+def get(port, path):
+    return urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10.0).read().decode()
+
+
+def scraped(port):
+    """Value by name and labels other than the process's."""
+    return {
+        (sample.name, sample.labels.get("topic", "")): (sample.value, sample.labels["process"], sample.labels["role"])
+        for family in text_string_to_metric_families(get(port, "/metrics"))
+        for sample in family.samples
+    }
+
+
+def everything(**more):
+    figures = {name: float(i + 1) for i, name in enumerate(FIGURES)}
+    state = dict.fromkeys(("live", "ready", "connected"), True)
+    return ProcessStatus(**({"process": "safety-3", "figures": figures, "published": {"log/a": 2}} | state | more))
+
+
+@pytest.fixture
+def exposed():
+    """`exposed(state)`: the port at which it is served."""
+    started = []
+
+    def serve(state):
+        started.append(MetricsServer("0", lambda: state))
+        return started[-1].port
+
+    yield serve
+    for exposition in started:
+        exposition.close()
+
+
+def test_a_process_is_scraped_and_asked_whether_it_is_ready():
+    settings = BusSettings(listen=(free_endpoint(),), metrics="0")
+    with Process(settings, "safety-0", stderr=False) as process:
+        port = process._metrics.port
+        with pytest.raises(urllib.error.HTTPError, match="503"):
+            get(port, "/ready")
+        process.figures.update(decisions=7, decide_ms=2.5)
+        process.bus.publisher(LOG)
+        process.announce()
+        assert get(port, "/ready") == get(port, "/live") == "yes\n"
+        until(lambda: scraped(port).get(("brakeline_published_total", "health"), (0,))[0] >= 1, "a Health")
+        metrics = scraped(port)
+        assert metrics["brakeline_decisions_total", ""] == (7.0, "safety-0", "safety")
+        assert metrics["brakeline_decide_seconds", ""][0] == pytest.approx(2.5e-3)
+        assert metrics["brakeline_connected", ""][0] == 1.0 and metrics["brakeline_passed_over_total", ""][0] == 0.0
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            get(port, "/keys")
+    with pytest.raises(urllib.error.URLError):
+        get(port, "/metrics")
+
+
+def test_who_is_stuck_does_not_live_and_who_is_cut_off_is_not_ready(exposed):
+    stuck, cut = exposed(everything(live=False)), exposed(everything(ready=False, connected=False))
+    with pytest.raises(urllib.error.HTTPError, match="503"):
+        get(stuck, "/live")
+    with pytest.raises(urllib.error.HTTPError, match="503"):
+        get(cut, "/ready")
+    assert get(cut, "/live") == "yes\n" and scraped(cut)["brakeline_connected", ""][0] == 0.0
+
+
+def test_where_nothing_can_be_served_is_said(exposed):
+    with pytest.raises(ValueError, match="HOST:PORT"):
+        MetricsServer("nonsense", everything)
+    with pytest.raises(OSError, match="in use"):
+        MetricsServer(str(exposed(everything())), everything)
+
+
+@pytest.mark.parametrize("path", ["grafana/brakeline.json", "kubernetes/autoscaler.yaml"])
+def test_what_is_asked_for_is_exported(exposed, path):
+    text = (DEPLOY / path).read_text()
+    asked = set(re.findall(r"\bbrakeline_[a-z_]+", text))
+    assert asked
+    assert asked <= {name for name, _ in scraped(exposed(everything()))}
+    if path.endswith(".json"):
+        assert len(asked) > 15 and json.loads(text)["panels"]

@@ -53,7 +53,7 @@ def test_an_action_outlives_the_next_call():
 
 def test_exploration():
     policy, generator = decode(FILE), np.random.default_rng(0)
-    actions = np.array([policy.explore(observation(0), generator) for _ in range(4000)])
+    actions = np.array([policy.explore(observation(0), generator) for _ in range(2000)])
     assert (actions >= GROUND.low()).all() and (actions <= GROUND.high()).all()
     np.testing.assert_allclose(actions[:, 1].mean(), policy(observation(0))[1], atol=0.02)
     np.testing.assert_allclose(actions[:, 1].std(), 0.25 * 0.5, atol=0.01)

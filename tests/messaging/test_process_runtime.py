@@ -1,7 +1,11 @@
-"""What a process says while it lives and when it ends."""
+"""What a process says while it lives and when it ends. Signals that come in a volley, at any moment, to whichever
+thread, set the event, and nobody waits for ever.
+"""
 
 import logging
 import signal
+import subprocess
+import threading
 import time
 from typing import Any
 
@@ -9,6 +13,7 @@ import pytest
 
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.stop_signals import NUMBERS, stop_on_signals
 from brakeline.messaging.topics import HEALTH, LOG
 from tests.messaging.programs import Join, Spawn
 from tests.waiting import until
@@ -104,3 +109,55 @@ def test_a_refresh_that_fails_does_not_stop_the_signs_of_life(join: Join, endpoi
         process.refresh = None
     wait_for_goodbye(health)
     assert "the Health was not published" in lines[0].text
+
+
+WAITS = """
+import signal
+import threading
+from brakeline.messaging.stop_signals import stop_on_signals
+signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest of a volley comes when it is through
+with stop_on_signals(threading.Event()) as stop:
+    print("ready", flush=True)
+    {wait}
+print("ended", flush=True)
+"""
+
+
+def ended(process: "subprocess.Popen[str]") -> None:
+    output, _ = process.communicate(timeout=20.0)
+    assert (process.returncode, output) == (0, "ended\n")
+
+
+def test_a_volley_that_comes_while_it_waits_again_and_again(spawn: Spawn) -> None:
+    """Python's handler would come within `Event.wait`, and wait for the lock that `wait` holds."""
+    process = spawn(WAITS.format(wait="while not stop.wait(1e-6): pass"))
+    for _ in range(300):
+        process.send_signal(signal.SIGTERM)
+    ended(process)
+
+
+def test_a_signal_that_another_thread_was_handed(spawn: Spawn) -> None:
+    """The main thread, asleep without a timeout, would never hear of it."""
+    hand_over = "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})"
+    other = "threading.Thread(target=threading.Event().wait, daemon=True).start()"
+    process = spawn(WAITS.format(wait=f"import signal; {other}; {hand_over}; stop.wait()"))
+    process.send_signal(signal.SIGTERM)
+    ended(process)
+
+
+def test_the_handlers_are_restored_and_another_thread_changes_none() -> None:
+    before = [signal.getsignal(number) for number in NUMBERS]
+    with stop_on_signals(threading.Event()) as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.wait(10.0)
+    assert [signal.getsignal(number) for number in NUMBERS] == before
+    seen = []
+
+    def elsewhere() -> None:
+        with stop_on_signals(threading.Event()):
+            seen.extend(signal.getsignal(number) for number in NUMBERS)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert seen == before

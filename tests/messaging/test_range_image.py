@@ -81,7 +81,7 @@ def see_ghosts(ranges, lone, rng):
 @pytest.mark.parametrize(
     ("spoil", "noise", "doubt"),
     [
-        *((drop(share), noise, 0) for share in (0.0, 0.1, 0.3) for noise in (0.0, 0.03)),
+        *((drop(share), noise, 0) for share, noise in ((0.0, 0.0), (0.1, 0.0), (0.3, 0.03))),
         (see_through, 0.0, 1),
         (see_ghosts, 0.0, 0),
     ],
@@ -103,7 +103,7 @@ def test_nothing_is_where_it_is_said_to_be_free(spoil, noise, doubt, seed):
 @pytest.mark.parametrize(("dropped", "least"), [(0.0, 0.6), (0.1, 0.25)])
 def test_much_of_what_is_free_is_said_to_be(dropped, least):
     shares = []
-    for seed in range(12):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         obstacles = hall(rng)
         image = taken(rng, obstacles)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.errors import BadDescription, UnknownRobot, UnknownTask
-from brakeline.messaging.robot import ROBOTS_FOLDER, Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import ROBOTS_FOLDER, Disc, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import UNITS, describe, read_robot, robot_from_description
 from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
 from tests.robots import GROUND, ROBOTS
@@ -164,8 +164,9 @@ def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
     robot = robot_named(str(tmp_path / "my.toml"))
     assert robot.name == "minted" and robot == replace(robot_named("ground"), name="minted")
     assert robot_named(f"{tmp_path / 'my.toml'}-late") == robot.in_real_time()
-    with pytest.raises(UnknownRobot, match="no robot is called 'minted'"):
+    with pytest.raises(UnknownRobot, match=r"no robot is called 'minted'.*ground") as caught:
         robot_named("minted")
+    assert caught.value.field == "robot"
     with pytest.raises(UnknownTask, match="minted has no task"):
         robot_with_task(str(tmp_path / "my.toml"))
     assert robot_maybe_with_task(str(tmp_path / "my.toml")) == robot
@@ -210,3 +211,16 @@ def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():
     assert not robot.is_standing(state) and robot.is_standing(np.array([9.0, 9.0, 1.0, 0.04, 0.0]))
     with pytest.raises(UnknownRobot, match="no real-time mode"):
         robot.in_real_time()
+
+
+def test_a_ramp_goes_down_step_by_step():
+    robot = replace(GROUND, horizon=6, free_steps=2, brake_steps=4)
+    plan = (robot.plan_matrix() @ [0.1, 0.2, 0.2, 0.4]).reshape(6, 2)
+    assert np.allclose(plan[:, 0], [0.1, 0.2, 0.15, 0.1, 0.05, 0.0])
+    assert np.allclose(plan[:, 1], [0.2, 0.4, 0.3, 0.2, 0.1, 0.0])
+
+
+def test_the_layout_changes_with_whatever_two_processes_must_share():
+    assert GROUND.layout() == replace(GROUND).layout()
+    assert GROUND.layout() != replace(GROUND, body=(Disc((0.0, 0.0), 0.1),)).layout()
+    assert GROUND.layout() != replace(GROUND, action_high=(0.25, 0.6)).layout()

@@ -41,8 +41,3 @@ def test_no_question_is_recorded_and_the_recorders_hear_all_that_is() -> None:
     assert RECORDED
     for topic in RECORDED:
         assert topic.delivery is Delivery.BLOCK and {"recorder", "viewer", "launcher"} <= set(topic.listeners)
-
-
-@each
-def test_stale_is_three_periods(topic: Topic) -> None:
-    assert topic.stale_after == (None if topic.rate is None else 3.0 / topic.rate)
