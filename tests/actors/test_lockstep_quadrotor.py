@@ -73,12 +73,14 @@ def test_a_flight_over_mavlink_equals_one_without_it(rules: str) -> None:
         assert period.subsamples == pytest.approx(direct.subsamples, abs=1e-3)
         assert period.clearance == pytest.approx(direct.clearance, abs=1e-3)
         assert period.closest <= direct.closest + 1e-3  # sampled more often
+    with pytest.raises(BadInput):
+        vehicle.step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_the_error_of_telemetry_stays_within_the_measurement_bound() -> None:
     vehicle, rng = LockstepQuadrotor(embedded("px4"), QUADROTOR), np.random.default_rng(2)
     worst = np.zeros(9)
-    for _ in range(400):
+    for _ in range(150):
         before = vehicle.measured[:3]
         period = vehicle.step(vehicle.input + rng.choice([-0.8, 0.8], 3))
         worst = np.maximum(worst, np.abs(period.measured - period.true))
@@ -100,11 +102,6 @@ def test_periods_are_shorter_than_the_setpoint_timeout() -> None:
 def test_collisions_come_from_the_simulator() -> None:
     vehicle = LockstepQuadrotor(embedded("px4", Obstacle(CYLINDER, (3.0, 0.0, 10.0), (0.5, 10.0))), QUADROTOR)
     assert any(vehicle.step(np.array([3.0, 0.0, 0.0])).collision for _ in range(12))
-
-
-def test_an_input_of_nan_is_refused() -> None:
-    with pytest.raises(BadInput):
-        LockstepQuadrotor(embedded("px4"), QUADROTOR).step(np.array([np.nan, 0.0, 0.0]))
 
 
 def test_the_tap_gets_every_frame_and_each_can_be_decoded() -> None:

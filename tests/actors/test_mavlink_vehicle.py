@@ -74,6 +74,9 @@ def speed(vehicle: MavlinkVehicle) -> float:
     return float(np.linalg.norm(vehicle.current_period.report.measured[3:6]))
 
 
+of_one_autopilot = pytest.mark.parametrize("shared_flight", RULES[:1], indirect=True)
+
+
 def setpoints(frames: list[CapturedFrame]) -> list[tuple[float, float, float]]:
     """Return the setpoints [m/s, ENU] without repetitions."""
     sent = [f.message for f in frames if f.name.endswith("SET_POSITION_TARGET_LOCAL_NED")]
@@ -101,9 +104,8 @@ def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float]
         until(lambda: not autopilot.flight.armed, "it disarms on the ground", 15.0)
 
 
-@pytest.mark.parametrize("rules", RULES)
-def test_the_autopilot_brakes_when_the_link_dies(rules: str) -> None:
-    with flight_of(rules) as (vehicle, autopilot, _):
+def test_the_autopilot_brakes_when_the_link_dies() -> None:
+    with flight_of("px4") as (vehicle, autopilot, _):
         for _ in range(8):
             vehicle.step(np.array([2.0, 0.0, 0.0]))
         vehicle.close()
@@ -122,6 +124,7 @@ def test_a_plan_is_flown_input_by_input_and_then_the_vehicle_hovers(flying: Flyi
     assert setpoints(frames) == [(0.0, 0.0, 0.0), *(tuple(row) for row in plan)]
 
 
+@of_one_autopilot
 def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, _, _ = flying
     monkeypatch.setattr(vehicle, "_robot", replace(QUADROTOR, action_slew=(0.2, 0.2, 0.2)))
@@ -131,6 +134,7 @@ def test_inputs_keep_to_the_robots_slew(flying: Flying, monkeypatch: pytest.Monk
     assert inputs == pytest.approx([0.2, 0.4, 0.6, 0.4, 0.2])
 
 
+@of_one_autopilot
 def test_a_late_plan_does_not_count_and_a_newer_one_does(flying: Flying) -> None:
     vehicle, _, _ = flying
     first, second = np.full((3, 3), 0.3), np.full((3, 3), 0.6)
@@ -150,6 +154,7 @@ def recovers(vehicle: MavlinkVehicle) -> bool:
     return any(not vehicle.wait(vehicle.current_period.number + 1).lost for _ in range(25))
 
 
+@of_one_autopilot
 def test_without_telemetry_the_period_is_lost_and_the_plan_goes_on(flying: Flying) -> None:
     vehicle, autopilot, _ = flying
     assert vehicle.commit(np.full((9, 3), 0.4), vehicle.current_period.number + 2)
@@ -171,6 +176,7 @@ def test_one_missing_quantity_is_lost_telemetry(flying: Flying) -> None:
     assert vehicle.timing.figures()["periods without telemetry"] >= 1
 
 
+@of_one_autopilot
 def test_a_period_outside_of_the_geofence_is_lost(flying: Flying) -> None:
     vehicle, _, _ = flying
     vehicle._client.outside = "boundary"

@@ -48,9 +48,9 @@ def test_a_flight_request_survives_a_conversion(robot):
     assert request_of(pb.FlightRequest.FromString(data)) == request
 
 
-@given(numbers=st.lists(st.floats(-1e6, 1e6), min_size=21 + 3 * SAMPLES, max_size=21 + 3 * SAMPLES), lost=st.text())
-def test_a_control_period_survives_a_conversion(numbers, lost):
-    values = np.array(numbers)
+@given(lost=st.text())
+def test_a_control_period_survives_a_conversion(lost):
+    values = np.random.default_rng(0).uniform(-1e6, 1e6, 21 + 3 * SAMPLES)
     path = values[21:].reshape(SAMPLES, 3)
     report = Period(values[:9], values[9:18], True, math.inf, -0.25, path, 0.5)
     period = period_of(period_message(ControlPeriod(2**40, values[18:21], report, lost)), LATE)

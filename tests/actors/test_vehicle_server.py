@@ -82,8 +82,6 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
     second: list[pb.MavlinkFrame] = []
     with contextlib.ExitStack() as stack:
         vehicle = stack.enter_context(actor(url, first))
-        with pytest.raises(BadInput):
-            vehicle.commit(np.full((2, 3), np.nan), vehicle.current_period.number + 2)
         number = vehicle.current_period.number + 2
         plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.8, 0.0, 0.0]])
         assert vehicle.commit(plan, number) and not vehicle.commit(plan, number - 2), "that period has begun"
@@ -105,38 +103,9 @@ def test_a_dead_actors_plan_is_flown_to_its_end_and_the_next_actor_takes_over(
     assert set(np.round([m.vy for m in sent], 3)) == {0.0, 0.8, 1.5}, "no other setpoints were sent"
 
 
-def test_a_vehicle_has_one_actor_at_a_time_and_its_server_ends_with_the_flight(
-    monkeypatch: pytest.MonkeyPatch, flown: tuple[str, Autopilot]
+def test_a_vehicle_that_a_pilot_took_or_that_is_wanted_elsewhere_is_taken_over_anew(
+    flown: tuple[str, Autopilot],
 ) -> None:
-    url, autopilot = flown
-    with actor(url) as vehicle:
-        monkeypatch.setattr(vehicle_client, "HANDOVER_TIMEOUT", 0.5)
-        with pytest.raises(MavlinkError, match="another process here flies it"), actor(url):
-            pass
-        monkeypatch.undo()
-        vehicle.wait(vehicle.current_period.number + 2)
-        vehicle.leave()
-        with actor(url, height=3.0) as other:
-            assert other.current_period.number < vehicle.current_period.number, "it is taken over anew"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client_socket, pytest.raises(ConnectionRefusedError):
-        client_socket.connect(address(url, 1))
-    until(lambda: autopilot.flight.mode is not Mode.OFFBOARD, "the autopilot leaves offboard mode by its own timeout")
-
-
-def test_closing_a_flight_at_speed_brakes_the_vehicle(flown: tuple[str, Autopilot]) -> None:
-    url, autopilot = flown
-    frames: list[pb.MavlinkFrame] = []
-    with actor(url, frames) as vehicle:
-        number = vehicle.current_period.number + 2
-        vehicle.commit(np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]]), number)
-        vehicle.wait(number + 2)
-        assert np.linalg.norm(vehicle.current_period.report.measured[3:6]) > 0.5
-    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
-    sent = setpoints(frames)
-    assert sent[-1].vy == 0.0, "the plan was sent to its end"
-
-
-def test_a_vehicle_that_a_pilot_took_meanwhile_is_taken_over_anew(flown: tuple[str, Autopilot]) -> None:
     url, autopilot = flown
     with actor(url) as vehicle:
         vehicle.leave()
@@ -145,6 +114,9 @@ def test_a_vehicle_that_a_pilot_took_meanwhile_is_taken_over_anew(flown: tuple[s
         with actor(url) as next_vehicle:
             next_vehicle.wait(next_vehicle.current_period.number + 5)
             assert not next_vehicle.current_period.lost and autopilot.flight.mode is Mode.OFFBOARD
+            next_vehicle.leave()
+            with actor(url, height=3.0) as other:
+                assert other.current_period.number < next_vehicle.current_period.number
 
 
 def test_a_process_of_another_user_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,11 +140,12 @@ def test_an_invalid_link_is_an_error(flown: tuple[str, Autopilot]) -> None:
         pass
 
 
-def test_an_invalid_command_is_skipped_and_the_flight_goes_on(
+def test_invalid_commands_are_skipped_the_flight_goes_on_and_its_end_brakes_the_vehicle(
     flown: tuple[str, Autopilot], caplog: pytest.LogCaptureFixture
 ) -> None:
-    rejected, url = RejectedMessages(), flown[0]
-    with caplog.at_level("INFO", "brakeline"), actor(url, rejected=rejected) as vehicle:
+    rejected, (url, autopilot) = RejectedMessages(), flown
+    frames: list[pb.MavlinkFrame] = []
+    with caplog.at_level("INFO", "brakeline"), actor(url, frames, rejected=rejected) as vehicle:
         raw = vehicle._socket._socket
         for payload in (b"\xff", b"\x80\x04\x95\x00.", b"x" * LARGEST, b"x" * (LARGEST + 1)):
             raw.send(payload)
@@ -193,13 +166,21 @@ def test_an_invalid_command_is_skipped_and_the_flight_goes_on(
         assert reply is not None and reply.error.type == "BadMessage" and not reply.in_time
         after = vehicle.wait(vehicle.current_period.number + 3)
         assert not after.input.any() and not after.lost, "no invalid plan was flown"
-        assert vehicle.commit(np.full((1, 3), 0.3), after.number + 2), "a valid plan still counts"
         until(lambda: rejected.count >= 11, "the server's count")
+        number = vehicle.current_period.number + 2
+        plan = np.array([[0.8, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 0.0, 0.0], [0.7, 0.0, 0.0]])
+        assert vehicle.commit(plan, number), "a valid plan still counts"
+        vehicle.wait(number + 2)
+        assert np.linalg.norm(vehicle.current_period.report.measured[3:6]) > 0.5
+    assert np.linalg.norm(autopilot.vehicle.state()[3:6]) < 0.3
+    assert setpoints(frames)[-1].vy == 0.0, "the plan was sent to its end"
     lines = [record.message for record in caplog.records if "passed over" in record.message]
     assert lines and "vehicle command" in lines[0], "the actor's log says so"
 
 
-def test_an_invalid_flight_request_gets_an_error_and_the_next_actor_is_served(flown: tuple[str, Autopilot]) -> None:
+def test_an_invalid_flight_request_gets_an_error_and_one_actor_at_a_time_is_served(
+    monkeypatch: pytest.MonkeyPatch, flown: tuple[str, Autopilot]
+) -> None:
     url, _ = flown
     server = subprocess.Popen([sys.executable, "-P", "-m", "brakeline.actors.mavlink.vehicle_server", url, "1"])
     try:
@@ -220,8 +201,12 @@ def test_an_invalid_flight_request_gets_an_error_and_the_next_actor_is_served(fl
                 client.receive(pb.VehicleMessage)
             client.close()
         with actor(url) as vehicle:
+            monkeypatch.setattr(vehicle_client, "HANDOVER_TIMEOUT", 0.5)
+            with pytest.raises(MavlinkError, match="another process here flies it"), actor(url):
+                pass
             vehicle.wait(vehicle.current_period.number + 2)
-        assert server.wait(30.0) == 0
+        assert server.wait(30.0) == 0, "it ends with the flight"
+        assert connect(url, 1) is None
     finally:
         server.kill()
         server.wait()
