@@ -8,7 +8,7 @@ from brakeline.errors import BusError, Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import request_message
-from tests.actors.no_answer import no_answer
+from tests.actors.conftest import no_answer
 from tests.robots import GROUND
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])

@@ -12,7 +12,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
-from tests.actors.no_answer import no_answer
+from tests.actors.conftest import no_answer
 from tests.robots import GROUND
 
 SIZE = 4

@@ -13,7 +13,7 @@ from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2.cdr_messages import DiagnosticArray, DiagnosticStatus, MarkerArray, decode, encode
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.service.wire import decision_of
-from tests.actors.no_answer import no_answer
+from tests.actors.conftest import no_answer
 from tests.robots import GROUND
 
 ROBOT = GROUND.in_real_time()

@@ -6,7 +6,6 @@ import time
 from contextlib import contextmanager
 
 import numpy as np
-import pytest
 
 from brakeline.actors.ros2.command_gate import LATE
 from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings
@@ -26,8 +25,7 @@ from brakeline.messaging.ros2.cdr_messages import (
     twist,
 )
 from tests.actors.ros2.test_command_gate import allow
-from tests.actors.ros2.test_laser_obstacles import BEAMS, scan_of
-from tests.actors.ros2.test_ros_inputs import odometry, transform
+from tests.actors.ros2.test_ros_inputs import BEAMS, odometry, scan_of, transform
 from tests.waiting import until
 
 # Wide, for a busy machine: only the absence of a message shows that its sender is silent.
@@ -119,17 +117,21 @@ def steered(simulated=False, stamped=False, ask=allow):
             assert not thread.is_alive()
 
 
-@pytest.mark.parametrize(
-    ("what", "because"),
-    [("odometry", "odometry is"), ("scan", "the scan is"), ("command", "no command"), ("numbers", "holds NaN")],
-)
-def test_a_missing_input_stops_the_robot_until_it_comes_again(what, because):
-    with steered() as (robot, _):
+def test_a_missing_input_stops_the_robot_until_it_comes_again_and_the_end_of_the_process_does():
+    with steered() as (robot, node_under_test):
+        for what, because in (
+            ("odometry", "odometry is"),
+            ("scan", "the scan is"),
+            ("command", "no command"),
+            ("numbers", "holds NaN"),
+        ):
+            robot.drives()
+            robot.mute.add(what)
+            robot.stops(because)
+            robot.mute.clear()
         robot.drives()
-        robot.mute.add(what)
-        robot.stops(because)
-        robot.mute.clear()
-        robot.drives()
+    assert robot.speeds[-1] == 0.0 and not node_under_test.gate.backup_plan.plan.any()
+    assert node_under_test.gate.stats.kinds["allowed"] > 0
 
 
 def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
@@ -188,10 +190,3 @@ def test_clocks_that_differ_stop_the_robot():
         robot.stops("odometry is")
         robot.offset = 20.0
         robot.stops("in the future")
-
-
-def test_the_process_ends_with_a_stop():
-    with steered() as (robot, node_under_test):
-        robot.drives()
-    assert robot.speeds[-1] == 0.0 and not node_under_test.gate.backup_plan.plan.any()
-    assert node_under_test.gate.stats.kinds["allowed"] > 0
