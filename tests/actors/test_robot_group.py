@@ -9,7 +9,6 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, decide
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
 from tests.actors.conftest import no_answer
@@ -83,15 +82,6 @@ def test_without_reservations_the_same_robots_touch(ask):
     begin_close_together(fleet)
     drive(fleet, ask, "adversary", 60)
     assert fleet.world.touches > 0
-
-
-def test_a_filter_that_ignores_reservations_lets_robots_touch(ask, monkeypatch):
-    """A mutant of the filter: robots make reservations, and no plan avoids them."""
-    monkeypatch.setattr(OtherReservations, "nearest", lambda self, point: np.full(len(self), np.inf))
-    fleet = fleet_of()
-    begin_close_together(fleet)
-    least, _ = drive(fleet, ask, "adversary", 60)
-    assert least < -ROUNDING and fleet.world.touches > 0
 
 
 def test_without_answers_all_robots_stop_within_their_reservations(ask):

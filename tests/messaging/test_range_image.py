@@ -15,7 +15,7 @@ from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
-from brakeline.safety.perception.image_coverage import BeamGrid, SphereCover, patch_free_ranges
+from brakeline.safety.perception.image_coverage import patch_free_ranges
 from tests.messaging.test_obstacle import cast, sample
 from tests.robots import QUADROTOR
 
@@ -134,15 +134,6 @@ def test_what_is_not_seen_is_not_free():
     elevations = grid.elevations
     assert (free[np.abs(elevations) > 0.5] == 0.0).all() and free[len(elevations) // 2].min() > 1.0
     assert abs(elevations[0]) <= 0.5 * math.pi and elevations[0] < -0.5 * math.pi + belt.step[0]
-
-
-def test_the_closer_beams_are_the_more_they_show():
-    wide, close = (SphereCover.of(half, half) for half in (0.05, 0.025))
-    far = [cover.free(np.full((1, 1), 5.0, np.float32), 1.0) for cover in (close, wide)]
-    assert close.within < wide.within and far[0] > far[1]
-    assert BeamGrid.of(RINGS, COLUMNS, -EDGE, EDGE).half_diagonal == pytest.approx(
-        0.5 * math.hypot(math.radians(4.0), math.radians(4.0))
-    )
 
 
 def test_an_image_crosses_the_wire_and_its_ranges_never_grow():

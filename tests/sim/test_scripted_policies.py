@@ -1,6 +1,4 @@
-"""Scripted policies of both robots drive as their classes say. A point mass without physics stands in for the
-quadrotor.
-"""
+"""Scripted policies of both robots drive as their classes say."""
 
 from itertools import pairwise
 from typing import Any
@@ -19,7 +17,6 @@ from brakeline.sim.quadrotor_policies import QuadrotorCarefulPolicy, QuadrotorRo
 from brakeline.sim.scripted_policies import scripted
 from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR, ROBOTS
-from tests.sim.kinematic import PointMass
 
 NO_OBSERVATION = np.zeros(189, np.float32)
 each_robot = pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
@@ -29,7 +26,7 @@ class Episodes:
     """The infos of all steps in episodes of a scripted policy."""
 
     def __init__(self, robot: RobotWithTask, policy_name: str, arena: str, episodes: int) -> None:
-        env = NavigationEnv(robot, arena, PointMass if robot is QUADROTOR else None)
+        env = NavigationEnv(robot, arena, Quadrotor if robot is QUADROTOR else None)
         policy = scripted(policy_name, robot, np.random.default_rng(1))
         self.infos = list[list[dict[str, Any]]]()
         for episode in range(episodes):
@@ -144,8 +141,8 @@ def staged_info(
 
 
 def flown_to_goal(arena: Arena, policy: QuadrotorRoutePolicy, most: int) -> np.ndarray:
-    """Return the true states (k, 9) of a point mass on its way to the goal, without a collision in `most` steps."""
-    vehicle, states = PointMass(arena, np.random.default_rng(0)), list[np.ndarray]()
+    """Return the true states (k, 9) of a quadrotor on its way to the goal, without a collision in `most` steps."""
+    vehicle, states = Quadrotor(arena, np.random.default_rng(0)), list[np.ndarray]()
     while not states or np.linalg.norm(vehicle.true[:3] - arena.goal) >= 1.0:
         assert len(states) < most, "the policy did not arrive"
         info = {"arena": arena, "goal": arena.goal, "state": vehicle.measured, "input_in_force": vehicle.input}
