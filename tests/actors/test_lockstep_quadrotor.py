@@ -118,21 +118,6 @@ def test_the_tap_gets_every_frame_and_each_can_be_decoded() -> None:
     assert json.loads(json.dumps(sent.fields))["vy"] == pytest.approx(0.5)  # east
 
 
-def test_client_and_simulated_autopilot_agree_on_frames() -> None:
-    sent: list[bytes] = []
-    client = AutopilotClient(sent.append)
-    client.setpoint(np.array([1.0, 2.0, 3.0]))
-    message = mavlink.MAVLink(None).parse_buffer(sent[0])[0]
-    assert (message.vx, message.vy, message.vz) == (2.0, 1.0, -3.0)
-    assert message.type_mask == 0x0DC7 and message.coordinate_frame == mavlink.MAV_FRAME_LOCAL_NED
-
-    autopilot = embedded("ardupilot")
-    vehicle = LockstepQuadrotor(autopilot, QUADROTOR)
-    for _ in range(10):
-        vehicle.step(np.array([3.0, -2.0, 1.0]))  # tilted, and accelerating
-    assert vehicle.measured[6:] == pytest.approx(vehicle.true[6:], abs=0.3)
-
-
 def test_a_missing_autopilot_and_refusals_are_errors() -> None:
     client = AutopilotClient(lambda _: None)
     with pytest.raises(NoAutopilot):

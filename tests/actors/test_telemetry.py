@@ -32,7 +32,6 @@ from brakeline.actors.mavlink.telemetry import (
     rotate,
 )
 from brakeline.errors import MavlinkError, TelemetryMissing
-from brakeline.sim.autopilot import ned_frames
 from tests.robots import QUADROTOR
 
 ROLL, PITCH, YAW = 0.2, -0.3, 1.1  # rad
@@ -96,15 +95,6 @@ def test_body_frame_odometry_is_rotated_and_an_unknown_frame_ignored() -> None:
     level = math.cos(PITCH)
     assert ahead == pytest.approx([level * math.sin(YAW), level * math.cos(YAW), math.sin(PITCH)], abs=1e-6)
     assert read(odometry(frame=20)) is None and SOURCES[ATTITUDE][1].read(odometry(frame=20)) is None
-
-
-def test_the_rotation_agrees_with_the_simulated_autopilot() -> None:
-    """A vector in the body frame, rotated by the attitude that the autopilot sends, is the simulator's vector."""
-    body = (0.3, -0.2, 9.0)  # forward-left-up
-    own = quaternion()  # taken for ENU from forward-left-up
-    autopilot = np.array(ned_frames.rotate(own, body))
-    north, east, down = rotate(ned_frames.attitude(own), ned_frames.body(body))
-    assert [east, north, -down] == pytest.approx(autopilot)
 
 
 class ScriptedAutopilot:

@@ -16,27 +16,12 @@ import zenoh
 
 from brakeline.errors import BadKeys, BusError, NoReply, Unreachable
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging import topics
 from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
 from brakeline.messaging.bus.access_control import MOST_ROBOTS, grants
 from brakeline.messaging.bus.bus_settings import local
 from brakeline.messaging.free_ports import HERE, free_endpoint
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.topics import (
-    DECIDE,
-    FLOW,
-    HEALTH,
-    JOIN,
-    LOG,
-    LOGGED,
-    MODEL,
-    ROLES,
-    SIMULATORS,
-    STEP,
-    TOPICS,
-    WEIGHTS,
-    Delivery,
-    Topic,
-)
 from tests.messaging.keyring import keyring
 from tests.waiting import until
 
@@ -93,7 +78,7 @@ def secure(keys: Path) -> Iterator[System]:
 
 
 @contextmanager
-def heard(listener: Bus, topic: Topic) -> Iterator[list[Sample]]:
+def heard(listener: Bus, topic: topics.Topic) -> Iterator[list[Sample]]:
     got: list[Sample] = []
     listener.subscribe(topic, got.append)
     time.sleep(JOINED)
@@ -102,12 +87,12 @@ def heard(listener: Bus, topic: Topic) -> Iterator[list[Sample]]:
 
 CASES = [
     # what only one role may say, who says it, who hears it, and the keys at which somebody else tries to
-    (MODEL, "certify", "safety", ("model/ground/certify", "model/ground/actor-1")),
-    (WEIGHTS, "learner", "actor-0", ("weights/ground",)),
-    (FLOW, "learner", "actor-0", ("flow/ground",)),
-    (STEP, "actor-0", "learner", ("step/ground/actor-0", "step/ground/actor-2", "step/ground/actor-10")),
-    (LOGGED, "feeder", "learner", ("logged/ground/actor-1",)),
-    (HEALTH, "actor-0", "recorder", ("health/actor-0", "health/safety")),
+    (topics.MODEL, "certify", "safety", ("model/ground/certify", "model/ground/actor-1")),
+    (topics.WEIGHTS, "learner", "actor-0", ("weights/ground",)),
+    (topics.FLOW, "learner", "actor-0", ("flow/ground",)),
+    (topics.STEP, "actor-0", "learner", ("step/ground/actor-0", "step/ground/actor-2", "step/ground/actor-10")),
+    (topics.LOGGED, "feeder", "learner", ("logged/ground/actor-1",)),
+    (topics.HEALTH, "actor-0", "recorder", ("health/actor-0", "health/safety")),
 ]
 
 
@@ -118,7 +103,8 @@ def test_what_one_role_may_say_nobody_else_can(system: System) -> None:
         for (topic, owner, _, keys_tried), samples in zip(CASES, got, strict=True):
             for key in keys_tried:
                 attacker.put(f"brakeline/{key}", b"evil")
-            names = {"source": "actor-0"} if topic is LOGGED else {"source": "actor-0.3"} if topic is STEP else {}
+            source = {"logged": "actor-0", "step": "actor-0.3"}.get(topic.name)  # a robot of the actor
+            names = {} if source is None else {"source": source}
             names |= {"robot": "ground"} if "{robot}" in topic.key else {}
             system.join(owner).publisher(topic, **names).put(topic.message())
             until(lambda: any(sample.payload != b"evil" for sample in samples), topic.name)  # noqa: B023
@@ -142,13 +128,13 @@ def test_a_second_queryable_answers_nobody(system: System) -> None:
         attacker.declare_queryable(key, evil, complete=True)
     time.sleep(JOINED)
     if system.keys is None:
-        assert asker.ask(DECIDE, b"?", 10.0, robot="ground") == b"allowed"
+        assert asker.ask(topics.DECIDE, b"?", 10.0, robot="ground") == b"allowed"
         return
     with pytest.raises(NoReply):
-        asker.ask(DECIDE, b"?", 2.0, robot="ground")
-    system.join("safety").serve(DECIDE, lambda payload, asker: b"verified")
+        asker.ask(topics.DECIDE, b"?", 2.0, robot="ground")
+    system.join("safety").serve(topics.DECIDE, lambda payload, asker: b"verified")
     time.sleep(JOINED)
-    assert {asker.ask(DECIDE, b"?", 10.0, robot="ground") for _ in range(200)} == {b"verified"}
+    assert {asker.ask(topics.DECIDE, b"?", 10.0, robot="ground") for _ in range(200)} == {b"verified"}
 
 
 WILD = {  # by role: keys that a client of the role may not publish at, and one that it may
@@ -161,7 +147,9 @@ WILD = {  # by role: keys that a client of the role may not publish at, and one 
 def test_a_key_with_a_wildcard_reaches_nobody(system: System) -> None:
     """A publication at a wildcard reaches the subscribers of all keys that it matches; each one would refuse it."""
     listener = system.join("recorder")
-    with heard(listener, LOG) as got, heard(listener, HEALTH) as signs, heard(listener, STEP) as steps:
+    with ExitStack() as stack:
+        kinds = (topics.LOG, topics.HEALTH, topics.STEP)
+        got, signs, steps = (stack.enter_context(heard(listener, topic)) for topic in kinds)
         for name, (keys, honest) in WILD.items():
             attacker, before = system.attacker(name), listener.rejected.count
             for key in keys:
@@ -177,7 +165,7 @@ def test_nobody_asks_under_the_name_of_another(system: System) -> None:
     """The name in the key of a query decides whose turn it is, for whom a token is, and who joins the learner."""
     attacker = system.attacker("actor-1")
     askers: list[str] = []
-    for source, topic in (("safety", DECIDE), ("learner", JOIN)):
+    for source, topic in (("safety", topics.DECIDE), ("learner", topics.JOIN)):
         system.join(source).serve(topic, lambda payload, asker: askers.append(asker) or b"answer")
     time.sleep(JOINED)
     for root in ("safety/ground/decide", "learner/ground/join"):
@@ -203,11 +191,11 @@ def test_an_eavesdropper_on_everything_hears_nothing(system: System) -> None:
     attacker.liveliness().declare_subscriber("**", lambda sample: overheard.append(str(sample.key_expr)), history=True)
     time.sleep(JOINED)
     actor = system.join("actor-0")
-    with heard(system.join("recorder"), STEP) as got:
-        actor.publisher(STEP, robot="ground").put(pb.Step())
-        actor.publisher(HEALTH).put(pb.Health())
+    with heard(system.join("recorder"), topics.STEP) as got:
+        actor.publisher(topics.STEP, robot="ground").put(pb.Step())
+        actor.publisher(topics.HEALTH).put(pb.Health())
         with pytest.raises(BusError):
-            actor.ask(DECIDE, b"?", 0.5, robot="ground")
+            actor.ask(topics.DECIDE, b"?", 0.5, robot="ground")
         until(lambda: len(got) >= 1)
     time.sleep(JOINED)
     assert bool(overheard) == (system.keys is None), overheard
@@ -248,9 +236,9 @@ def test_a_name_that_is_struck_out_can_do_nothing(keys: Path, tmp_path: Path) ->
     (router_keys / "names").write_text("\n".join(name for name in names if name != "actor-1"))
     system = System(router_keys)
     revoked, honest = system.join("actor-1"), system.join("actor-0")
-    with heard(system.join("learner"), STEP) as got:
-        revoked.publisher(STEP, robot="ground").put(pb.Step())
-        honest.publisher(STEP, robot="ground").put(pb.Step())
+    with heard(system.join("learner"), topics.STEP) as got:
+        revoked.publisher(topics.STEP, robot="ground").put(pb.Step())
+        honest.publisher(topics.STEP, robot="ground").put(pb.Step())
         until(lambda: len(got) == 1)
         time.sleep(JOINED)
         assert [sample.key for sample in got] == ["step/ground/actor-0"]
@@ -259,7 +247,7 @@ def test_a_name_that_is_struck_out_can_do_nothing(keys: Path, tmp_path: Path) ->
 
 def test_the_table_works_with_keys(secure: System) -> None:
     """Whoever the table lets speak is heard by all whom it lets listen: nothing honest is shut out."""
-    for topic in TOPICS:
+    for topic in topics.TOPICS:
         listeners, speakers = (
             [secure.join("actor-0" if role == "actor" else role) for role in roles if role not in left_out]
             for roles, left_out in (
@@ -268,9 +256,9 @@ def test_the_table_works_with_keys(secure: System) -> None:
             )
         )
         robot = {"robot": "ground"} if "{robot}" in topic.key else {}
-        if topic.delivery is Delivery.QUERY:
+        if topic.delivery is topics.Delivery.QUERY:
             for listener in listeners:
-                listener.serve(topic, lambda payload, asker: b"answer", **({} if topic is DECIDE else robot))
+                listener.serve(topic, lambda payload, asker: b"answer", **({} if topic is topics.DECIDE else robot))
             time.sleep(JOINED)
             assert {speaker.ask(topic, b"?", 5.0, **robot) for speaker in speakers} == {b"answer"}, topic.name
             continue
@@ -295,17 +283,17 @@ def test_who_looks_on_knows_who_lives(secure: System) -> None:
     until(lambda: ("actor-0", False) in comes)
 
 
-@pytest.mark.parametrize("role", sorted({*ROLES} - {"router"}))
+@pytest.mark.parametrize("role", sorted({*topics.ROLES} - {"router"}))
 def test_a_role_is_granted_what_the_table_says_and_no_more(role: str) -> None:
     granted = grants(f"{role}-7", "brakeline")
     keys = {key for flow, messages, key in granted if flow == "ingress" and "put" in messages}
-    own = {topic for topic in TOPICS if role in topic.publishers and topic.delivery is not Delivery.QUERY}
+    own = {topic for topic in topics.TOPICS if role in topic.publishers and topic.delivery is not topics.Delivery.QUERY}
     assert {key.split("/")[1] for key in keys} == {topic.key.split("/")[0] for topic in own}
     for key in keys:
         root = key.split("/")[1]
         if root not in ("weights", "flow", "metrics", "logged"):
             assert "*" not in key.split("/")[-1], "under exact names"
-            robots = {f"{role}-7.{number}" for number in range(MOST_ROBOTS)} if role in SIMULATORS else set()
+            robots = {f"{role}-7.{number}" for number in range(MOST_ROBOTS)} if role in topics.SIMULATORS else set()
             assert key.split("/")[-1] in {f"{role}-7"} | robots, "under its own name"
     answers = {key for _, messages, key in granted if "declare_queryable" in messages and "reply" in messages}
     asks = {key for flow, messages, key in granted if flow == "ingress" and "query" in messages}
@@ -346,7 +334,7 @@ def test_without_keys_on_purpose_every_health_says_so() -> None:
     got: list[Sample] = []
     settings = BusSettings(listen=(f"tcp/0.0.0.0:{port}",), insecure=True)
     with Process(settings, "safety", stderr=False) as process:
-        process.bus.subscribe(HEALTH, got.append)
+        process.bus.subscribe(topics.HEALTH, got.append)
         for _ in range(3):
             before = len(got)
             process.announce()

@@ -15,31 +15,21 @@ from rosbags.typesys.stores import Stores, get_typestore
 from brakeline.errors import BadRosName, Malformed, Unreachable
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.ros2 import LATCHED, SENSOR, GraphEntity, Qos, RosNode, RosSettings
-from brakeline.messaging.ros2.cdr_messages import (
-    Clock,
-    DiagnosticArray,
-    LaserScan,
-    MarkerArray,
-    Odometry,
-    TFMessage,
-    Twist,
-    TwistStamped,
-    decode,
-    digest_of,
-    encode,
-    header,
-    quaternion,
-    seconds,
-    time_of,
-    twist,
-    type_of,
-    yaw_of,
-)
+from brakeline.messaging.ros2 import cdr_messages as cdr
 from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
 from brakeline.messaging.ros2.rmw_names import NODE, PUBLISHER, SUBSCRIPTION, full_name, ros_type, topic_key
 from tests.waiting import until
 
-KINDS = (Clock, DiagnosticArray, LaserScan, MarkerArray, Odometry, TFMessage, Twist, TwistStamped)
+KINDS = (
+    cdr.Clock,
+    cdr.DiagnosticArray,
+    cdr.LaserScan,
+    cdr.MarkerArray,
+    cdr.Odometry,
+    cdr.TFMessage,
+    cdr.Twist,
+    cdr.TwistStamped,
+)
 HASH = "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
 REFERENCE_SCRIPT = """
 import json
@@ -87,19 +77,24 @@ def test_names_tokens_and_attachments_agree_with_another_implementation(tmp_path
 
 
 def test_type_hashes_agree_with_ros():
-    expected = {Twist: "9c45bf16", TwistStamped: "5f0fcd4f", Odometry: "3cc97dc7", LaserScan: "64c19139"}
+    expected = {
+        cdr.Twist: "9c45bf16",
+        cdr.TwistStamped: "5f0fcd4f",
+        cdr.Odometry: "3cc97dc7",
+        cdr.LaserScan: "64c19139",
+    }
     for kind, begins in expected.items():
-        assert digest_of(kind).startswith(f"RIHS01_{begins}")
+        assert cdr.digest_of(kind).startswith(f"RIHS01_{begins}")
     kilted = get_typestore(Stores.ROS2_KILTED)
     for kind in KINDS:
-        assert kilted.hash_rihs01(type_of(kind)) == digest_of(kind)
+        assert kilted.hash_rihs01(cdr.type_of(kind)) == cdr.digest_of(kind)
 
 
 def test_a_twist_is_52_bytes_of_little_endian_cdr():
-    payload = encode(twist(0.25, -0.5))
+    payload = cdr.encode(cdr.twist(0.25, -0.5))
     assert len(payload) == 52 and payload[:4] == bytes((0, 1, 0, 0))
     assert np.frombuffer(payload[4:], "<f8").tolist() == [0.25, 0.0, 0.0, 0.0, 0.0, -0.5]
-    assert decode(Twist, payload) == twist(0.25, -0.5)
+    assert cdr.decode(cdr.Twist, payload) == cdr.twist(0.25, -0.5)
 
 
 def test_a_global_id_is_the_hash_of_the_token_low_half_first():
@@ -116,10 +111,10 @@ def test_an_attachment_has_33_bytes():
 
 
 def test_a_sequence_with_too_many_elements_is_malformed():
-    endless = bytearray(encode(TFMessage(transforms=[])))
+    endless = bytearray(cdr.encode(cdr.TFMessage(transforms=[])))
     endless[4:8] = (2**32 - 1).to_bytes(4, "little")
     with pytest.raises(Malformed):
-        decode(TFMessage, bytes(endless))
+        cdr.decode(cdr.TFMessage, bytes(endless))
 
 
 def test_topic_names_resolve_as_in_ros():
@@ -140,11 +135,11 @@ def test_an_invalid_token_is_refused(token):
 
 @given(st.floats(-3.1, 3.1), st.floats(0.0, 2e9))
 def test_angles_and_times_survive_a_conversion_and_what_is_no_rotation_has_no_yaw(yaw, moment):
-    rotation = quaternion(yaw)
-    assert yaw_of(rotation) == pytest.approx(yaw, abs=1e-9)
+    rotation = cdr.quaternion(yaw)
+    assert cdr.yaw_of(rotation) == pytest.approx(yaw, abs=1e-9)
     rotation.w = rotation.z = 0.0
-    assert np.isnan(yaw_of(rotation))
-    assert seconds(time_of(moment)) == pytest.approx(moment, abs=1e-6)
+    assert np.isnan(cdr.yaw_of(rotation))
+    assert cdr.seconds(cdr.time_of(moment)) == pytest.approx(moment, abs=1e-6)
 
 
 @pytest.fixture
@@ -166,36 +161,36 @@ def test_nodes_of_one_domain_receive_messages_in_order(nodes):
     nodes("router")
     sender, receiver, stranger = nodes("sender"), nodes("receiver"), nodes("stranger", domain=1)
     received, misdirected = [], []
-    receiver.subscribe("cmd_vel", Twist, lambda message: received.append(message.linear.x), Qos(depth=100))
-    stranger.subscribe("cmd_vel", Twist, misdirected.append)
-    publisher = sender.publisher("cmd_vel", Twist)
+    receiver.subscribe("cmd_vel", cdr.Twist, lambda message: received.append(message.linear.x), Qos(depth=100))
+    stranger.subscribe("cmd_vel", cdr.Twist, misdirected.append)
+    publisher = sender.publisher("cmd_vel", cdr.Twist)
 
     def first_arrived():
-        publisher.put(twist(-1.0, 0.0))
+        publisher.put(cdr.twist(-1.0, 0.0))
         return received
 
     until(first_arrived, "the first message", 20.0)
     for i in range(50):
-        publisher.put(twist(float(i), 0.0))
+        publisher.put(cdr.twist(float(i), 0.0))
     until(lambda: received[-1] == 49.0, "the last message", 20.0)
     assert [value for value in received if value >= 0.0] == [float(i) for i in range(50)]
     assert not misdirected
     with pytest.raises(TypeError, match="Twist"):
-        publisher.put(header(0.0, "odom"))
+        publisher.put(cdr.header(0.0, "odom"))
 
 
 def test_a_later_subscriber_gets_latched_messages(nodes):
     early = nodes("early")
-    early.publisher("/tf_static", TFMessage, LATCHED).put(TFMessage(transforms=[]))
+    early.publisher("/tf_static", cdr.TFMessage, LATCHED).put(cdr.TFMessage(transforms=[]))
     received = []
-    nodes("late").subscribe("/tf_static", TFMessage, received.append, LATCHED)
+    nodes("late").subscribe("/tf_static", cdr.TFMessage, received.append, LATCHED)
     until(lambda: received, "the transforms of before", 20.0)
 
 
 def test_the_graph_lists_all_entities_of_a_node_until_it_is_closed(nodes):
     watcher, robot = nodes("watcher"), nodes("robot", namespace="/a")
-    robot.publisher("odom", Odometry)
-    robot.subscribe("cmd_vel", Twist, print, SENSOR)
+    robot.publisher("odom", cdr.Odometry)
+    robot.subscribe("cmd_vel", cdr.Twist, print, SENSOR)
     wanted = {(NODE, "/a", "robot", "", ""), (NODE, "/", "watcher", "", "")}
     wanted |= {(PUBLISHER, "/a", "robot", "/a/odom", "nav_msgs/msg/Odometry")}
     wanted |= {(SUBSCRIPTION, "/a", "robot", "/a/cmd_vel", "geometry_msgs/msg/Twist")}
@@ -211,8 +206,8 @@ def test_the_graph_lists_all_entities_of_a_node_until_it_is_closed(nodes):
 def test_an_invalid_message_does_not_stop_the_next_one(nodes, caplog):
     router, node = nodes("router"), nodes("node")
     received = []
-    node.subscribe("cmd_vel", Twist, lambda message: received.append(message.linear.x))
-    publisher = router.publisher("cmd_vel", Twist)
+    node.subscribe("cmd_vel", cdr.Twist, lambda message: received.append(message.linear.x))
+    publisher = router.publisher("cmd_vel", cdr.Twist)
     raw = router._session.declare_publisher(topic_key(0, "/cmd_vel", "geometry_msgs/msg/Twist", "any"))
 
     def send_invalid():
@@ -220,7 +215,7 @@ def test_an_invalid_message_does_not_stop_the_next_one(nodes, caplog):
         return node.rejected.count
 
     until(send_invalid, "the invalid message", 20.0)
-    publisher.put(twist(1.0, 0.0))
+    publisher.put(cdr.twist(1.0, 0.0))
     until(lambda: received == [1.0], "a message after it", 20.0)
     assert "/cmd_vel: Malformed: not a geometry_msgs/msg/Twist" in caplog.text
 

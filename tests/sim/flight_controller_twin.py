@@ -12,18 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from brakeline.messaging.obstacle import Array
-from brakeline.sim.kernels.flight_kernels import (
-    AIRFRAME,
-    EASE,
-    GAINS,
-    GRAVITY,
-    LAGS,
-    OUTER,
-    OUTER_EVERY,
-    RAMP,
-    ROUND,
-    STOPPED,
-)
+from brakeline.sim.kernels import flight_kernels as kernels
 
 MIXER = np.array([[-1, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])  # torques of each rotor about x, y and z
 
@@ -40,59 +29,59 @@ class FlightController:
 
     def __init__(self) -> None:
         self.setpoint, self.target, self.reference, self.velocity, self.integral = np.zeros((5, 3))
-        self.allowance, self.hold = np.full(3, GAINS.jump), None
+        self.allowance, self.hold = np.full(3, kernels.GAINS.jump), None
         self.yaw = self.yaw_goal = self.yaw_rate = self.turn = 0.0
         self.ramped, self.rounded, self.eased, self.jerk = (
-            deque(np.zeros((size, 3)), size) for size in (RAMP, ROUND, EASE, EASE)
+            deque(np.zeros((size, 3)), size) for size in (kernels.RAMP, kernels.ROUND, kernels.EASE, kernels.EASE)
         )
-        self.delayed = [deque([0.0] * size) for size in LAGS]
+        self.delayed = [deque([0.0] * size) for size in kernels.LAGS]
         self.updates = 0
 
     def update(self, position: Array, velocity: Array, attitude: Array, rates: Array) -> Array:
         """Return the rotors' thrusts (4,) [N] for an estimated state; attitude: (w, x, y, z), world from body."""
-        if self.updates % OUTER_EVERY == 0:
+        if self.updates % kernels.OUTER_EVERY == 0:
             self._velocity_loop(position, velocity)
         self.updates += 1
         return self._attitude_loop(Rotation.from_quat(attitude, scalar_first=True).as_matrix(), rates)
 
     def _velocity_loop(self, position: Array, velocity: Array) -> None:
         """Update the wanted specific force and its first two derivatives, and the reference of the heading."""
-        g = GAINS
-        allowance = np.minimum(self.allowance + g.acceleration * OUTER, g.jump)
+        g, body = kernels.GAINS, kernels.AIRFRAME
+        allowance = np.minimum(self.allowance + g.acceleration * kernels.OUTER, g.jump)
         change = np.clip(self.setpoint - self.target, -allowance, allowance)
         self.target, self.allowance = self.target + change, allowance - np.abs(change)
-        slope = push(self.ramped, self.target) / OUTER
-        jerk = push(self.rounded, slope) / OUTER
+        slope = push(self.ramped, self.target) / kernels.OUTER
+        jerk = push(self.rounded, slope) / kernels.OUTER
         push(self.eased, np.mean(self.rounded, axis=0))
-        snap = push(self.jerk, jerk) / OUTER
+        snap = push(self.jerk, jerk) / kernels.OUTER
         feedforward = np.mean(self.eased, axis=0)
-        self.reference = self.reference + feedforward * OUTER
+        self.reference = self.reference + feedforward * kernels.OUTER
         for axis, delayed in enumerate(self.delayed):
             delayed.append(self.reference[axis])
             self.velocity[axis] = delayed.popleft()
 
         if self.setpoint.any():
             self.hold = None
-        elif self.hold is None and (np.abs(self.velocity) < STOPPED).all():
+        elif self.hold is None and (np.abs(self.velocity) < kernels.STOPPED).all():
             self.hold = position
         wanted = self.velocity + (0.0 if self.hold is None else g.position * (self.hold - position))
-        integral = self.integral + g.integral * OUTER * (wanted - velocity)
+        integral = self.integral + g.integral * kernels.OUTER * (wanted - velocity)
         self.integral = np.clip(integral, -g.integral_limit, g.integral_limit)
-        drag = g.known_drag * (AIRFRAME.drag_linear + AIRFRAME.drag_quadratic * np.linalg.norm(self.velocity))
+        drag = g.known_drag * (body.drag_linear + body.drag_quadratic * np.linalg.norm(self.velocity))
         force = feedforward + g.velocity * (wanted - velocity) + self.integral + drag * self.velocity
-        force[2] = max(force[2] + GRAVITY, 0.2 * GRAVITY)
+        force[2] = max(force[2] + kernels.GRAVITY, 0.2 * kernels.GRAVITY)
         force[:2] *= min(math.tan(g.tilt_limit) * force[2] / math.hypot(*force[:2], 1e-9), 1.0)
         self.force = force, np.mean(self.jerk, axis=0), snap
 
         if self.yaw_rate:
-            self.yaw_goal = self.yaw + self.yaw_rate * OUTER
+            self.yaw_goal = self.yaw + self.yaw_rate * kernels.OUTER
         remaining = math.remainder(self.yaw_goal - self.yaw, math.tau)
-        self.turn = min(max(remaining / OUTER, -g.yaw_rate_limit), g.yaw_rate_limit)
-        self.yaw += self.turn * OUTER
+        self.turn = min(max(remaining / kernels.OUTER, -g.yaw_rate_limit), g.yaw_rate_limit)
+        self.yaw += self.turn * kernels.OUTER
 
     def _attitude_loop(self, axes: Array, rates: Array) -> Array:
         """Return the thrusts that turn the body, whose axes are the columns of `axes`, towards the wanted force."""
-        g, body, low, high = GAINS, AIRFRAME, AIRFRAME.least_thrust, AIRFRAME.most_thrust
+        g, body = kernels.GAINS, kernels.AIRFRAME
         force, jerk, snap = (vector @ axes for vector in self.force)
         size = np.linalg.norm(force)
         tilt = np.clip((g.attitude * force + jerk)[:2] / size, -g.rate_limit, g.rate_limit)
@@ -103,7 +92,7 @@ class FlightController:
         torques = body.inertia * (g.rate * np.array([1.0, 1.0, 0.3]) * (wanted - rates) + towards) / leverage
         torques[2] = min(max(torques[2], -1.0), 1.0)
         lift = 0.25 * body.mass * self.force[0][2] / max(axes[2, 2], 0.3)
-        lift = min(max(lift, low + 0.5), high - 1.0)  # height has priority
-        room, needed = min(lift - low, high - lift), float(np.abs(torques).sum())
-        thrusts: Array = lift + MIXER @ torques * min(room / needed, 1.0)
+        lift = min(max(lift, body.least_thrust + 0.5), body.most_thrust - 1.0)  # height has priority
+        room = min(lift - body.least_thrust, body.most_thrust - lift)
+        thrusts: Array = lift + MIXER @ torques * min(room / np.abs(torques).sum(), 1.0)
         return thrusts

@@ -12,7 +12,6 @@ from benchmarks import ground_station, sitl
 from benchmarks.autopilot_conformance import on_the_ground
 from brakeline.deploy.run.autopilot_run import AutopilotSettings, open_field, vehicle
 from brakeline.errors import BadParameter, UnknownName
-from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import LandedState, Mode
@@ -294,18 +293,6 @@ def test_telemetry_is_in_ned(flying: Station) -> None:
             assert unit * flying.last(name).zacc == pytest.approx(-9.81, abs=0.4)
         else:
             assert flying.last(name).vx == pytest.approx(100, abs=10)
-
-
-def test_frame_conversions_are_inverse_to_each_other() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
-        q, v = (w, x, y, z), tuple(rng.standard_normal(3))
-        assert ned_frames.world(ned_frames.world(v)) == pytest.approx(v)
-        turned = ned_frames.rotate(ned_frames.attitude(q), ned_frames.body(v))
-        assert turned == pytest.approx(ned_frames.world(ned_frames.rotate(q, v)))
-        assert ned_frames.into_body(q, ned_frames.rotate(q, v)) == pytest.approx(v)
-    assert ned_frames.yaw(ned_frames.yaw(0.3)) == pytest.approx(0.3)
 
 
 def test_parameters_are_listed_read_and_set(station: Station) -> None:

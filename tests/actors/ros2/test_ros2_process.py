@@ -17,22 +17,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2 import LATCHED, SENSOR, RosNode, RosSettings
-from brakeline.messaging.ros2.cdr_messages import (
-    Clock,
-    DiagnosticArray,
-    DiagnosticStatus,
-    LaserScan,
-    MarkerArray,
-    Odometry,
-    TFMessage,
-    Twist,
-    TwistStamped,
-    decode,
-    encode,
-    header,
-    time_of,
-    twist,
-)
+from brakeline.messaging.ros2 import cdr_messages as cdr
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.service.wire import decision_of
 from tests.actors.conftest import no_answer
@@ -135,16 +120,16 @@ def test_markers_and_diagnostics_survive_encoding():
     request = pb.Request(action=[0.2, 0.0], input_in_force=[0.0, 0.0], plan=[0.0] * 2 * ROBOT.horizon)
     decision = allow([request])[0].decision
     obstacles = (Obstacle("box", (1.0, 0.0), (0.1, 0.5), 0.3), Obstacle("cylinder", (0.0, 1.0), (0.1,)))
-    shown = decode(MarkerArray, encode(markers(3.0, "odom", decision_of(decision, ROBOT), obstacles)))
+    shown = cdr.decode(cdr.MarkerArray, cdr.encode(markers(3.0, "odom", decision_of(decision, ROBOT), obstacles)))
     groups = [marker.ns for marker in shown.markers]
     assert groups.count("tube") == ROBOT.horizon and groups.count("plan") == 1 and groups.count("obstacles") == 2
     assert {marker.header.frame_id for marker in shown.markers} == {"odom"}
     for kind, level in (("allowed", 0), ("adjusted", 1), ("failsafe", 1), (BLIND, 2), (LATE, 2), (NO_ANSWER, 2)):
         sent = diagnostics(3.0, "brakeline", "ground", kind, "why", {"periods": 3.0})
-        message = decode(DiagnosticArray, encode(sent))
+        message = cdr.decode(cdr.DiagnosticArray, cdr.encode(sent))
         (status,) = message.status
         assert (status.level, status.message, status.values[0].key) == (level, f"{kind}: why", "periods")
-    assert DiagnosticStatus.ERROR == 2
+    assert cdr.DiagnosticStatus.ERROR == 2
 
 
 class CautiousFilter:
@@ -208,15 +193,15 @@ class Robot:
     def __init__(self, node, simulated, stamped):
         self.mute, self.speeds, self.simulated = set(), [], simulated
         self.reasons = []
-        self._odometry, self._scan = node.publisher("odom", Odometry), node.publisher("scan", LaserScan, SENSOR)
-        self._clock = node.publisher("/clock", Clock, SENSOR)
-        kind = TwistStamped if stamped else Twist
+        self._odometry, self._scan = node.publisher("odom", cdr.Odometry), node.publisher("scan", cdr.LaserScan, SENSOR)
+        self._clock = node.publisher("/clock", cdr.Clock, SENSOR)
+        kind = cdr.TwistStamped if stamped else cdr.Twist
         self._raw, self._stamped = node.publisher("cmd_vel_raw", kind), stamped
-        node.publisher("/tf_static", TFMessage, LATCHED).put(
-            TFMessage(transforms=[transform("base_footprint", "base_scan")])
+        node.publisher("/tf_static", cdr.TFMessage, LATCHED).put(
+            cdr.TFMessage(transforms=[transform("base_footprint", "base_scan")])
         )
         node.subscribe("cmd_vel", kind, lambda m: self.speeds.append(m.twist.linear.x if stamped else m.linear.x))
-        node.subscribe("/diagnostics", DiagnosticArray, lambda m: self.reasons.append(m.status[0].message))
+        node.subscribe("/diagnostics", cdr.DiagnosticArray, lambda m: self.reasons.append(m.status[0].message))
         self.offset = 0.0
         self._time = 100.0
         self._done = threading.Event()
@@ -251,15 +236,15 @@ class Robot:
         while not self._done.wait(0.05):
             if self.simulated and "clock" not in self.mute:
                 self._time += 0.05
-                self._clock.put(Clock(clock=time_of(self._time)))
+                self._clock.put(cdr.Clock(clock=cdr.time_of(self._time)))
             now = self.now()
             if "odometry" not in self.mute:
                 self._odometry.put(odometry(now, speed=0.2))
             if "scan" not in self.mute:
-                self._scan.put(scan_of(np.full(BEAMS, math.inf), header=header(now, "base_scan")))
+                self._scan.put(scan_of(np.full(BEAMS, math.inf), header=cdr.header(now, "base_scan")))
             if "command" not in self.mute:
-                raw = twist(math.nan if "numbers" in self.mute else 0.2, 0.0)
-                self._raw.put(TwistStamped(header=header(now, ""), twist=raw) if self._stamped else raw)
+                raw = cdr.twist(math.nan if "numbers" in self.mute else 0.2, 0.0)
+                self._raw.put(cdr.TwistStamped(header=cdr.header(now, ""), twist=raw) if self._stamped else raw)
 
 
 @contextmanager

@@ -17,24 +17,7 @@ from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree
 from brakeline.errors import BadScan, InputMissing
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.messaging.ros2.cdr_messages import (
-    Clock,
-    LaserScan,
-    Odometry,
-    PoseWithCovariance,
-    Quaternion,
-    TFMessage,
-    Transform,
-    TransformStamped,
-    TwistStamped,
-    TwistWithCovariance,
-    header,
-    pose,
-    quaternion,
-    time_of,
-    twist,
-    vector,
-)
+from brakeline.messaging.ros2 import cdr_messages as cdr
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import SpinningLidar
 from brakeline.sim.lidar import Lidar
@@ -50,7 +33,7 @@ EDGE = 0.15  # m: neighbouring beams that differ by more are on both sides of an
 def scan_of(beam_ranges, **more):
     n = len(beam_ranges)
     fields = {
-        "header": header(10.0, "base_scan"),
+        "header": cdr.header(10.0, "base_scan"),
         "angle_min": 0.0,
         "angle_max": 2.0 * math.pi * (n - 1) / n,
         "angle_increment": 2.0 * math.pi / n,
@@ -61,14 +44,14 @@ def scan_of(beam_ranges, **more):
         "ranges": np.asarray(beam_ranges, np.float32),
         "intensities": np.zeros(0, np.float32),
     }
-    return LaserScan(**fields | more)
+    return cdr.LaserScan(**fields | more)
 
 
-def obstacles_of(scan, pose=(0.0, 0.0, 0.0), mount=MOUNT, **more):
+def obstacles_of(scan, at=(0.0, 0.0, 0.0), mount=MOUNT, **more):
     """Return the obstacles of a scan that a robot makes while it stands."""
     beams = read(scan, **more)
-    poses = np.tile(pose, (len(beams.times), 1))
-    return obstacles(beams, poses, mount, GROUND, ERRORS, np.asarray(pose[:2], float))
+    poses = np.tile(at, (len(beams.times), 1))
+    return obstacles(beams, poses, mount, GROUND, ERRORS, np.asarray(at[:2], float))
 
 
 def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
@@ -191,17 +174,17 @@ ROBOT = GROUND.in_real_time()
 
 def odometry(at, x=0.0, y=0.0, yaw=0.0, speed=0.0, turn_rate=0.0):
     none = np.zeros(36)
-    return Odometry(
-        header=header(at, "odom"),
+    return cdr.Odometry(
+        header=cdr.header(at, "odom"),
         child_frame_id="base_footprint",
-        pose=PoseWithCovariance(pose=pose(x, y, yaw), covariance=none),
-        twist=TwistWithCovariance(twist=twist(speed, turn_rate), covariance=none),
+        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, y, yaw), covariance=none),
+        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, turn_rate), covariance=none),
     )
 
 
 def transform(parent, child, x=0.0, y=0.0, rotation=None, at=0.0):
-    moved = Transform(translation=vector(x, y), rotation=rotation or quaternion(0.0))
-    return TransformStamped(header=header(at, parent), child_frame_id=child, transform=moved)
+    moved = cdr.Transform(translation=cdr.vector(x, y), rotation=rotation or cdr.quaternion(0.0))
+    return cdr.TransformStamped(header=cdr.header(at, parent), child_frame_id=child, transform=moved)
 
 
 def test_states_are_interpolated_and_extrapolated_a_little():
@@ -254,7 +237,7 @@ def test_no_state_is_interpolated_in_a_long_gap():
 
 def test_transforms_are_composed_up_and_down_the_tree():
     frames = TransformTree()
-    frames.add(transform("base_footprint", "base_link", 0.0, 0.1, quaternion(0.5 * math.pi)))
+    frames.add(transform("base_footprint", "base_link", 0.0, 0.1, cdr.quaternion(0.5 * math.pi)))
     frames.add(transform("/base_link", "base_scan", 0.2))
     forward = frames.pose("base_scan", "base_footprint")
     assert (forward.x, forward.y, forward.yaw) == pytest.approx((0.0, 0.3, 0.5 * math.pi))
@@ -265,7 +248,7 @@ def test_transforms_are_composed_up_and_down_the_tree():
 
 def test_an_inverted_sensor_or_a_loop_of_frames_has_no_pose():
     frames = TransformTree()
-    frames.add(transform("base", "scan", rotation=Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)))
+    frames.add(transform("base", "scan", rotation=cdr.Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)))
     assert frames.pose("scan", "base") is None
     frames.add(transform("a", "b"))
     frames.add(transform("b", "a"))
@@ -279,7 +262,7 @@ def inputs():
     for i in range(101):
         inputs.on_odometry(odometry(9.0 + 0.01 * i, x=0.001 * i))
     inputs.on_scan(scan_of(np.full(BEAMS, math.inf)))
-    inputs.on_command(twist(0.2, 0.1), 10.0)
+    inputs.on_command(cdr.twist(0.2, 0.1), 10.0)
     return inputs
 
 
@@ -305,9 +288,9 @@ def test_an_old_scan_counts_as_missing(inputs):
 
 def test_a_command_counts_until_its_age_limit(inputs):
     assert inputs.command(10.6) is None
-    inputs.on_command(twist(math.nan, 0.0), 10.6)
+    inputs.on_command(cdr.twist(math.nan, 0.0), 10.6)
     assert not np.isfinite(inputs.command(10.6).action).all(), "the filter has to handle it"
-    inputs.on_command(TwistStamped(header=header(0.0, ""), twist=twist(0.1, 0.0)), 10.7)
+    inputs.on_command(cdr.TwistStamped(header=cdr.header(0.0, ""), twist=cdr.twist(0.1, 0.0)), 10.7)
     assert inputs.command(10.7).action.tolist() == [0.1, 0.0]
 
 
@@ -323,7 +306,7 @@ def test_the_message_names_the_missing_input():
     bare.on_odometry(odometry(10.0))
     with pytest.raises(InputMissing, match="from 'base_footprint' to 'base_scan'"):
         bare.obstacles(np.zeros(2), 10.1)
-    bare.on_fixed_transforms(TFMessage(transforms=[transform("base_footprint", "base_scan", -0.03)]))
+    bare.on_fixed_transforms(cdr.TFMessage(transforms=[transform("base_footprint", "base_scan", -0.03)]))
     assert bare.obstacles(np.zeros(2), 10.1)
     bare.on_scan(scan_of(np.full(BEAMS, 1.0), angle_increment=0.0))
     with pytest.raises(InputMissing, match="no valid scan"):
@@ -334,7 +317,7 @@ def test_transforms_can_replace_odometry():
     inputs = RosInputs(ROBOT, SensorSettings(base_frame="base"), AgeLimits())
     for i in range(30):
         inputs.on_transforms(
-            TFMessage(
+            cdr.TFMessage(
                 transforms=[
                     transform("map", "odom", 5.0, at=0.02 * i),
                     transform("odom", "base", 0.004 * i, at=0.02 * i),
@@ -347,9 +330,9 @@ def test_transforms_can_replace_odometry():
 def test_a_clock_that_was_set_reports_the_jump_once(monkeypatch):
     simulated = RosSimulatedClock()
     for stamp in (100.0, 99.9, 101.0):
-        simulated.on_clock(Clock(clock=time_of(stamp)))
+        simulated.on_clock(cdr.Clock(clock=cdr.time_of(stamp)))
     assert simulated.now() == 101.0 and simulated.jumped() == 0.0
-    simulated.on_clock(Clock(clock=time_of(5.0)))
+    simulated.on_clock(cdr.Clock(clock=cdr.time_of(5.0)))
     assert simulated.now() == 5.0 and simulated.jumped() == pytest.approx(-96.0) and simulated.jumped() == 0.0
     clock = SystemClock()
     before = clock.now()
