@@ -8,7 +8,7 @@ import pytest
 
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadInput
-from brakeline.messaging.obstacle import BOX, CYLINDER, Array, Obstacle
+from brakeline.messaging.obstacle import CYLINDER, Array, Obstacle
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import CUT, Estimator, cut_normal, steady_gain, wrap
@@ -130,17 +130,6 @@ def test_inputs_are_clipped_to_the_bounds() -> None:
     assert (vehicle.input == [0.25, 0.0]).all()
     drive(vehicle, -1.0, 0.0, 2)
     assert abs(vehicle.true[3]) < 1e-3
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize(("miss", "hit"), [(0.01, False), (-0.01, True)])
-@pytest.mark.parametrize("kind", ["pillar", "box"])
-def test_a_wheel_hits_or_misses_by_a_centimetre(side: float, miss: float, hit: bool, kind: str) -> None:
-    reach = 0.089 + miss  # half the robot's width over the wheels
-    at = (0.6, side * (reach + 0.2))
-    obstacle = pillar(*at, 0.2) if kind == "pillar" else Obstacle(BOX, at, (0.4, 0.4))
-    vehicle = robot(room(obstacle))
-    assert any(drive(vehicle, 0.25, 0.0).collision for _ in range(25)) == hit
 
 
 def test_a_wall_is_a_collision_and_the_floor_is_not() -> None:
