@@ -1,6 +1,8 @@
-"""The buses of a learner and an actor, and the filter of the ground robot in this process."""
+"""Services that answer, services that do not, and what else actors talk to."""
 
+import threading
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,14 +14,32 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.errors import NoReply
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.process_clock import WallClock
 from brakeline.safety.model.model_set import ModelConfig
+from brakeline.sim.autopilot import autopilot_server
+from brakeline.sim.autopilot.endpoint import Autopilot
 from tests.robots import GROUND
 
 
 def no_answer(requests: Sequence[pb.Request]) -> NoReturn:
     """Ask a safety service that does not answer."""
     raise NoReply("gone")
+
+
+@contextmanager
+def served(autopilot: Autopilot, truth: autopilot_server.TruthSender | None = None) -> Iterator[str]:
+    """Run an autopilot in a thread. Yields the URL that reaches it."""
+    link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
+    thread = threading.Thread(target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, truth))
+    thread.start()
+    try:
+        yield f"udpout:127.0.0.1:{link.port}"  # type: ignore[union-attr]
+    finally:
+        stop.set()
+        thread.join()
+        link.close()
 
 
 @pytest.fixture

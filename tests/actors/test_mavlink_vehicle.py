@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -16,13 +15,12 @@ from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.telemetry import ATTITUDE
 from brakeline.errors import BadInput
-from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.free_ports import free_udp_port
-from brakeline.messaging.process_clock import WallClock
 from brakeline.sim.autopilot import autopilot_server
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
+from tests.actors.conftest import served
 from tests.actors.test_lockstep_quadrotor import RULES, quadrotor
 from tests.robots import QUADROTOR
 from tests.waiting import until
@@ -35,24 +33,15 @@ Flying = tuple[MavlinkVehicle, Autopilot, list[CapturedFrame]]
 @contextlib.contextmanager
 def flight_of(rules: str, floor: float | None = None) -> Iterator[Flying]:
     """Fly a vehicle that hovers at first, or stands on a floor. Yield it, its autopilot in a thread, and the frames."""
-    link, stop, frames = open_link("udpin:127.0.0.1:0"), threading.Event(), list[CapturedFrame]()
-    truth_port = free_udp_port()
+    frames, truth_port = list[CapturedFrame](), free_udp_port()
     autopilot = Autopilot(quadrotor(floor=floor), rules, parameters={TIMEOUT[rules]: 1.0})
-    channel = autopilot_server.TruthSender("127.0.0.1", truth_port)
-    thread = threading.Thread(
-        target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, channel)
-    )
-    thread.start()
-    url = f"udpout:127.0.0.1:{link.port}"  # type: ignore[union-attr]
-    try:
+    with (
+        contextlib.closing(autopilot_server.TruthSender("127.0.0.1", truth_port)) as channel,
+        served(autopilot, channel) as url,
+    ):
         flight = FlightSettings(url, truth=truth_port, height=2.0, raise_limits=True)
         with contextlib.closing(MavlinkVehicle(QUADROTOR, flight, tap=frames.append)) as vehicle:
             yield vehicle, autopilot, frames
-    finally:
-        stop.set()
-        thread.join()
-        link.close()
-        channel.close()
 
 
 @pytest.fixture(scope="module", params=RULES)

@@ -42,17 +42,15 @@ from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEU
 from brakeline.actors.mavlink.vehicle_socket import LARGEST, MessageSocket, address, connect, listening, same_user
 from brakeline.errors import BadInput, BadLink, BadMessage, CommandRefused, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
-from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import robot_named
-from brakeline.sim.autopilot import autopilot_server as server
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period
+from tests.actors.conftest import served
 from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import GROUND, QUADROTOR
 from tests.waiting import until
@@ -64,16 +62,9 @@ ROBOT = replace(QUADROTOR, name="mine").in_real_time()
 @pytest.fixture
 def flown() -> Iterator[tuple[str, Autopilot]]:
     """Run an autopilot in the air in a thread. Yield its URL and the autopilot."""
-    link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
     autopilot = Autopilot(quadrotor(), "px4")
-    thread = threading.Thread(target=server.serve, args=([autopilot], link, WallClock(), stop.is_set))
-    thread.start()
-    try:
-        yield f"udpout:127.0.0.1:{link.port}", autopilot  # type: ignore[union-attr]
-    finally:
-        stop.set()
-        thread.join()
-        link.close()
+    with served(autopilot) as url:
+        yield url, autopilot
 
 
 @contextmanager

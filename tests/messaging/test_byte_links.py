@@ -1,19 +1,16 @@
 """Bytes there and back over each kind of link, and peers that are gone."""
 
-import time
-
 import pytest
 
 from brakeline.errors import BadLink
 from brakeline.messaging.byte_links import Link, Tcp, TcpServer, Udp, open_link
+from tests.waiting import until
 
 
 def arrives(link: Link, expected: bytes) -> bool:
     """Within a second, in however many pieces."""
-    data, deadline = b"", time.monotonic() + 1.0
-    while data != expected and time.monotonic() < deadline:
-        data += link.receive()
-    return data == expected
+    data = bytearray()
+    return bool(until(lambda: data.extend(link.receive()) or data == expected, seconds=1.0))
 
 
 @pytest.mark.parametrize(("listening", "calling"), [("udpin", "udpout"), ("tcpin", "tcp")])
@@ -38,10 +35,7 @@ def test_a_peer_that_is_gone_is_no_error() -> None:
     client.send(b"x")
     assert arrives(server, b"x")
     server.close()
-    deadline = time.monotonic() + 1.0
-    while client.open and time.monotonic() < deadline:
-        client.receive()
-    assert not client.open
+    until(lambda: client.receive() or not client.open, seconds=1.0)
     client.send(b"y")
     client.close()
 

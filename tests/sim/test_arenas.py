@@ -22,7 +22,6 @@ from brakeline.sim.grid_planner import Routes
 from brakeline.sim.kernels.arena_kernels import connected, first_fitting, nearest_distances
 from tests.arenas import staged_arena
 from tests.robots import GROUND, QUADROTOR, ROBOTS
-from tests.sim.outline_twin import gaps
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.name)
@@ -153,6 +152,24 @@ def test_the_distance_of_a_point_that_is_not_a_number_is_none() -> None:
     parts = Shapes.of([*room_boundary(2.0, None)], dim=2).parts
     points = np.array([[np.nan, 0.0], [0.0, np.nan], [0.0, 0.0]])
     assert nearest_distances(*parts, points) == pytest.approx([np.nan, np.nan, 2.0], nan_ok=True)
+
+
+CORNERS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0), (0.0, 0.0)])  # in half edges
+
+
+def gaps(candidates: list[Obstacle], others: list[Obstacle]) -> np.ndarray:
+    """Return the distance (k,) [m] from each candidate (no wall) to the nearest other; overlap: <= 0. The twin."""
+    ours, theirs = Shapes.of(candidates, dim=2), Shapes.of(others, dim=2)
+    between = np.minimum(from_corners(ours, theirs), from_corners(theirs, ours).T)
+    return (between - ours.rho[:, None] - theirs.rho).min(axis=1)
+
+
+def from_corners(shapes: Shapes, others: Shapes) -> np.ndarray:
+    """Return the least distance (k, o) [m] from the corners of each outline to the rectangle of each other."""
+    corners = (CORNERS * shapes.half[:, None]) @ shapes.axes.swapaxes(1, 2) + shapes.center[:, None]
+    away = (corners[:, None] - others.center[:, None]) @ others.axes
+    beyond = np.maximum(np.abs(away) - others.half[:, None], 0.0)
+    return np.sqrt((beyond * beyond).sum(axis=-1)).min(axis=-1)
 
 
 def first_that_fits(candidates: list[Obstacle], others: list[Obstacle], gap: float) -> int:

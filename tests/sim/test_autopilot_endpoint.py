@@ -15,9 +15,23 @@ from brakeline.errors import BadParameter, UnknownName
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import LandedState, Mode
+from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.autopilot.telemetry_sender import MESSAGES
 from tests.sim import station as gs
 from tests.sim.station import ACCEPTED, ARM, DENIED, FAILED, LAND, MODE, REJECTED, TAKEOFF, UNSUPPORTED, Station
+
+
+@pytest.fixture(params=["px4", "ardupilot"])
+def station(request: pytest.FixtureRequest) -> Station:
+    return Station(request.param)
+
+
+@pytest.fixture(params=["px4", "ardupilot"])
+def flying(request: pytest.FixtureRequest) -> Station:
+    """Return a station whose vehicle flies and follows setpoints without a limit of acceleration."""
+    station = Station(request.param, airborne=True, parameters=AT_ONCE[request.param])
+    station.follow_setpoints()
+    return station
 
 
 def test_the_heartbeat_names_the_autopilot_once_a_second(station: Station) -> None:
