@@ -193,8 +193,8 @@ def test_implausible_weights_are_ignored_and_the_learner_is_joined_again(buses: 
 
 def test_weights_before_the_first_join_are_ignored(buses: tuple[Bus, Bus]) -> None:
     learner, client = ScriptedLearner(buses[0]), LearnerClient(buses[1], GROUND, "actor-0")
-    for version in range(1, 11):
-        learner.publish_weights(version)
+    for number in range(1, 11):
+        learner.publish_weights(number)
         time.sleep(0.02)
     assert version(client) is None and buses[1].rejected.count == 0
 

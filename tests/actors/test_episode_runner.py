@@ -1,9 +1,13 @@
-"""Without a valid answer, the robot brakes along its committed plan and stands; with the next answer it drives on."""
+"""One robot in its episodes, without a bus. Without a valid answer it brakes along its committed plan and stands; with
+the next answer it drives on. Where not even hovering can be verified, a vehicle stays on the ground.
+"""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from brakeline.actors.decision_guard import at_rest, next_input, request_decisions
+from brakeline.actors.decision_guard import Ask, at_rest, next_input, request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.actors.flight_process import takeoff_verified
 from brakeline.deploy.data.model_store import model_for
@@ -31,6 +35,7 @@ from tests.safety.rivals.test_sailr import known
 
 PLAN = np.array([[0.2, 0.3], [0.1, 0.15], [0.0, 0.0]])
 REQUEST = pb.Request(robot="ground", input_in_force=[0.0, 0.0])
+IN_REAL_TIME = QUADROTOR.in_real_time()
 
 
 def decision(plan=PLAN, **fields):
@@ -285,44 +290,38 @@ def test_a_missing_answer_is_not_an_intervention():
     assert fallback.fallback and not fallback.cut and fallback.penalty >= 0.0
 
 
-def stage(gap: float) -> Arena:
+def hall(*obstacles: Obstacle) -> Arena:
+    return staged_arena(*obstacles, start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), half_width=6.0, height=6.0)
+
+
+def beside(gap: float) -> Arena:
     """Return an arena with a sphere whose distance from the body is `gap` [m] at the start."""
-    radius = 0.4
-    away = QUADROTOR.footprint + gap + radius
-    return staged_arena(
-        Obstacle("sphere", (away, 0.0, 3.0), (radius,)),
-        start=(0.0, 0.0, 3.0),
-        goal=(-4.0, -4.0, 3.0),
-        half_width=6.0,
-        height=6.0,
-    )
+    return hall(Obstacle("sphere", (IN_REAL_TIME.footprint + gap + 0.4, 0.0, 3.0), (0.4,)))
 
 
-@pytest.mark.usefixtures("flight_folder")
-def test_no_takeoff_where_hovering_cannot_be_verified() -> None:
-    robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
-    assert takeoff_verified(question, robot, stage(2.0), True, lambda: False)
+@pytest.fixture
+def flight_filter(flight_folder: Path) -> Ask:
+    return in_process(model_for(IN_REAL_TIME, ModelConfig(), BOUND), BOUND)
+
+
+def test_no_takeoff_where_hovering_cannot_be_verified(flight_filter: Ask) -> None:
+    assert takeoff_verified(flight_filter, IN_REAL_TIME, beside(2.0), True, lambda: False)
     with pytest.raises(TakeoffNotVerified, match=r"0\.\d+ m from the nearest obstacle.*collect more data"):
-        takeoff_verified(question, robot, stage(0.02), True, lambda: False)
-    assert takeoff_verified(question, robot, stage(0.02), False, lambda: False), "a rival method cannot verify hovering"
-
-
-@pytest.mark.usefixtures("flight_folder")
-def test_in_real_time_recovery_continues_period_after_period() -> None:
-    """A recovery in every other period would not move a real vehicle: it does not follow so short a command."""
-    robot = QUADROTOR.in_real_time()
-    question = in_process(model_for(robot, ModelConfig(), BOUND), BOUND)
-    make = delayed(Quadrotor, robot)
-    env = NavigationEnv(
-        robot, "default", make, draw=lambda *_: staged_arena(start=(0.0, 0.0, 3.0), goal=(-4.0, -4.0, 3.0), height=6.0)
+        takeoff_verified(flight_filter, IN_REAL_TIME, beside(0.02), True, lambda: False)
+    assert takeoff_verified(flight_filter, IN_REAL_TIME, beside(0.02), False, lambda: False), (
+        "a rival cannot verify hovering"
     )
-    runner = EpisodeRunner(robot, env, ActorIdentity("actor", 0, 0))
+
+
+def test_in_real_time_recovery_continues_period_after_period(flight_filter: Ask) -> None:
+    """A recovery in every other period would not move a real vehicle: it does not follow so short a command."""
+    env = NavigationEnv(IN_REAL_TIME, make_vehicle=delayed(Quadrotor, IN_REAL_TIME), draw=lambda *_: hall())
+    runner = EpisodeRunner(IN_REAL_TIME, env, ActorIdentity("actor", 0, 0))
     runner.begin(0)
     kinds = []
     for _ in range(25):
         runner.info["obstacles"] = (Obstacle("sphere", (0.5, 0.0, 3.0), (0.6,)),)  # a virtual one around the vehicle
-        outcome = runner.decide(np.zeros(3), question)
+        outcome = runner.decide(np.zeros(3), flight_filter)
         assert outcome is not None and outcome.answer is not None
         kinds.append(outcome.answer.kind)
         runner.execute(np.zeros(3), outcome)

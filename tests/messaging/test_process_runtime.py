@@ -47,11 +47,10 @@ def wait_for_goodbye(health: list[Any]) -> Any:
 def test_a_signal_ends_it_with_a_goodbye(join: Join, spawn: Spawn, endpoint: str, number: signal.Signals) -> None:
     health, lines = listen(join("launcher", listen=True))
     child = spawn(PROCESS.format(endpoint=endpoint, end=""))
-    time.sleep(1.2)
+    until(lambda: len(health) >= 2, "one when announced, one a second")
     child.send_signal(number)
     last = wait_for_goodbye(health)
     assert child.wait(5.0) == 0
-    assert len(health) >= 3, "one when announced, one a second, one at the end"
     assert last.figures["rate"] == 2.5
     assert last.published["health/worker"] == len(health) == last.header.sequence
     assert lines == []

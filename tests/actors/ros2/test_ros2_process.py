@@ -1,4 +1,6 @@
-"""The gate sends the answer's input if it came in time, otherwise the committed plan's. The askers are scripted."""
+"""The gate sends the answer's input if it came in time, otherwise the committed plan's. The process among nodes that
+fall silent: while an input is missing the robot stops; then it drives on.
+"""
 
 import math
 import threading
