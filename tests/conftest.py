@@ -12,8 +12,9 @@ from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
 from benchmarks.timing import stalls
-from brakeline.deploy.data import model_store, simulated_recording
-from brakeline.safety.model.model_set import ModelConfig
+from brakeline.deploy.data import data_paths, model_store, simulated_recording
+from brakeline.errors import BadModel
+from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 
@@ -23,7 +24,7 @@ gc.disable()  # until all tests are collected: to search the half million object
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
-FLIGHTS = 60  # trajectories of the quadrotor, recorded in half a minute
+STORED_FLIGHT_MODEL = Path(__file__).parent / "stored" / "quadrotor-late.safetensors"
 TRAJECTORIES = 68  # the fewest whose held-out plans state the limit of 1 %, late ones too; recorded in 14 seconds
 
 
@@ -111,10 +112,21 @@ def data_folder(shared_folder: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def flight_folder(data_folder: Path) -> Path:
-    """The same, with a data set of the quadrotor, and its models in lockstep and in real time."""
-    simulated_recording.load_or_record(QUADROTOR, trajectories=FLIGHTS)
-    for robot in (QUADROTOR, QUADROTOR.in_real_time()):
-        model_store.model_for(robot, ModelConfig(), BOUND)
+    """The same, with the quadrotor's model sets: in lockstep the one that all have, in real time a stored one.
+
+    The stored one is of 60 recorded trajectories. It takes a minute to make it again, where the simulator has changed.
+    """
+    config = ModelConfig()
+    for robot, source in ((QUADROTOR, "quadrotor"), (QUADROTOR.in_real_time(), STORED_FLIGHT_MODEL)):
+        path = data_paths.model_path(robot, config)
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            ModelSet.load(source).save(path)
+        try:
+            model_store.model_for(robot, config, BOUND, build=False)
+        except BadModel:
+            simulated_recording.load_or_record(QUADROTOR, trajectories=60)
+            model_store.model_for(robot, config, BOUND)
     return data_folder
 
 
