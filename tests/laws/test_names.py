@@ -1,6 +1,6 @@
 """No module and no class has the name of another one."""
 
-import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -23,5 +23,5 @@ def test_no_module_name_stands_twice():
 
 
 def test_no_class_name_stands_twice():
-    trees = [ast.parse(file.read_text()) for file in sources()]
-    assert repeated([node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]) == []
+    classes = re.compile(r"^class (\w+)", re.MULTILINE)
+    assert repeated([name for file in sources() for name in classes.findall(file.read_text())]) == []

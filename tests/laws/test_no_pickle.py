@@ -8,6 +8,7 @@ which pickle: a Connection's `send_bytes` and `recv_bytes` do not.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,10 +26,13 @@ PICKLES = ("pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "mar
 PICKLES += ("multiprocessing.reduction", "multiprocessing.managers")
 NAMES = ("ForkingPickler", "SyncManager", "BaseManager", "Manager")  # of multiprocessing
 CALLS = ("send", "recv")
+SUSPECT = re.compile("pickle|dill|joblib|marshal|shelve|multiprocessing|spawning|torch")  # all others need no parser
 
 
 def pickling(source: str) -> Iterator[str]:
     """Yield a line for each use of pickle in a module."""
+    if not SUSPECT.search(source):
+        return
     tree = ast.parse(source)
     modules: set[str] = set()
     for node in ast.walk(tree):
