@@ -56,7 +56,7 @@ from brakeline.safety.service.client import read_reply, request_message
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from tests.fuzz.message_fuzzer import MessageFuzzer
 
-LOOK = 25_000  # messages between two looks at the processes' figures
+LOOK = 25_000  # most messages between two looks at the processes' figures
 SETTLED = 0.3  # share of the messages after which tables are full
 LATER = 0.67  # share of the messages after which growth is a leak
 
@@ -248,13 +248,14 @@ def fuzz(messages: int, seed: int = 0) -> Figures:
         folder = Path(name)
         everybody = parties(folder, fuzzer)
         settled, later, process = 0, 0, psutil.Process()
+        look = min(LOOK, max(messages // 50, 1))
         for number in range(messages):
             sample = fuzzer.sample(fuzzer.random.choice(TOPICS))
             for party in everybody.values():
                 if sample.topic.name in party.names:
                     party.messages += 1
                     party.try_(partial(party.take, sample))
-            if number % LOOK == LOOK - 1 or number == messages - 1:
+            if number % look == look - 1 or number == messages - 1:
                 for party in everybody.values():
                     party.try_(party.look)
             if number == int(SETTLED * messages):
