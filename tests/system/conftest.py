@@ -2,26 +2,27 @@
 
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.system.runs import BRAKELINE, Run
+from tests.system.runs import BRAKELINE
+from tests.waiting import PATIENCE
 
 
 @pytest.fixture(scope="session")
-def whole_run(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder of a finished run of the `debug` experiment with two actors, and the figures it printed."""
-    with Run(tmp_path_factory.mktemp("runs") / "whole") as run:
-        figures = run.end()
-        assert run.popen.returncode == 0, run.errors.read_text()
-    return run.folder, figures
+def demo(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder in which `brakeline demo` has run, and what it printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    words = (*BRAKELINE, "demo", "--steps", "800", "--out", "runs/first", "--verbose")
+    done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=2.0 * PATIENCE, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
 
 
 @pytest.fixture(scope="session")
-def logged_run(whole_run: tuple[Path, dict[str, Any]]) -> Path:
-    """Its folder."""
-    return whole_run[0]
+def logged_run(demo: tuple[Path, str]) -> Path:
+    """The folder of its run: two actors, and a learner that is warming up."""
+    return demo[0] / "runs" / "first"
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """A ROS 2 node by somebody else's implementation (zenoh-ros2-sdk): rams what its scan shows, through topics alone.
 
-python ros2_driver.py PORT DOMAIN [--stamped] [--direct]. It turns to the nearest hit of /scan in a direction, drives at
+python ros2_driver.py PORT [--direct]. It turns to the nearest hit of /scan in a direction, drives at
 it at full speed, and after a while picks another direction. On stdout, a JSON object every half second: how many raw
 commands, scans and commands went by, and how long [s] raw commands took to come out of /cmd_vel. --direct: it commands
 the base itself, with nothing between. Run it with a HOME of its own: the SDK may edit git's configuration.
@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.session import ZenohSession
 
-PORT, DOMAIN, STAMPED = int(sys.argv[1]), int(sys.argv[2]), "--stamped" in sys.argv
+PORT = int(sys.argv[1])
 RAW = "/cmd_vel" if "--direct" in sys.argv else "/cmd_vel_raw"
 PERSISTENCE = 40  # scans that one thing is rammed for, or driven away from
 PAUSE = 0.02  # s between raw commands
@@ -74,10 +74,9 @@ class Driver:
             self.wanted = (0.25 if abs(target) < 0.5 else 0.0, turn)
 
     def command(self, message: object) -> None:
-        twist = message.twist if STAMPED else message
         with self.lock:
             self.heard += 1
-            sent = self.sent.pop(round(twist.angular.z, 8), None)
+            sent = self.sent.pop(round(message.angular.z, 8), None)
             if sent is not None:
                 self.delays.append(time.monotonic() - sent)
 
@@ -87,8 +86,8 @@ def main() -> None:
         "builtin_interfaces/msg/Time", "std_msgs/msg/Header", "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Twist"
     )
     driver = Driver()
-    kind = "geometry_msgs/msg/TwistStamped" if STAMPED else "geometry_msgs/msg/Twist"
-    place = {"router_ip": "127.0.0.1", "router_port": PORT, "domain_id": DOMAIN}
+    kind = "geometry_msgs/msg/Twist"
+    place = {"router_ip": "127.0.0.1", "router_port": PORT, "domain_id": 0}
     scans = ROS2Subscriber(
         "/scan",
         "sensor_msgs/msg/LaserScan",
@@ -99,8 +98,7 @@ def main() -> None:
     )
     commands = ROS2Subscriber("/cmd_vel", kind, driver.command, definition(kind), type_hash=digest(kind), **place)
     raw = ROS2Publisher(RAW, kind, definition(kind), node_name="rammer", type_hash=digest(kind), **place)
-    store = raw.session_mgr.store
-    vector, twist = store.types["geometry_msgs/msg/Vector3"], store.types["geometry_msgs/msg/Twist"]
+    vector = raw.session_mgr.store.types["geometry_msgs/msg/Vector3"]
     reported = time.monotonic()
     number = 0
     while True:
@@ -109,13 +107,7 @@ def main() -> None:
             speed, turn = driver.wanted
             turn += 1e-6 * (number % 1000)  # each command can be told from the others
             driver.sent[round(turn, 8)] = time.monotonic()
-        linear, angular = vector(x=speed, y=0.0, z=0.0), vector(x=0.0, y=0.0, z=turn)
-        if STAMPED:
-            header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-            head = header(stamp=stamp(sec=0, nanosec=0), frame_id="")
-            raw.publish(header=head, twist=twist(linear=linear, angular=angular))
-        else:
-            raw.publish(linear=linear, angular=angular)
+        raw.publish(linear=vector(x=speed, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=turn))
         if time.monotonic() - reported > 0.5:
             reported = time.monotonic()
             with driver.lock:

@@ -31,6 +31,17 @@ def brakeline(*arguments: object, timeout: float = PATIENCE) -> subprocess.Compl
     words = [*map(str, arguments)]
     if words[0] in OF_ITS_OWN:
         return subprocess.run([*BRAKELINE, *words], check=False, capture_output=True, text=True, timeout=timeout)
+    return _in_this_process(words)
+
+
+def refused(*arguments: object) -> str:
+    """Run a command that refuses its arguments, whichever it is. Returns its error message."""
+    done = _in_this_process([*map(str, arguments)])
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    return done.stderr
+
+
+def _in_this_process(words: list[str]) -> subprocess.CompletedProcess[str]:
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         try:
@@ -108,22 +119,17 @@ class Run:
         (endpoint,) = client_settings(self.folder).connect
         return "--connect", endpoint, "--keys", self.folder / "keys"
 
-    def steps(self) -> int:
-        """Return the steps since `watch`."""
-        return sum(tally.steps for tally in self.metrics.actors.copy().values())
+    def until_steps(self, count: int, actors: str = "actor-") -> None:
+        """Wait for `count` more steps of the actors whose names begin so, as long as the run makes progress."""
 
-    def learned(self) -> int:
-        """Return the steps of the learner's last message."""
-        known = self.metrics.learners.get("ground")
-        return 0 if known is None else int(known.steps)
+        def steps() -> int:
+            return sum(stats.steps for name, stats in metrics.actors.copy().items() if name.startswith(actors))
 
-    def until_steps(self, count: int) -> None:
-        """Wait for `count` more steps, as long as the run makes progress."""
-        self.watch()
-        target = self.steps() + count
-        while (done := self.steps()) < target:
+        metrics = self.watch()
+        target = steps() + count
+        while (done := steps()) < target:
             next_stop = min(done + STRIDE, target)
-            until(lambda: self.steps() >= next_stop or self.popen.poll() is not None, f"{count} steps")  # noqa: B023
+            until(lambda: steps() >= next_stop or self.popen.poll() is not None, f"{count} steps")  # noqa: B023
             assert self.popen.poll() is None, self.errors.read_text()
 
     def kill(self, name: str) -> None:

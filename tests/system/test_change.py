@@ -4,19 +4,22 @@ The new model set comes from `certify --publish` by hand, or from the certifier 
 """
 
 import json
-import shutil
 import signal
+from dataclasses import replace
 
 import pytest
 
+from brakeline.deploy.data.data_paths import record_path
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.dataset import Dataset
 from tests.accepting import WORDS
+from tests.robots import GROUND
 from tests.system.runs import Run, brakeline
-from tests.waiting import until
+from tests.waiting import PATIENCE, until
 
 DRIVEN = 1000  # steps of both actors
-BEFORE, DURING, AFTER = 800, 2400, 600
+BEFORE, AFTER = 120, 250
 ENDLESS = 100_000  # the run is ended when it has shown what is wanted, however long the new model set takes to make
 
 
@@ -51,15 +54,18 @@ def beyond(exchanges):
 
 
 def test_the_certifier_of_a_run_publishes_a_set_of_the_changed_robot_by_itself(data_folder, tmp_path, monkeypatch):
-    shutil.copytree(data_folder, tmp_path / "data")  # other tests' runs take the newest model set of the shared folder
+    few = Dataset.load(record_path(GROUND))
+    few = replace(few, trajectories=few.trajectories[:24])
+    # A folder of its own: other tests' runs take the newest model set of the shared one.
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
-    change = ("--change.after", BEFORE // 4, "--change.payload-kg", 2)
+    record_path(GROUND).parent.mkdir(parents=True)
+    few.save(record_path(GROUND))
+    change = ("--change.after", BEFORE, "--change.payload-kg", 2)
     adapt = ("--actors", 1, "--mode", "one-step", "--adapt", "--learner.td3.warmup", ENDLESS)
     with Run(tmp_path / "run", "--steps", ENDLESS, *adapt, *change, *WORDS) as run:
         processes = run.watch().processes
         certifier = until(lambda: processes.get("certify.adapt"), "the certifier")
-        run.until_steps(BEFORE + DURING // 2)
-        until(lambda: certifier.figures.get("published ground"), "a new model set")
+        until(lambda: certifier.figures.get("published ground"), "a new model set", 3.0 * PATIENCE)
         run.until_steps(AFTER)
         note, refused = certifier.notes["adaptation ground"], certifier.figures.get("refused ground", 0)
         figures = run.end(signal.SIGINT)

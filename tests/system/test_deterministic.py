@@ -20,17 +20,14 @@ from tests.waiting import until
 SHORT = ("--deterministic", "--steps", 400, "--learner.td3.warmup", 100, "--learner.checkpoint-every", 100)
 
 
-def weights(run: Run) -> bytes:
-    figures = run.end()
-    assert run.popen.returncode == 0, run.errors.read_text()
-    assert figures["finished"] and figures["collisions"] == 0 and list(figures["actors"]) == ["actor-0"]
-    return (run.folder / "learner" / "policy.safetensors").read_bytes()
-
-
 @pytest.fixture(scope="module")
 def uninterrupted(data_folder, tmp_path_factory) -> tuple[Path, bytes]:
     with Run(tmp_path_factory.mktemp("runs") / "one", *SHORT, "--seed", 3) as run:
-        return run.folder, weights(run)
+        figures = run.end()
+        assert run.popen.returncode == 0, run.errors.read_text()
+    assert figures["finished"] and figures["collisions"] == 0 and list(figures["actors"]) == ["actor-0"]
+    assert figures["learners"]["ground"]["updates"] == 600 - 100, "one for each step after the warm-up"
+    return run.folder, (run.folder / "learner" / "policy.safetensors").read_bytes()
 
 
 def first_goal(folder: Path) -> list[float]:

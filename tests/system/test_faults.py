@@ -6,10 +6,8 @@ import signal
 import socket
 import subprocess
 import time
-from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from brakeline.deploy.interpreter import PYTHON
@@ -18,43 +16,61 @@ from brakeline.deploy.run.run_config import EXPERIMENTS, encode
 from brakeline.learner.checkpoint import exists
 from brakeline.logs.figure_tables import analyse
 from brakeline.logs.reader import open_log
-from tests.robots import GROUND
-from tests.system.runs import Run, alive, brakeline
+from tests.accepting import WORDS
+from tests.robots import ROBOTS
+from tests.system.runs import Run, alive
 from tests.waiting import PATIENCE, until
 
+KINDS = ("ground", "quadrotor")
+MIXED = ("train", *KINDS, "--experiment", "debug")
 
-def test_each_process_is_killed_in_turn_and_the_run_goes_on_to_its_end(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 1000, "--learner.checkpoint-every", 350) as run:
-        run.until_steps(80)
-        assert not exists(run.folder / "learner" / "checkpoint"), "the learner dies before its first checkpoint"
-        run.kill("learner")
+
+def test_each_process_is_killed_in_turn_and_robots_of_two_kinds_learn_to_the_end(flight_folder, tmp_path):
+    words = ("--steps", 600, "--learner.checkpoint-every", 200, "--actors", 2, "--mavlink", *WORDS)
+    with Run(tmp_path / "run", *words, command=MIXED) as run:
+        checkpoint = run.folder / "learner-ground" / "checkpoint"
         run.until_steps(80)
         run.kill("safety-0")
-        run.until_steps(80)
-        run.kill("actor-1")
-        run.until_steps(80)
+        run.until_steps(40, "actor-ground")  # the quadrotors may soon be through
+        assert not exists(checkpoint), "the learner dies before its first checkpoint"
+        run.kill("learner-ground")
+        run.until_steps(80, "actor-ground")
+        run.kill("actor-ground-1")
+        run.until_steps(50, "actor-ground")
         run.kill("recorder")
-        until(lambda: exists(run.folder / "learner" / "checkpoint"), "a checkpoint")
-        run.until_steps(50)
-        run.kill("learner")
+        until(lambda: exists(checkpoint), "a checkpoint")
+        run.until_steps(50, "actor-ground")
+        run.kill("learner-ground")
         figures = run.end()
         assert run.popen.returncode == 0, run.errors.read_text()
+    assert json.loads((run.folder / "figures.json").read_text()) == figures
     assert figures["finished"] and figures["collisions"] == 0
-    assert figures["learners"]["ground"]["steps"] == 1000
-    assert figures["restarts"] == {"learner": 2, "safety-0": 1, "actor-1": 1, "recorder": 1}
+    assert {name: learner["steps"] for name, learner in figures["learners"].items()} == dict.fromkeys(KINDS, 600)
+    assert all(learner["weights_version"] > 1 for learner in figures["learners"].values()), "both learned something"
+    assert figures["restarts"] == {"learner-ground": 2, "safety-0": 1, "actor-ground-1": 1, "recorder": 1}
+    actors = {f"actor-{kind}-{i}" for kind in KINDS for i in (0, 1)}
+    assert set(figures["actors"]) == actors
     starts = {name: process["starts"] for name, process in figures["processes"].items()}
-    assert starts == {"launcher": 1, "recorder": 2, "safety-0": 2, "learner": 3, "actor-0": 1, "actor-1": 2}
+    once = dict.fromkeys(("launcher", "learner-quadrotor", *actors), 1)
+    assert starts == once | {"recorder": 2, "safety-0": 2, "learner-ground": 3, "actor-ground-1": 2}
     log = open_log(run.folder)
     records = list(log)
     assert len(log.paths) == 2 and len(log.cuts) == 1 and "run.mcap" in str(log.cuts[0])
     analysed = analyse(run.folder)
     assert analysed["collisions"] == 0 and analysed["cuts"] == [str(log.cuts[0])]
     lost = {key: topic["missing"] for key, topic in analysed["topics"].items() if topic["missing"]}
-    assert lost, "what nobody recorded shows as gaps"
-    assert analysed["steps"] + sum(n for key, n in lost.items() if key.startswith("step/")) >= figures["steps"]
+    assert any(key.startswith("step/") for key in lost), "what nobody recorded shows as gaps"
+    for key in ("step/ground/actor-ground-0", "step/ground/actor-ground-1"):
+        assert analysed["topics"][key]["messages"] + lost.get(key, 0) >= figures["topics"][key]["messages"]
     texts = [record.message.text for record in records if record.key == "log/launcher"]
-    for name in ("learner", "safety-0", "actor-1"):
+    for name in ("learner-ground", "safety-0", "actor-ground-1"):
         assert any(f"{name} was killed by SIGKILL" in text for text in texts), texts
+    failed = {r.message.request.actor for r in records if r.topic == "exchange" and r.message.failure}
+    waited = {r.message.process for r in records if r.topic == "log" and "waiting for the safety" in r.message.text}
+    felt = failed | waited - {"launcher"}  # which repeats the last words of what was killed
+    assert felt == actors, "each of them felt that the service had died"
+    taped = {r.message.actor for r in records if r.topic == "frames"}
+    assert taped == {"actor-quadrotor-0", "actor-quadrotor-1"}
     _braked_as_committed(records)
 
 
@@ -64,7 +80,7 @@ def _braked_as_committed(records):
     for record in records:
         if record.topic == "exchange" and not record.message.failure:
             request = record.message.request
-            plan = np.reshape(record.message.reply.decision.plan, (-1, GROUND.action_dim))
+            plan = np.reshape(record.message.reply.decision.plan, (-1, ROBOTS[request.robot].action_dim))
             plans[request.actor, request.episode, request.step] = plan[1:]
         elif record.topic == "step" and record.message.fallback:
             step = record.message
@@ -77,65 +93,11 @@ def _braked_as_committed(records):
     assert len(failures) == fallbacks, "who stands and waits takes no step"
 
 
-def test_two_replicas_and_then_no_launcher(data_folder, tmp_path):
-    with Run(tmp_path / "run", "--steps", 100_000, "--replicas", 2) as run:
-        run.until_steps(200)
-        _is_asked(run.there, tmp_path)
-        victims = run.children()
-        assert {"safety-0", "safety-1", "recorder", "learner", "actor-0", "actor-1"} == victims.keys()
-        _imports_what_it_needs(victims)
-        victims["safety-0"].kill()
-        run.until_steps(200)  # some are taken before it is back
-        assert not [e for e in run.metrics.figures()["no_decision"] if e not in ("NoReply", "Late")]
-        until(lambda: run.children().get("safety-0", victims["safety-0"]).pid != victims["safety-0"].pid, "a new one")
-        children = run.children()
-        run.popen.kill()
-        run.popen.wait()
-        until(lambda: run.children() == {}, "no process is left without its launcher")
-        assert len(children) == 6
-    log = open_log(run.folder)
-    steps = [record.message for record in log if record.topic == "step"]
-    assert log.cuts == [], "the recorder ended in order"
-    assert len(steps) > 350 and not any(step.collision for step in steps)
-    assert exists(run.folder / "learner" / "checkpoint"), "and so did the learner"
-
-
-def _imports_what_it_needs(children: dict[str, psutil.Process]) -> None:
-    """Else each costs seconds at its start, and hundreds of megabytes."""
-    loaded = {name: " ".join(part.path for part in child.memory_maps()) for name, child in children.items()}
-    assert {name for name, paths in loaded.items() if "libtorch" in paths} == {"learner"}
-    assert {name for name, paths in loaded.items() if "libmujoco" in paths} == {"actor-0", "actor-1"}
-    # Numba brings SciPy's linear algebra; all else of SciPy would come on top.
-    assert not {name for name, paths in loaded.items() if "/scipy/sparse/" in paths and name.startswith("actor")}
-
-
-def _is_asked(there: tuple[object, ...], folder: Path) -> None:
-    """`status` and `query` of a run in progress, for people and as JSON."""
-    status = brakeline("status", *there)
-    assert status.returncode == 0 and "safety-1" in status.stdout and "learning ground" in status.stdout
-    shown = json.loads(brakeline("status", *there, "--json").stdout)
-    assert {"launcher", "recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"} <= set(shown["alive"])
-    assert shown["processes"]["safety-0"]["model ground"] and shown["learners"]["ground"]["steps"] > 0
-    near = ("query", "ground", *there, "--timeout", 10, "--obstacle", "cylinder 0.25 0 0.1")
-    answer = json.loads(brakeline(*near, "--json").stdout)
-    assert answer.keys() >= {"kind", "action", "plan", "tube_center", "margin", "time_ms", "model"}
-    assert answer["kind"] in ("allowed", "adjusted", "failsafe") and answer["margin"] >= 0.0
-    assert len(answer["plan"]) == len(answer["tube_center"]) == len(answer["tube_half_width"]) == GROUND.horizon
-    assert answer["kind"] in brakeline(*near).stdout
-    for far, said in ((3.5, ("allowed",)), (0.0, ("adjusted", "failsafe"))):  # all free about it; nothing seen
-        scan = {"ranges": [far] * 360, "angles": np.radians(range(360)).tolist(), "pose": [0.0, 0.0, 0.0]}
-        (folder / "scan.json").write_text(json.dumps(scan))
-        query = brakeline("query", "ground", *there, "--timeout", 10, "--scan", folder / "scan.json", "--json")
-        assert json.loads(query.stdout)["kind"] in said
-    wrong = brakeline("query", "ground", *there, "--known-free", "--state", 1, 2)
-    assert wrong.returncode == 1 and "BadRequest" in wrong.stderr and "Traceback" not in wrong.stderr
-
-
 def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_path):
     folder = tmp_path / "run"
     (folder / "learner" / "checkpoint").mkdir(parents=True)
     (folder / "learner" / "checkpoint" / "latest").write_text("000042\n")  # it is not there: never a fresh start
-    with Run(folder) as run:
+    with Run(folder, "--actors", 1, "--no-record") as run:
         run.popen.wait(3.0 * PATIENCE)  # five starts of a process that imports torch
         errors = run.errors.read_text()
         assert run.popen.returncode == 1
@@ -150,8 +112,8 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
 
 def test_a_second_interrupt_leaves_nothing_either(data_folder, tmp_path):
     """Of a run without a recorder (`tests/deploy/run/test_launcher.py` has its figures)."""
-    with Run(tmp_path / "run", "--no-record") as run:
-        until(lambda: run.children().keys() == {"safety-0", "learner", "actor-0", "actor-1"}, "all processes")
+    with Run(tmp_path / "run", "--no-record", "--actors", 1) as run:
+        until(lambda: run.children().keys() == {"safety-0", "learner", "actor-0"}, "all processes")
         run.popen.send_signal(signal.SIGINT)
         time.sleep(1.5)
         run.popen.send_signal(signal.SIGINT)
