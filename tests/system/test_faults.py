@@ -110,14 +110,18 @@ def test_what_fails_again_and_again_ends_the_run_and_says_why(data_folder, tmp_p
     assert json.loads((folder / "figures.json").read_text())["restarts"]["learner"] == 4
 
 
-def test_a_second_interrupt_leaves_nothing_either(data_folder, tmp_path):
+def test_a_second_interrupt_ends_the_launcher_at_once_and_leaves_nothing_either(data_folder, tmp_path):
     """Of a run without a recorder (`tests/deploy/run/test_launcher.py` has its figures)."""
     with Run(tmp_path / "run", "--no-record", "--actors", 1) as run:
-        until(lambda: run.children().keys() == {"safety-0", "learner", "actor-0"}, "all processes")
+        run.until_steps(20)
+        actor = run.children()["actor-0"]
+        actor.suspend()  # the launcher waits for it for ten seconds
         run.popen.send_signal(signal.SIGINT)
-        time.sleep(1.5)
+        time.sleep(1.5)  # else both would count as one
+        assert run.popen.poll() is None
         run.popen.send_signal(signal.SIGINT)
-        run.popen.wait(PATIENCE)
+        assert run.popen.wait(5.0) == 130
+        actor.resume()
         until(lambda: run.children() == {}, "no process is left")
     assert list(run.folder.glob("*.mcap")) == []
 
