@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from brakeline.deploy.cli import main
+from brakeline.deploy.data import importer
+from brakeline.deploy.data.sources.isolated_reader import read_here
 from tests.deploy.drive import drive
 
 
@@ -29,3 +31,9 @@ def command(capsys):
         return status, printed.out, printed.err
 
     return run
+
+
+@pytest.fixture
+def reading_here(monkeypatch):
+    """Read foreign logs in this process: starting one takes longer than reading a minute of driving."""
+    monkeypatch.setattr(importer, "read_isolated", lambda reader, path, limits: read_here(reader, path))

@@ -22,6 +22,7 @@ from brakeline.deploy.data.sources.tlog_file import _frames
 from brakeline.errors import NoSource
 from tests.robots import QUADROTOR
 
+pytestmark = pytest.mark.usefixtures("reading_here")
 FLOWN = Path(__file__).parent / "flown"
 COPTER_EARTH = 6378100.0  # m, its simulator's
 AXES = "xyz"

@@ -25,6 +25,8 @@ from tests.deploy.data.bags import (
 )
 from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, porter, write_csv
 
+pytestmark = pytest.mark.usefixtures("reading_here")
+
 
 @pytest.fixture(scope="module")
 def driven():

@@ -18,6 +18,8 @@ from brakeline.messaging.robot import robot_named
 from tests.deploy.data.bags import write_bag
 from tests.deploy.data.porter import COLUMNS, drive, write_csv
 
+pytestmark = pytest.mark.usefixtures("reading_here")
+
 
 @pytest.fixture(scope="module")
 def driven():

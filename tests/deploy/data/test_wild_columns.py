@@ -20,6 +20,7 @@ from brakeline.safety.model.dataset import Dataset
 from tests.deploy.data.porter import COLUMNS, FILE, drive, write_csv
 from tests.deploy.data.test_importer import same
 
+pytestmark = pytest.mark.usefixtures("reading_here")
 EPOCH = 1_760_000_000
 STAMPS = {
     "time": lambda t: f"{t:.2f}",
