@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
+from brakeline.deploy.experiments import bootstrap
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
@@ -34,6 +35,7 @@ from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.figure_tables import analyse
+from brakeline.logs.reader import read
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import task
 from brakeline.messaging.policy_weights import MLP
@@ -41,90 +43,75 @@ from brakeline.messaging.task import read_task, robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 
-DEAR = ("decision_ms", "milliseconds")
+MEASURED = ("decision_ms", "milliseconds", "folder", "seconds")  # no two runs agree on these
 METHODS = ("ddpc", "sailr", "secas", "none")
-BATCH = {"backend": "batch", "robots": 8}
-IN_A_BATCH = ("ddpc", "sailr", "sac-ddpc")
+SINGLE, BATCH = "single", "batch"
+BACKENDS = {SINGLE: {}, BATCH: {"backend": "batch", "robots": 8}}
+EACH = [*((method, SINGLE) for method in METHODS), *((method, BATCH) for method in ("ddpc", "sailr", "sac-ddpc"))]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_resamples():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bootstrap, "RESAMPLES", 500)
+        yield
 
 
 # --- studies -------------------------------------------------------------------------------------------------------
 
-TINY = CellConfig("ground", "none", 3, steps=320, episodes=1, arenas=("default",), untrained=1)
-TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=60))
+TINY = CellConfig("ground", "none", 3, steps=160, episodes=1, arenas=("default",), untrained=1)
+TINY = replace(TINY, td3=replace(TINY.td3, hidden=(16, 16), batch=16, warmup=40))
+
+
+def tiny(method, backend=SINGLE) -> CellConfig:
+    return replace(TINY, method=method, **BACKENDS[backend])
 
 
 @pytest.fixture(scope="module")
-def short_episodes():
-    """Robots that know next to nothing drive until the time limit, in every cell."""
+def rivals(data_folder):
+    """Rivals that know next to nothing, made in seconds; and robots that drive until an early time limit."""
 
     def shortened(path):
         known = read_task(path)
-        return replace(known, arenas={name: replace(kind, step_limit=80) for name, kind in known.arenas.items()})
+        return replace(known, arenas={name: replace(kind, step_limit=40) for name, kind in known.arenas.items()})
 
+    little = {"samples": 300, "fit": FitConfig(hidden=(8, 8), epochs=1, batch=32)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task, "read_task", shortened)
+        for method, config in (("secas", rival_pretraining.SecasConfig), ("sailr", rival_pretraining.SailrConfig)):
+            patch.setitem(rival_pretraining.CONFIGS, method, partial(config, **little))
+            model_store.method_for(GROUND, method, ModelConfig())
         yield
 
 
 @pytest.fixture(scope="module")
-def rivals(data_folder, short_episodes):
-    """Rivals that know next to nothing, made in seconds."""
-    little = {"samples": 300, "fit": FitConfig(hidden=(8, 8), epochs=1, batch=32)}
-    made = {
-        "secas": partial(rival_pretraining.SecasConfig, **little),
-        "sailr": partial(rival_pretraining.SailrConfig, **little),
-    }
-    before = dict(rival_pretraining.CONFIGS)
-    rival_pretraining.CONFIGS.update(made)
-    for method in made:
-        model_store.method_for(GROUND, method, ModelConfig())
-    yield made
-    rival_pretraining.CONFIGS.update(before)
+def cells(rivals, tmp_path_factory) -> dict[tuple[str, str], dict]:
+    """By method and backend: one robot, and eight at once by the batch filter, row by row and with another learner."""
+    root, made = tmp_path_factory.mktemp("cells"), {}
+    for method, backend in EACH:
+        folder = root / f"{method}-{backend}"
+        made[method, backend] = tiny(method, backend).run(folder) | {"folder": folder}
+    return made
 
 
-@pytest.fixture(scope="module")
-def cells(rivals, tmp_path_factory) -> dict[str, dict]:
-    folder = tmp_path_factory.mktemp("cells")
-    return {m: replace(TINY, method=m).run(folder / m) | {"folder": folder / m} for m in METHODS}
-
-
-@pytest.fixture(scope="module")
-def batch_cells(rivals, tmp_path_factory) -> dict[str, dict]:
-    """Cells that are trained and evaluated with eight robots at once: by the batch filter, and row by row."""
-    folder = tmp_path_factory.mktemp("batch")
-    return {m: in_a_batch(m).run(folder / m) | {"folder": folder / m} for m in IN_A_BATCH}
-
-
-def in_a_batch(method: str) -> CellConfig:
-    return replace(TINY, method=method, **BATCH)
-
-
-def stripped(value):
-    """Without anything that a clock had a part in."""
+def repeatable(value):
+    """Return the part of a result that no clock has a part in."""
     if isinstance(value, dict):
-        return {k: stripped(v) for k, v in value.items() if k not in (*DEAR, "folder", "seconds")}
+        return {name: repeatable(part) for name, part in value.items() if name not in MEASURED}
     return value
 
 
-@pytest.mark.parametrize("method", ["ddpc", "none"])
-def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, method, tmp_path):
-    again = replace(TINY, method=method).run(tmp_path / "again")
-    assert stripped(again) == stripped(cells[method])
-    if method == "none":
-        assert replace(TINY, seed=4).run(tmp_path / "other")["policy"] != again["policy"]
-
-
-def test_a_batch_is_repeatable_too(batch_cells, tmp_path):
-    again = in_a_batch("sailr").run(tmp_path)
-    assert stripped(again) == stripped(batch_cells["sailr"])
-
-
-EACH = [*((method, "single") for method in METHODS), *((method, "batch") for method in IN_A_BATCH)]
+def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, tmp_path):
+    for method, backend in (("ddpc", SINGLE), ("sailr", BATCH)):
+        again = tiny(method, backend).run(tmp_path / method)
+        assert repeatable(again) == repeatable(cells[method, backend])
+    other = replace(tiny("none"), seed=4).run(tmp_path / "other")
+    assert other["policy"] != cells["none", SINGLE]["policy"]
 
 
 @pytest.mark.parametrize(("method", "backend"), EACH)
-def test_a_cell_says_what_its_logs_say(cells, batch_cells, method, backend):
-    cell, figures = {"single": cells, "batch": batch_cells}[backend][method], None
+def test_a_cell_says_what_its_logs_say(cells, method, backend):
+    cell = cells[method, backend]
     for name, evaluation in [("training", cell["training"]), *cell["evaluations"].items()]:
         figures = analyse(cell["folder"] / f"{name}.mcap")
         episodes = evaluation["episodes"]
@@ -136,21 +123,16 @@ def test_a_cell_says_what_its_logs_say(cells, batch_cells, method, backend):
         assert figures["method"] == (method if name == "training" else name.split("-")[1])
     assert cell["training"]["steps"] == TINY.steps
     assert 0.9 * (TINY.steps - TINY.td3.warmup) <= cell["training"]["updates"] <= TINY.steps
-    assert json.loads(json.dumps(cell["study"])) == configuration(
-        replace(TINY, method=method, **(BATCH if backend == "batch" else {}))
-    )
+    assert json.loads(json.dumps(cell["study"])) == configuration(tiny(method, backend))
     assert MLP.load(cell["folder"] / "policy.safetensors", GROUND).sizes == (26, 16, 16, 2)
 
 
-def test_methods_and_backends_share_the_episodes_that_they_are_evaluated_on(cells, batch_cells):
-    from brakeline.logs.reader import read as records
-
+def test_methods_and_backends_share_the_episodes_that_they_are_evaluated_on(cells):
     arenas = []
-    for method, backend in EACH:
-        log = {"single": cells, "batch": batch_cells}[backend][method]["folder"]
-        log /= f"trained-{method.removeprefix('sac-')}-default.mcap"
-        arenas.append([(r.message.start, r.message.goal) for r in records(log) if r.topic == "episode"])
-    assert arenas[0] and all(list(map(str, arena)) == list(map(str, arenas[0])) for arena in arenas)
+    for (method, _), cell in cells.items():
+        log = cell["folder"] / f"trained-{method.removeprefix('sac-')}-default.mcap"
+        arenas.append([str((r.message.start, r.message.goal)) for r in read(log) if r.topic == "episode"])
+    assert arenas[0] and all(arena == arenas[0] for arena in arenas)
 
 
 def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp_path):
@@ -176,7 +158,7 @@ def test_only_where_a_policy_and_a_filter_are_crossed_there_are_more_trials():
 
 
 def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cells):
-    training = cells["sailr"]["training"]["episodes"]
+    training = cells["sailr", SINGLE]["training"]["episodes"]
     assert max(training["interventions"]) <= 1
     columns = (training[name] for name in ("interventions", "goal", "collision", "timeout"))
     for ended, goal, collision, timeout in zip(*columns, strict=True):
@@ -184,29 +166,24 @@ def test_sailrs_interventions_end_episodes_in_training_and_not_in_evaluation(cel
 
 
 def test_the_table_curves_and_points_of_real_cells(cells, tmp_path):
-    rows = table(cells.values())
-    text = markdown(rows)
-    for name in (
-        "| ours, n = 1 | SAILR, n = 1 | SECAS, n = 1 | TD3, n = 1 |",
-        "*paper*",
-        "## training",
-        "## default",
-        "## deployment",
-        "*80.4*",
-    ):
-        assert name in text
-    json.dumps(plain(rows))
-    once = without_times(plain(rows))
-    assert "decision [ms]" not in json.dumps(once) and "goal rate" in json.dumps(once)
-    learning_curves(list(cells.values()), tmp_path / "curves.png")
+    singles = [cells[method, SINGLE] for method in METHODS]
+    without_filter = singles[-1]
+
+    def changed(**study):
+        return [*singles, without_filter | {"study": without_filter["study"] | study}]
+
+    rows = table(singles)
+    text, figures = markdown(rows), json.dumps(without_times(plain(rows)))
+    assert "| ours, n = 1 | SAILR, n = 1 | SECAS, n = 1 | TD3, n = 1 |" in text
+    assert all(word in text for word in ("*paper*", "## training", "## default", "## deployment", "*80.4*"))
+    assert "decision [ms]" in text and "decision [ms]" not in figures and "goal rate" in figures
+    learning_curves(singles, tmp_path / "curves.png")
     seeds_as_points(rows, tmp_path / "seeds.png")
     assert (tmp_path / "curves.png").stat().st_size > 10_000 < (tmp_path / "seeds.png").stat().st_size
-    more = [*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"seed": 9}}]
-    assert "| SECAS, n = 1 | TD3, n = 2 |" in markdown(table(more))
-    newer = cells["none"] | {"study": cells["none"]["study"] | {"method": "lagrange"}}
-    assert "**" not in markdown(table([*cells.values(), newer])), "the paper has no figure of TD3-Lagrange"
+    assert "| SECAS, n = 1 | TD3, n = 2 |" in markdown(table(changed(seed=9)))
+    assert "**" not in markdown(table(changed(method="lagrange"))), "the paper has no figure of TD3-Lagrange"
     with pytest.raises(ValueError, match="one robot"):
-        table([*cells.values(), cells["none"] | {"study": cells["none"]["study"] | {"robot": "quadrotor"}}])
+        table(changed(robot="quadrotor"))
 
 
 def test_the_studies_of_a_comparison():
@@ -241,9 +218,9 @@ def test_intervals_cover_what_they_should():
 
 
 def test_a_rate_without_an_event_has_an_exact_interval():
-    never, always, once = rate([np.zeros(500)] * 3), rate([np.ones(500)] * 3), [np.eye(500)[0], np.zeros(500)]
-    assert (never.value, never.low) == (0.0, 0.0) and never.high == pytest.approx(1.0 - 0.025 ** (1 / 1500))
-    assert (always.value, always.high) == (1.0, 1.0) and always.low == pytest.approx(0.025 ** (1 / 1500))
+    never, always, once = rate([np.zeros(50)] * 3), rate([np.ones(50)] * 3), [np.eye(50)[0], np.zeros(50)]
+    assert (never.value, never.low) == (0.0, 0.0) and never.high == pytest.approx(1.0 - 0.025 ** (1 / 150))
+    assert (always.value, always.high) == (1.0, 1.0) and always.low == pytest.approx(0.025 ** (1 / 150))
     assert rate(once) == mean(once)
 
 
@@ -267,16 +244,6 @@ def test_steps_of_several_actors_are_rows_in_the_order_in_which_their_episodes_b
     assert table.pop()["steps"] == 3 and table.columns()["steps"] == [2, 1]
 
 
-def test_a_batch_is_not_taken_for_a_fast_learner_because_its_short_episodes_end_first():
-    """Half of the robots reach the goal soon, and the others time out long after."""
-    begins = list(range(100))
-    ends = [100 + n if n % 2 else 3000 + n for n in begins]
-    episodes = {"goal": [n % 2 for n in begins], "steps": [1] * 100, "begin": begins, "end": ends}
-    assert steps_to_learn(episodes, 5000) == 5000
-    later = {"goal": [1] * 50, "steps": [1] * 50, "begin": range(100, 150), "end": [4000 + n for n in range(50)]}
-    assert steps_to_learn({name: [*values, *later[name]] for name, values in episodes.items()}, 5000) == 4038
-
-
 def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_none():
     assert backend_for("ground", ("default", "dense")) == backend_for("quadrotor", ("default", "dense")) == "batch"
     assert backend_for("ground", ("default", "walkers")) == backend_for("ground+tracks", ("default",)) == "single"
@@ -286,11 +253,16 @@ def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_no
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():
-    goals = [0] * 30 + [1] * 100
-    steps = [10] * 130
+    """In a batch, short episodes end first: half of the robots reach the goal soon, the others time out long after."""
+    goals, steps = [0] * 30 + [1] * 100, [10] * 130
     assert steps_to_learn({"goal": goals, "steps": steps}, 5000) == 10 * (30 + 45)
     assert steps_to_learn({"goal": [0] * 130, "steps": steps}, 5000) == 5000
     assert steps_to_learn({"goal": [1] * 10, "steps": [10] * 10}, 5000) == 5000, "too few episodes to tell"
+    ends = [100 + n if n % 2 else 3000 + n for n in range(100)]
+    batch = {"goal": [n % 2 for n in range(100)], "steps": [1] * 100, "begin": [*range(100)], "end": ends}
+    assert steps_to_learn(batch, 5000) == 5000
+    later = {"goal": [1] * 50, "steps": [1] * 50, "begin": range(100, 150), "end": [4000 + n for n in range(50)]}
+    assert steps_to_learn({name: [*values, *later[name]] for name, values in batch.items()}, 5000) == 4038
 
 
 def test_the_goals_of_training_are_counted_in_thirds_of_the_steps():
