@@ -13,8 +13,8 @@ from tests.robots import GROUND
 
 
 def test_transitions_are_whole_scaled_and_the_same_again():
-    one, same, other = (transitions(GROUND, SecasConfig(samples=400, seed=seed)) for seed in (1, 1, 2))
-    assert one.observation.shape == (400, 26) and one.action.shape == (400, 2) and one.change.shape == (400, 6)
+    one, same, other = (transitions(GROUND, SecasConfig(samples=200, seed=seed)) for seed in (1, 1, 2))
+    assert one.observation.shape == (200, 26) and one.action.shape == (200, 2) and one.change.shape == (200, 6)
     assert np.array_equal(one.change, same.change) and not np.array_equal(one.change, other.change)
     assert (np.abs(one.action) <= 1.0).all() and (one.action[:, 0] >= 0).all()
     fast = one.action[:, 0] > 0.8
@@ -22,15 +22,15 @@ def test_transitions_are_whole_scaled_and_the_same_again():
 
 
 def test_costs_are_of_braking_to_the_end():
-    recorded = costs(GROUND, SailrConfig(samples=3000, seed=1))
+    recorded = costs(GROUND, SailrConfig(samples=1000, seed=1))
     assert recorded.collisions > 0 and recorded.collided.sum() == recorded.collisions
     for cost in (recorded.braked_cost, recorded.step_cost):
         assert (cost >= 0.0).all() and (cost <= 1.0 + 1e-9).all()
     driven = recorded.driven
-    assert len(driven) >= 3000 and driven.shape[1] == 28 and (np.abs(driven[:, 26:]) <= 1.0).all()
+    assert len(driven) >= 1000 and driven.shape[1] == 28 and (np.abs(driven[:, 26:]) <= 1.0).all()
     quiet = recorded.braked_cost[recorded.braked_cost < 0.5]
     assert quiet.max() < 0.1, "a stop that touched nothing is nearly free, whatever it came near"
-    assert len(recorded.braked) == len(recorded.braked_cost) > 500
+    assert len(recorded.braked) == len(recorded.braked_cost) > 150
 
 
 @pytest.mark.parametrize("config_class", [SecasConfig, SailrConfig])

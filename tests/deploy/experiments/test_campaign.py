@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binomtest
 
 from brakeline.deploy.commands.campaign_command import COLLIDED, CampaignCommand
-from brakeline.deploy.experiments import campaign
+from brakeline.deploy.experiments import campaign, experiment_jobs
 from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cells_of, parts_of_cell
 from brakeline.deploy.experiments.campaign_episodes import CampaignDriver
 from brakeline.deploy.experiments.experiment_jobs import complete
@@ -15,11 +15,10 @@ from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS
 from brakeline.deploy.run.replay_run import replay
 from brakeline.errors import ResultError
 from brakeline.logs.figure_tables import analyse
-from brakeline.messaging.task import robot_with_task
+from tests.robots import GROUND
 
 NEAR = 0.1  # m, so that a few of these episodes are near misses
 CELL = CampaignPart("ground", "dense", "trained", "residual", "as-recorded", NEAR, 0, 1)
-GROUND = robot_with_task("ground")
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +45,12 @@ def test_the_parts_of_a_cell_add_up(driven):
     assert "| dense | trained | residual | as-recorded | 6 |" in text and "0: 0.00 % [0.00, 45.93]" in text
 
 
-def test_a_campaign_goes_on_after_the_episodes_that_it_has(driven, monkeypatch):
+def test_a_campaign_goes_on_after_the_episodes_that_it_has_and_adds_up_one_model_set(driven, monkeypatch):
     parts, results, folder = driven
     monkeypatch.setattr(CampaignPart, "run", lambda *_: pytest.fail("driven again"))
     assert complete(parts, folder, folder) == results
+    with pytest.raises(ResultError, match="other model sets"):
+        cells_of(parts, [results[0], results[1] | {"model": "another"}])
 
 
 def test_near_misses_are_kept_and_replay_bit_by_bit(driven):
@@ -73,22 +74,15 @@ def test_episodes_in_a_batch_are_those_one_after_the_other(driven, monkeypatch):
         assert [row[name] for row in rows] == pytest.approx(values[1:3], rel=0.05, abs=2e-3), name
 
 
-def test_parts_with_other_model_sets_are_not_added_up(driven):
-    parts, results, _ = driven
-    with pytest.raises(ResultError, match="other model sets"):
-        cells_of(parts, [results[0], results[1] | {"model": "another"}])
-
-
 def test_a_search_hits_something_without_the_filter_and_nothing_with_it(data_folder, tmp_path):
-    found = {}
-    for model_set in ("none", "residual"):
-        job = CampaignSearch(replace(CELL, model_set=model_set), 20)
-        found[model_set] = job.run(tmp_path / "ground" / model_set, lambda text: None)
-    bare, filtered = found["none"], found["residual"]
+    bare, filtered = (
+        CampaignSearch(replace(CELL, model_set=model_set), 10).run(tmp_path / "ground" / model_set, lambda text: None)
+        for model_set in ("none", "residual")
+    )
     assert bare["collisions"] > 0 and bare["closest"] <= 0.0
     assert filtered["collisions"] == 0 and filtered["closest"] > 0.0
-    for search in found.values():
-        assert search["episodes"] >= 20 and search["history"] == sorted(search["history"], reverse=True)
+    for search in (bare, filtered):
+        assert search["episodes"] >= 10 and search["history"] == sorted(search["history"], reverse=True)
         assert search["history"][-1] == pytest.approx(search["closest"], abs=1e-5)
         assert analyse([search["log"]])["closest_approach"] == pytest.approx(search["closest"])
     assert replay([filtered["log"]]).figures()["different"] == 0
@@ -98,15 +92,12 @@ def test_a_collision_behind_the_filter_is_an_exit_status(driven, monkeypatch, tm
     _, (first, _), _ = driven
     touched = json.loads(json.dumps(first))
     touched["episodes"]["collision"][0] = 1
-    monkeypatch.setattr(CampaignPart, "run", lambda self, folder, say: touched | {"study": {}})
+    monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [touched] if jobs else [])
     command = CampaignCommand(
         arenas=("dense",), policies=("trained",), model_sets=("residual",), episodes=4, engine=IN_THIS_PROCESS,
         results=tmp_path / "results", runs=tmp_path / "runs", json=True,
     )  # fmt: skip
-    monkeypatch.setattr("brakeline.deploy.experiments.experiment_jobs.read", lambda *_: None)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("brakeline.deploy.experiments.experiment_jobs.complete", lambda *_: [touched] if _[0] else [])
-        assert command.run() == COLLIDED
+    assert command.run() == COLLIDED
     (cell,) = json.loads(capsys.readouterr().out)["ground"]["cells"]
     assert cell["collisions"] == 1
 

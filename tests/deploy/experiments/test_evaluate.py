@@ -1,11 +1,61 @@
-"""`evaluate --fleet`: figures of robots that share a world."""
+"""Evaluations: a batch counts the same episodes as one robot after the other, each once; a fleet shares a world."""
+
+from dataclasses import replace
 
 import pytest
 
-from brakeline.deploy.experiments.evaluate import Evaluation, evaluate
+from brakeline.deploy.experiments import batch_evaluation
+from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, parts_of
 from brakeline.deploy.run.replay_run import _joint_requests
+from brakeline.logs.episode_stats import EpisodeStats
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
+
+TRAINED = Evaluation(policy="trained", arena="dense", episodes=6, model_config=ModelConfig(mode="direct"))
+COUNTED = ("episodes", "goals", "collisions", "timeouts")
+
+
+@pytest.mark.parametrize("method", ["ddpc", "none"])
+def test_the_figures_are_those_of_one_robot_after_the_other(data_folder, method):
+    what = replace(TRAINED, method=method)
+    single, batch = evaluate(GROUND, what), evaluate(GROUND, replace(what, backend="batch"))
+    assert {name: batch[name] for name in COUNTED} == {name: single[name] for name in COUNTED}
+    assert batch["steps"] == pytest.approx(single["steps"], rel=0.01)
+    assert batch["interventions"] == pytest.approx(single["interventions"], rel=0.05, abs=5)
+    assert batch["mean_reward"] == pytest.approx(single["mean_reward"], rel=0.01)
+    assert batch["closest_approach"] == pytest.approx(single["closest_approach"], abs=1e-3)
+    assert (batch["collisions"] > 0) == (method == "none"), "what the filter prevents"
+    assert batch["containment"]["steps"] == (batch["steps"] if method == "ddpc" else 0)
+
+
+def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeypatch):
+    """A robot's first goals come early. Only counting all episodes, the slow ones too, is fair to a policy."""
+    returns = []
+    for turns in (1, 3):
+        monkeypatch.setattr(batch_evaluation, "TURNS", turns)
+        ended: list[EpisodeStats] = []
+        (part,) = parts_of(GROUND, replace(TRAINED, method="none", backend="batch"))
+        driven = part.drive(ended.append)
+        assert len(ended) == 6 and len(driven.stats) == 6 // turns
+        returns.append(sorted(value for stats in driven.stats.values() for value in stats.returns))
+    assert returns[1] == pytest.approx(returns[0], abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"policy": "astar", "backend": "batch"}, "driven by a network"),
+        ({"fleet": 3, "backend": "batch"}, "robots of a fleet"),
+        ({"arena": "walkers", "method": "none", "backend": "batch"}, "moving obstacles"),
+        ({"arena": "crossing", "method": "secas", "fleet": 2}, "promises"),
+        ({"arena": "crossing", "method": "sailr", "fleet": 2}, "promises"),
+    ],
+)
+def test_what_no_batch_and_no_fleet_does_is_refused(monkeypatch, change, said):
+    monkeypatch.setattr(batch_evaluation, "method_for", lambda *_: object())
+    with pytest.raises(ValueError, match=said):
+        evaluate(GROUND, replace(TRAINED, **change))
 
 
 def test_a_fleet_of_planners_gets_past_each_other(data_folder):
@@ -17,12 +67,6 @@ def test_a_fleet_of_planners_gets_past_each_other(data_folder):
     worlds = figures["worlds"]
     assert worlds["count"] == 1 and worlds["touches"] == 0 and worlds["goals_per_minute"] > 0.0
     assert worlds["robot_steps"] >= figures["steps"], "who is at its goal stands there until the others are"
-
-
-@pytest.mark.parametrize("method", ["secas", "sailr"])
-def test_rivals_promise_nothing(method):
-    with pytest.raises(ValueError, match="promises"):
-        evaluate(GROUND, Evaluation(method=method, arena="crossing", fleet=2))
 
 
 def test_what_was_one_question_is_asked_again_as_one():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.commands.compare_command import CompareCommand
+from brakeline.deploy.experiments import bootstrap
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
 from brakeline.deploy.experiments.experiment_jobs import configuration
@@ -16,12 +17,27 @@ from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuni
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 
-GOALS = {
-    "ddpc": (100, 98, 96, 94),
-    "none": (97, 93, 80),
-    "sac": (90,),
-    "lagrange": (90,),
-}  # of 100 episodes, by run; in `dense` 10 fewer
+# Of 100 episodes, by run; in `dense` 10 fewer.
+GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80), "sac": (90,), "lagrange": (90,)}
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(bootstrap, "RESAMPLES", 500)
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A folder with the stored cells of the ground robot."""
+    store(tmp_path / "ground")
+    return tmp_path
+
+
+def change(path, how):
+    """Change the content of a stored cell."""
+    cell = json.loads(path.read_text())
+    how(cell)
+    path.write_text(json.dumps(cell))
 
 
 def evaluation(goals: int, collisions: int) -> dict:
@@ -31,12 +47,12 @@ def evaluation(goals: int, collisions: int) -> dict:
     return {"episodes": episodes | columns, "decision_ms": {"mean": 0.5, "std": 0.1}}
 
 
-def store(folder, physics: int = 2) -> None:
+def store(folder) -> None:
     """Store cells with known figures."""
     folder.mkdir(exist_ok=True, parents=True)
     for method, runs in GOALS.items():
         for cell, goals in zip(cell_configs("ground", (method,), range(len(runs))), runs, strict=True):
-            own = replace(cell, physics=physics, td3=learning(TD3Config(), method))
+            own = replace(cell, physics=2, td3=learning(TD3Config(), method))
             hit = 0 if method == "ddpc" else 2
             training = evaluation(90, 3 * hit) | {"steps": 60_000}
             trials = {f"trained-{method}-default": evaluation(goals, hit)}
@@ -49,55 +65,44 @@ def store(folder, physics: int = 2) -> None:
             (folder / f"{own.name}.json").write_text(json.dumps(result))
 
 
-def test_every_figure_follows_from_the_cells(tmp_path):
-    store(tmp_path / "ground")
-    text = page(tmp_path, ["ground", "quadrotor"])
+def test_every_figure_follows_from_the_cells(results):
+    text = page(results, ["ground", "quadrotor"])
     assert "| ours | 4 | 97.0 % [" in text and "| TD3 | 3 | 90.0 % [" in text, "middle half, all of three"
     assert "0 of 400: 0.00 % [0.00, 0.92]" in text and "6 of 300: 2.00 % [0.74, 4.30]" in text
     assert "| SAC | 1 | SAC | – |" in text and "| TD3-Lagrange | 1 | TD3 with a multiplier | – |" in text
     assert "| 6.0 (6 to 6) |" in text and "| ours over TD3 | 0.83 [" in text, "10 of 12 pairs"
-    assert (
-        "| 10.0 % | 10.0 % | 0.50 | 0.50 |" in text and "60,000 training steps" in text and "## quadrotor" not in text
-    )
-    found = RobotResults("ground", stored_cells(tmp_path, "ground"))
-    assert found.goals("none").shape == (2, 3) and np.allclose(found.goals("none")[1], [0.87, 0.83, 0.7])
+    assert "| 10.0 % | 10.0 % | 0.50 | 0.50 |" in text and "60,000 training steps" in text
+    assert "## quadrotor" not in text
+    goals = RobotResults("ground", stored_cells(results, "ground")).goals("none")
+    assert goals.shape == (2, 3) and np.allclose(goals[1], [0.87, 0.83, 0.7])
 
 
-def test_cells_of_two_simulators_are_not_mixed(tmp_path):
-    store(tmp_path / "ground")
-    old = json.loads((tmp_path / "ground" / "none-s0.json").read_text())
-    del old["study"]["physics"]
-    (tmp_path / "ground" / "none-s0.json").write_text(json.dumps(old))
+def test_cells_of_two_simulators_and_of_two_settings_of_a_rival_are_not_mixed(results):
+    old = results / "ground" / "none-s0.json"
+    change(old, lambda cell: cell["study"].pop("physics"))
     with pytest.raises(ResultError, match="more than one physics"):
-        page(tmp_path, ["ground"])
-
-
-def test_cells_of_two_settings_of_a_rival_are_not_mixed(tmp_path):
-    store(tmp_path / "ground")
+        page(results, ["ground"])
+    change(old, lambda cell: cell["study"].update(physics=2))
     for number, margin in enumerate((0.0, 0.02)):
-        path = tmp_path / "ground" / f"ddpc-s{number}.json"
-        cell = json.loads(path.read_text())
-        cell["model"]["settings"] = {"margin": margin}
-        path.write_text(json.dumps(cell))
+        path = results / "ground" / f"ddpc-s{number}.json"
+        change(path, lambda cell, margin=margin: cell["model"].update(settings={"margin": margin}))
     with pytest.raises(ResultError, match="ddpc has cells of several settings"):
-        stored_cells(tmp_path, "ground")
+        stored_cells(results, "ground")
 
 
-def test_the_command_writes_the_page_and_the_figures_without_a_run(tmp_path, capsys):
-    store(tmp_path / "ground")
-    assert CompareCommand(("ground",), table=True, results=tmp_path, quiet=True).run() == 0
-    assert (tmp_path / "README.md").read_text() == page(tmp_path, ["ground"])
-    written = {path.name for path in (tmp_path / "ground").iterdir()}
+def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
+    assert CompareCommand(("ground",), table=True, results=results, quiet=True).run() == 0
+    assert (results / "README.md").read_text() == page(results, ["ground"])
+    written = {path.name for path in (results / "ground").iterdir()}
     assert written > {"profiles.png", "curves.png", "seeds.png", "table.md", "table.json"}
 
 
-def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(tmp_path):
+def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
     jobs = tuning_jobs("ground", tuple(METHODS), ("default", "dense"))
     counts = {job.method: sum(other.method == job.method for other in jobs) for job in jobs}
     assert counts == dict.fromkeys(("sailr", "secas", "lagrange", "cbf", "psf", "sac"), 4)
     assert len({job.name for job in jobs}) == len(jobs)
     assert {job.cell.td3.multiplier_rate for job in jobs if job.method == "lagrange"} == {1.0, 3.0, 10.0, 30.0}
-    store(tmp_path / "ground")
     for job in jobs:
         if isinstance(job, FilterTuning):
             row = {"oracle_goals": 60, "oracle_interventions": 0.1, "greedy_goals": 20, "episodes": 60}
@@ -106,8 +111,8 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(tmp_path):
             assert isinstance(job, LearnerTuning) and job.cell.seed == 1000
             row = {"goals": 118, "collisions": int(job.value), "training_collisions": 7, "episodes": 120}
             row |= {"value": job.value}
-        (tmp_path / "ground" / f"{job.name}.json").write_text(json.dumps({"study": configuration(job), **row}))
-    text = page(tmp_path, ["ground"])
+        (results / "ground" / f"{job.name}.json").write_text(json.dumps({"study": configuration(job), **row}))
+    text = page(results, ["ground"])
     assert "| CBF-QP | rate α [1/s] | **0.5**: A* 60 goals; greedy 20, 1 collisions |" in text
     assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | 10 |" in text
 
