@@ -1,5 +1,6 @@
 """One short log, and the command line within this process."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import importer
 from brakeline.deploy.data.sources.isolated_reader import read_here
+from brakeline.safety.model.dataset import Dataset
 from tests.deploy.drive import drive
 
 
@@ -31,6 +33,15 @@ def command(capsys):
         return status, printed.out, printed.err
 
     return run
+
+
+@pytest.fixture(scope="session")
+def few_data(data_folder, tmp_path_factory) -> Path:
+    """The first minutes of the session's recording, as a data set of its own."""
+    data = Dataset.load(data_folder / "ground" / "record.safetensors")
+    path = tmp_path_factory.mktemp("few") / "few.safetensors"
+    replace(data, trajectories=data.trajectories[:24]).save(path)
+    return path
 
 
 @pytest.fixture

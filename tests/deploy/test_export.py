@@ -50,9 +50,7 @@ def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: 
     assert missing == {"path"}
 
 
-def test_minari_loads_the_episodes(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, capsys) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     figures = run(capsys, log, "--minari", "brakeline/ground-v0")["minari"]
@@ -76,9 +74,7 @@ def test_minari_loads_the_episodes(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_foxglove_draws_every_step_and_keeps_every_byte(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, capsys) -> None:
     out = tmp_path / "full.mcap"
     count = run(capsys, log, "--foxglove", out)["foxglove"]["messages"]
     before, after = messages(log), messages(out)
@@ -93,9 +89,7 @@ def test_foxglove_draws_every_step_and_keeps_every_byte(
     assert cli.main(["export", str(log), "--foxglove", str(out)]) == 1
 
 
-def test_an_impossible_export_fails_with_a_reason(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_impossible_export_fails_with_a_reason(log, tmp_path, capsys) -> None:
     assert cli.main(["export", str(log)]) == 1
     assert "--csv, --minari, --foxglove" in capsys.readouterr().err
     assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1

@@ -3,28 +3,26 @@
 import contextlib
 import io
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.deploy.data.data_paths import record_path
 from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.messaging.robot_description import read_robot
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelSet
-from tests.robots import GROUND
 
 
 @pytest.fixture(scope="module")
-def few(data_folder, tmp_path_factory):
-    """A data folder with some minutes of driving: the first trajectories of the session's recording."""
+def few(few_data, tmp_path_factory):
+    """A data folder with some minutes of driving."""
     folder = tmp_path_factory.mktemp("few")
-    data = Dataset.load(record_path(GROUND))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BRAKELINE_DATA", str(folder))
         (folder / "ground").mkdir()
-        replace(data, trajectories=data.trajectories[:24]).save(record_path(GROUND))
+        shutil.copy(few_data, folder / "ground" / "record.safetensors")
         yield folder
 
 
@@ -46,19 +44,13 @@ def loose(certified, few):
     model_of(few).write_bytes(certified["file"])
 
 
-def run(capsys, *words):
-    status = main([str(word) for word in words])
-    output = capsys.readouterr()
-    return status, output.out, output.err
-
-
 def model_of(folder):
     return folder / "ground" / "residual-direct.safetensors"
 
 
-def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, capsys):
+def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, command):
     model_of(few).unlink(missing_ok=True)
-    status, out, err = run(capsys, *CERTIFY, "--json")
+    status, out, err = command(*CERTIFY, "--json")
     assert status == 1 and not model_of(few).exists()
     assert "not put to use" in err and "limit of ground is 1 %" in err and "--accept-bound 0." in err
     figures = json.loads(out)["residual"]
@@ -70,18 +62,20 @@ def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
 
 
 def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(
-    few, tmp_path, monkeypatch, capsys
+    few, tmp_path, monkeypatch, command
 ):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    words = ("certify", "ground-late", "--data", few / "ground" / "record.safetensors", "--accept-bound", "0.5")
-    found = [
-        json.loads(run(capsys, *words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
+    data = Dataset.load(few / "ground" / "record.safetensors")
+    replace(data, trajectories=data.trajectories[:10]).save(tmp_path / "fewer.safetensors")
+    words = ("certify", "ground-late", "--data", tmp_path / "fewer.safetensors", "--accept-bound", "0.5")
+    strict, lenient = (
+        json.loads(command(*words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
         for outside in ("0.001", "0.1")
-    ]
+    )
     assert ModelSet.load(tmp_path / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
-    assert found[1]["inflation"] < found[0]["inflation"] and found[1]["half_width_rest"] < found[0]["half_width_rest"]
-    assert found[1]["bound_plan"] > found[0]["bound_plan"] and found[1]["marginal"] > found[0]["marginal"]
-    status, _, err = run(capsys, "certify", "ground", "--outside", "0.5")
+    assert all(lenient[name] < strict[name] for name in ("inflation", "half_width_rest"))
+    assert all(lenient[name] > strict[name] for name in ("bound_plan", "marginal"))
+    status, _, err = command("certify", "ground", "--outside", "0.5")
     assert status == 1 and "between 0 and 0.1" in err and not (tmp_path / "ground").exists()
 
 
@@ -94,30 +88,30 @@ def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_le
         "ros2 ground --seconds 1",
     ],
 )
-def test_each_command_that_drives_refuses_a_loose_model_set(words, loose, capsys, tmp_path):
-    status, _, err = run(capsys, *words.format(out=tmp_path / "run").split())
+def test_each_command_that_drives_refuses_a_loose_model_set(words, loose, command, tmp_path):
+    status, _, err = command(*words.format(out=tmp_path / "run").split())
     assert status == 1, err
     assert "of plans leave their tubes" in err and "is 1 %" in err and "--accept-bound 0." in err
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluate_uses_a_model_set_with_an_accepted_bound(loose, capsys):
+def test_evaluate_uses_a_model_set_with_an_accepted_bound(loose, command):
     words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--json")
-    assert run(capsys, *words, "--accept-bound", 0.5)[0] == 0
-    status, _, err = run(capsys, *words, "--accept-bound", 0.001)
+    assert command(*words, "--accept-bound", 0.5)[0] == 0
+    status, _, err = command(*words, "--accept-bound", 0.001)
     assert status == 1 and "--accept-bound accepts is 0.1 %" in err
-    status, _, err = run(capsys, *words, "--accept-bound", 2)
+    status, _, err = command(*words, "--accept-bound", 2)
     assert status == 1 and "above 0 and at most 1" in err
 
 
 @pytest.mark.parametrize("bound", [None, "nan", "a few"])
-def test_a_model_set_without_a_readable_bound_is_refused(bound, loose, few, capsys):
+def test_a_model_set_without_a_readable_bound_is_refused(bound, loose, few, command):
     model = ModelSet.load(model_of(few))
     model.about.pop("bound_plan")
     model.about.update({} if bound is None else {"bound_plan": bound})
     model.save(model_of(few))
     words = ("evaluate", "ground", "--episodes", 1, "--policy", "random", "--accept-bound", 0.99)
-    status, _, err = run(capsys, *words)
+    status, _, err = command(*words)
     assert status == 1 and "any share may leave their tubes" in err and "--accept-bound 1 " in err
 
 
@@ -135,14 +129,16 @@ def test_a_description_can_set_its_own_limit(tmp_path):
 
 
 @pytest.mark.parametrize("damaged", [False, True])
-def test_a_vehicle_behind_a_link_is_not_flown_with_a_model_set_of_the_simulator(damaged, tmp_path, monkeypatch, capsys):
+def test_a_vehicle_behind_a_link_is_not_flown_with_a_model_set_of_the_simulator(
+    damaged, tmp_path, monkeypatch, command
+):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     file = tmp_path / "quadrotor-late" / "residual-one-step.safetensors"
     if damaged:
         file.parent.mkdir()
         file.write_bytes(b"damaged")
     words = ("fly", "--url", "udpin:127.0.0.1:14999", "--accept-bound", "1", "--out", tmp_path / "run")
-    status, _, err = run(capsys, *words)
+    status, _, err = command(*words)
     assert status == 1 and "no model set of this vehicle" in err and "collect quadrotor --url" in err
     assert not (tmp_path / "quadrotor").exists() and not (tmp_path / "run").exists()
     assert not damaged or file.read_bytes() == b"damaged"

@@ -70,3 +70,13 @@ def test_a_robot_that_asks_a_service_stops_before_the_cylinder(service, capsys):
     assert "adjusted" in output or "failsafe" in output
     positions = [float(x) for x in re.findall(r"x = (\S+) m", output)]
     assert len(positions) == 15 and 0.3 < max(positions) < 0.6 - 0.1 - 0.105
+
+
+def test_the_arm_certifies_its_own_log_and_never_exceeds_a_limit(tmp_path):
+    pytest.importorskip("mujoco")
+    picture = tmp_path / "limits.png"
+    words = ("--minutes", "5", "--accept-bound", "0.03", "--episodes", "10", "--steps", "50", "--picture", str(picture))
+    behind, without = run_program("two_link_arm/two_link_arm.py", *words).splitlines()[-2:]
+    assert "'episodes': 10, 'steps': 500, 'episodes beyond a limit': 0" in behind, behind
+    assert float(re.search(r"'nearest to a limit \[rad\]': ([\d.e-]+)", behind)[1]) < 0.15
+    assert int(re.search(r"'episodes beyond a limit': (\d+)", without)[1]) >= 5 and picture.stat().st_size > 1000

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.experiments.evaluate import FRESH, episode, in_process
@@ -37,7 +36,7 @@ from tests.arenas import staged_arena
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")
-TRAJECTORIES = 24  # enough windows in both parts of the data
+TRAJECTORIES = 20  # enough windows in both parts of the data
 
 
 def robot(name: str) -> RobotWithTask:
@@ -178,9 +177,7 @@ def test_held_out_plans_stay_in_their_tubes(certified: tuple[ModelSet, Validatio
     assert model.robot == recorded.robot
 
 
-def test_adversarial_episodes_collide_only_without_the_filter(
-    kind: RobotWithTask, certified: tuple[ModelSet, ValidationReport]
-) -> None:
+def test_adversarial_episodes_collide_only_without_the_filter(kind, certified) -> None:
     model, _ = certified
     assert _collisions(kind, in_process(model, BOUND)) == (0, 0)
     assert _collisions(kind, None)[0] > 0
@@ -198,9 +195,7 @@ def _collisions(kind: RobotWithTask, question: object) -> tuple[int, int]:
     return collisions, outside
 
 
-def test_a_changed_description_leads_to_a_new_model_set(
-    kind: RobotWithTask, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_description_leads_to_a_new_model_set(kind, recorded, tmp_path, monkeypatch) -> None:
     """A wider body needs a new model set from the same recording; another period needs a new recording."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     recorded.save(data_paths.record_path(kind))
@@ -210,25 +205,6 @@ def test_a_changed_description_leads_to_a_new_model_set(
     assert model_store.model_for(wider, ModelConfig(), BOUND).robot.body == wider.body
     with pytest.raises(BadData, match="changed"):
         simulated_recording.data_for(replace(kind, period=0.1))
-
-
-def test_an_imported_data_set_is_never_overwritten_by_a_recording(
-    kind: RobotWithTask,
-    recorded: Dataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Neither a changed description nor `brakeline collect` overwrites it."""
-    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
-    path = data_paths.record_path(kind)
-    replace(recorded, about={"origin": "import", "sources": "drive.csv"}).save(path)
-    before = path.read_bytes()
-    with pytest.raises(BadData, match=r"kept: .* \(import: drive.csv\).*import the log again"):
-        model_store.model_for(replace(kind, period=0.1), ModelConfig())
-    assert main(["collect", str(EXAMPLES / kind.name / f"{kind.name}.toml"), "--trajectories", "1"]) == 1
-    assert "drive.csv" in capsys.readouterr().err
-    assert path.read_bytes() == before
 
 
 def test_a_process_has_the_name_of_the_robot_and_not_of_its_file() -> None:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.certification import certify
@@ -92,8 +93,9 @@ def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_
     first = next(collect.record(GROUND, 1, simulated_recording.SEED, Conditions()))
     assert (first.states == steady.trajectories[0].states).all()
     assert "restless" not in steady.about
-    assert certify(data, ModelConfig())[0].version == certify(steady, ModelConfig())[0].version
-    assert steady.digest() != data.digest()
+    few = replace(data, trajectories=(*steady.trajectories[:8], *restless[:4]), about=data.about | {"restless": "4"})
+    assert certify(few, ModelConfig())[0].version == certify(few.steady(), ModelConfig())[0].version
+    assert few.steady().digest() != few.digest()
 
 
 @pytest.fixture
@@ -107,6 +109,13 @@ def elsewhere(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
     return recordings
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Trajectories of a few periods: they are too short to certify."""
+    monkeypatch.setattr(collect, "PERIODS", 60)
+    monkeypatch.setattr(collect, "RESTLESS_PERIODS", 30)
 
 
 def test_a_robot_without_a_recording_uses_the_model_set_that_comes_with_it(elsewhere):
@@ -128,7 +137,7 @@ def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     assert data_paths.record_path(GROUND).exists() and len(elsewhere) == 1
     assert ModelSet.load(data_paths.model_path(GROUND, ModelConfig())).version == model.version
     assert model_store.model_for(GROUND, ModelConfig(), BOUND).version == model.version
-    other = model_store.model_for(GROUND, ModelConfig("set-membership"), BOUND)
+    other = model_store.model_for(GROUND, ModelConfig("matrix-zonotope"), BOUND)
     assert other.version != model.version and len(elsewhere) == 1, "one recording for all"
     assert float(model.about["bound_step"]) <= float(model.about["bound_plan"]) < 1.0
     data_paths.model_path(GROUND, ModelConfig()).write_bytes(b"damaged")
@@ -173,9 +182,10 @@ def test_of_two_that_find_nothing_one_records_and_the_other_waits_for_it(tmp_pat
     assert not list((tmp_path / "data").rglob("*.new"))
 
 
-def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch):
+def test_what_is_imported_is_not_recorded_over(elsewhere, short, monkeypatch, capsys):
+    """Neither while it is recorded, nor by a changed description, nor by `brakeline collect`."""
     data = simulated_recording.load_or_record(GROUND, trajectories=1)
-    driven = replace(data, about={"origin": "a log", "source": "drive.csv"})
+    driven = replace(data, about={"origin": "a log", "source": "drive.csv", "sources": "drive.csv"})
     path, record = data_paths.record_path(GROUND), collect.record
 
     def interrupted(*how):
@@ -190,6 +200,11 @@ def test_what_is_imported_meanwhile_is_not_recorded_over(elsewhere, monkeypatch)
         assert Dataset.about_of(path)["source"] == "drive.csv"
     with pytest.raises(BadData, match="is kept"):
         simulated_recording.load_or_record(GROUND, trajectories=1, again=True)
+    before = path.read_bytes()
+    with pytest.raises(BadData, match=r"kept: .* \(a log.*import the log again"):
+        model_store.model_for(replace(GROUND, period=0.1), ModelConfig())
+    assert main(["collect", "ground", "--trajectories", "1"]) == 1
+    assert "drive.csv" in capsys.readouterr().err and path.read_bytes() == before
 
 
 def steps(actor: str, episode: int, numbers, run: int = 1) -> list[pb.Step]:
@@ -235,7 +250,7 @@ def test_the_last_steps_of_a_log(tmp_path):
         from_log(tmp_path / "none.mcap", GROUND, last=60)
 
 
-def test_an_interrupted_recording_is_gone_on_from(elsewhere, monkeypatch, capsys):
+def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys):
     drive = collect.record
 
     def interrupted(*given):

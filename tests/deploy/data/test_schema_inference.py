@@ -144,9 +144,9 @@ def log_of(path, *robots):
     return path
 
 
-@pytest.mark.parametrize("name", ["ground", "quadrotor", "../examples/car/car.toml"])
+@pytest.mark.parametrize("name", ["quadrotor", str(ROBOTS / "../examples/car/car.toml")])
 def test_a_log_of_a_run_carries_the_description(tmp_path, name):
-    robot = robot_named(str(ROBOTS / name) if "/" in name else name)
+    robot = robot_named(name)
     log, path = log_of(tmp_path / "run.mcap", robot), tmp_path / "found.toml"
     assert main(["robot", "new", str(path), "--from", str(log)]) == 0
     assert robot_named(str(path)).description == robot.description | {"name": "found"}

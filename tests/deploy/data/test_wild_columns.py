@@ -17,7 +17,7 @@ from brakeline.deploy import progress
 from brakeline.deploy.cli import main
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.dataset import Dataset
-from tests.deploy.data.porter import COLUMNS, FILE, drive, write_csv
+from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, write_csv
 from tests.deploy.data.test_importer import same
 
 pytestmark = pytest.mark.usefixtures("reading_here")
@@ -50,6 +50,25 @@ def imported(path, *words) -> Dataset:
     out = path.with_suffix(".safetensors")
     assert main(["import", str(path), "--robot", str(FILE), "--out", str(out), *words]) == 0
     return Dataset.load(out)
+
+
+def write_cells(path, names, rows):
+    """Write a CSV file. rows: of text, or of numbers, which keep all their digits."""
+    cells = [[cell if isinstance(cell, str) else repr(float(cell)) for cell in row] for row in rows]
+    path.write_text("\n".join(map(",".join, [names, *cells])) + "\n")
+    return path
+
+
+def exported(time, values, names, fields):
+    """Write a drive as exported messages do: the names and rows of stamps in ns, a text, and the fields of a row.
+
+    fields: from a row of the drive, with the heading as a quaternion, to the cells.
+    """
+    rows = []
+    for t, (x, y, heading, *others) in zip(time, values, strict=True):
+        turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
+        rows.append([f"{EPOCH * 10**9 + round(1e9 * t)}", "odom", *fields(t, (x, y), turned, others)])
+    return ["%time", "field.header.frame_id", *names], rows
 
 
 @st.composite
@@ -157,9 +176,7 @@ def test_stamps_in_a_given_unit_that_the_motion_contradicts_are_refused(driven, 
 @pytest.mark.parametrize("scale", [1e-6, 1e5])
 def test_implausible_stamps_are_refused(driven, tmp_path, capsys, scale):
     time, values = driven
-    path = tmp_path / "drive.csv"
-    rows = [",".join(map(repr, map(float, row))) for row in np.column_stack([scale * time, values])]
-    path.write_text("\n".join([",".join(("time", *COLUMNS)), *rows]) + "\n")
+    path = write_cells(tmp_path / "drive.csv", ("time", *COLUMNS), np.column_stack([scale * time, values]))
     text = refused(capsys, ["robot", "new", tmp_path / "my.toml", "--from", path, "--unit", "time=s"])
     assert "not plausible" in text and "--unit time=ms" in text
 
@@ -169,8 +186,6 @@ def test_implausible_stamps_are_refused(driven, tmp_path, capsys, scale):
 
 def held(seconds=120.0, seed=0):
     """A drive of somebody who holds the stick for a second at a time, commanded every 0.1 s."""
-    from tests.deploy.data.porter import STEP, Porter
-
     rng = np.random.default_rng(seed)
     robot, rows, u, left = Porter(rng), [], np.zeros(2), 0
     for k in range(round(seconds / STEP)):
@@ -323,43 +338,29 @@ def test_certify_shows_the_share_that_is_done_and_the_time_left(tmp_path, monkey
 
 def test_the_fields_of_exported_messages_are_the_coordinates(driven, plain, tmp_path, capsys):
     """As `rostopic echo -p` writes them: a comment as header, text, a quaternion, stamps in ns."""
-    time, values = driven
     pose, twist = "field.pose.pose.", "field.twist.twist."
-    names = ["%time", "field.header.frame_id", f"{pose}position.x", f"{pose}position.y"]
-    names += [f"{pose}orientation.{part}" for part in "xyzw"] + [f"{twist}linear.x", f"{twist}angular.z", *COLUMNS[5:]]
-    lines = [",".join(names)]
-    for t, (x, y, heading, *speeds) in zip(time, values, strict=True):
-        turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
-        numbers = ",".join(map(repr, map(float, (x, y, *turned, *speeds))))
-        lines.append(f"{EPOCH * 10**9 + round(1e9 * t)},odom,{numbers}")
-    path = tmp_path / "odom.csv"
-    path.write_text("\n".join(lines) + "\n")
+    names = [f"{pose}position.x", f"{pose}position.y", *(f"{pose}orientation.{part}" for part in "xyzw")]
     # The description calls the speeds v and w, and its inputs as the messages call the speeds.
-    path.write_text(path.read_text().replace(",speed,turn rate\n", ",cmd v,cmd w\n", 1))
+    names += [f"{twist}linear.x", f"{twist}angular.z", "cmd v", "cmd w"]
+    written = exported(*driven, names, lambda t, position, turned, speeds: (*position, *turned, *speeds))
     places = ("--map", "v=speed", "w=turn rate", "speed=cmd v", "turn rate=cmd w")
-    same(plain, imported(path, *places), 1e-5)
+    same(plain, imported(write_cells(tmp_path / "odom.csv", *written), *places), 1e-5)
 
 
 @pytest.mark.parametrize("flat", [True, False])
 def test_odometry_with_covariances_becomes_a_description(driven, tmp_path, capsys, flat):
     """A base writes z as noise of a nanometre. A camera in space estimates no speeds, and writes zeros."""
-    time, values = (part[:600] for part in driven)
     rng, pose, twist = np.random.default_rng(0), ".pose.pose.", ".twist.twist."
     names = [f"{pose}position.{axis}" for axis in "xyz"] + [f"{pose}orientation.{part}" for part in "xyzw"]
     names += [f"{twist}linear.x", f"{twist}angular.z"] + [f".pose.covariance{k}" for k in range(6)]
-    lines = [",".join(["%time", ".header.seq", *names])]
-    for row, (t, (x, y, heading, v, w, *_)) in enumerate(zip(time, values, strict=True)):
-        turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
-        z, speeds = (1e-10 * rng.normal(), (v, w)) if flat else (0.3 * math.sin(t), (0.0, 0.0))
-        numbers = (x, y, z, *turned, *speeds, *rng.uniform(0.0, 0.01, 6))
-        lines.append(",".join([f"{EPOCH * 10**9 + round(1e9 * t)}", str(row), *map(repr, map(float, numbers))]))
+
+    def fields(t, position, turned, others):
+        z, speeds = (1e-10 * rng.normal(), others[:2]) if flat else (0.3 * math.sin(t), (0.0, 0.0))
+        return (*position, z, *turned, *speeds, *rng.uniform(0.0, 0.01, 6))
+
     path, out = tmp_path / "odom.csv", tmp_path / "odom.toml"
-    path.write_text("\n".join(lines) + "\n")
+    write_cells(path, *exported(*(part[:600] for part in driven), names, fields))
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     assert f"as {'it changes by less than a millimetre: z' if flat else 'they never change: '}" in out.read_text()
-    states = [
-        "x [m]",
-        "y [m]",
-        *(["heading [rad]", "speed [m/s]", "turn rate [rad/s]"] if flat else ["z [m]", "heading [1]"]),
-    ]
-    assert [*robot_named(str(out)).state] == states
+    seen = ("heading [rad]", "speed [m/s]", "turn rate [rad/s]") if flat else ("z [m]", "heading [1]")
+    assert robot_named(str(out)).state == ("x [m]", "y [m]", *seen)

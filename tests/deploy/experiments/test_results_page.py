@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.commands.compare_command import CompareCommand
-from brakeline.deploy.experiments import bootstrap
+from brakeline.deploy.experiments import bootstrap, conservatism
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
+from brakeline.deploy.experiments.conservatism import Conservatism
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.results_page import RobotResults, page, stored_cells
 from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuning, best_learner, tuning_jobs
@@ -127,3 +128,24 @@ def test_a_missing_extra_of_a_method_is_told_before_any_training(monkeypatch, tm
     with pytest.raises(ModuleNotFoundError, match="stable_baselines3"):
         CompareCommand(("ground",), methods=("none", "sac"), results=tmp_path, runs=tmp_path, quiet=True).run()
     assert not list(tmp_path.iterdir())
+
+
+SAID = {"half_width_rest": 0.0056, "half_width_full": 0.0081, "violations": 2, "windows": 1981, "bound_plan": 0.0042}
+
+
+def test_every_kind_of_row_of_the_certificates_has_all_columns():
+    """What was driven, what is too wide to drive, and what was refused."""
+    drove = {"collisions": 0, "interventions": 0.05, "steps": 900, "decision_ms": {"mean": 0.2, "std": 0}}
+    driving = {"astar": drove | {"goals": 60}, "x": drove | {"goals": 7}}
+    wide = SAID | {"half_width_full": 3e5}
+    rows = [
+        {"certificate": "residual", "mode": "direct", "statement": SAID, "driving": driving},
+        {"certificate": "residual", "mode": "recursion", "statement": wide, "driving": None},
+        {"certificate": "matrix-zonotope", "mode": "recursion", "refused": "poor data"},
+    ]
+    study = configuration(Conservatism("ground", policies=("astar", "x")))
+    lines = conservatism.markdown({"study": study, "rows": rows}).splitlines()
+    table = [line for line in lines if line.startswith("|")]
+    assert len({line.count("|") for line in table}) == 1 and len(table) == 5
+    assert "| 5.6 mm | 8.1 mm | 2 of 1981 | 0.42% | 60, 5.0% | 7, 5.0% |" in table[2]
+    assert "3e+05 m" in table[3] and "not driven" in table[3] and "refused: poor data" in table[4]

@@ -1,6 +1,7 @@
 """Training from a batch: repeatable by its seed, every step filtered and told, resumed without losses."""
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,13 +45,21 @@ class Told:
         (self.steps if isinstance(message, pb.Step) else self.episodes).append(message)  # type: ignore[arg-type]
 
 
-def trained(seed: int = 0, learner: Learner | None = None, periods: int = PERIODS) -> tuple[Learner, Told]:
+def trained(learner=None, safety=SAFETY, periods=PERIODS, seed=0, **options) -> tuple[Learner, Told]:
     learner, told = learner or Learner(GROUND, replace(CONFIG, seed=seed)), Told()
-    trainer = BatchTrainer(learner, SAFETY, SIZE, "learner", told, seed=seed)
+    trainer = BatchTrainer(learner, safety, SIZE, "learner", told, seed=seed, **options)
     for _ in range(periods):
         trainer.period()
     trainer.close()
     return learner, told
+
+
+def successive(steps: list[pb.Step]) -> Iterator[tuple[pb.Step | None, pb.Step]]:
+    """Yield each step with the step before it of the same robot, None for the first one."""
+    last = dict[str, pb.Step]()
+    for step in steps:
+        yield last.get(step.actor), step
+        last[step.actor] = step
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +101,13 @@ def test_consecutive_steps_of_a_robot_continue_each_other_over_the_ends_of_episo
     """The last step of an episode belongs to that episode, although the next one has begun when it is published."""
     learner, told = Learner(GROUND, CONFIG), Told()
     trainer = BatchTrainer(learner, SAFETY, SIZE, "learner", told)
-    greedy, ended, last = GroundGreedyPolicy(GROUND, np.random.default_rng(0)), 0, dict[str, pb.Step]()
+    greedy, ended = GroundGreedyPolicy(GROUND, np.random.default_rng(0)), 0
     trainer._propose = lambda: np.array([greedy(None, info) for info in infos(trainer)])  # type: ignore
     for _ in range(70):
         trainer.period()
     trainer.close()
     assert (learner.metrics().duplicates, learner.metrics().missing) == (0, 0)
-    for step in told.steps:
-        before = last.get(step.actor)
+    for before, step in successive(told.steps):
         assert step.index == (1 if before is None else before.index + 1)
         if before is not None and before.episode == step.episode:
             assert step.observation == before.next_observation and step.step == before.step + 1
@@ -107,44 +115,31 @@ def test_consecutive_steps_of_a_robot_continue_each_other_over_the_ends_of_episo
             assert (before.terminated or before.truncated) and step.episode == before.episode + 1
             assert step.step == 0 and before.goal
             ended += 1
-        last[step.actor] = step
     assert ended >= 1 and all(learner.metrics().limit[actor] >= 70 for actor in trainer.actors)
 
 
 def test_in_sailrs_training_an_intervention_ends_the_robots_episode() -> None:
     """As with one robot: the step is the last one, and its reward less its penalty is the lowest."""
-    learner, told = Learner(GROUND, CONFIG), Told()
-    rival = RowByRow(Sailr(known(threshold=0.6)))
-    trainer = BatchTrainer(learner, rival, SIZE, "learner", told, ends_on_intervention=True)
-    for _ in range(PERIODS):
-        trainer.period()
-    trainer.close()
+    learner, told = trained(safety=RowByRow(Sailr(known(threshold=0.6))), ends_on_intervention=True)
     assert (learner.metrics().duplicates, learner.metrics().missing) == (0, 0)
-    last, begun = dict[str, pb.Step](), {(episode.actor, episode.episode) for episode in told.episodes}
-    for step in told.steps:
+    begun = {(episode.actor, episode.episode) for episode in told.episodes}
+    for before, step in successive(told.steps):
         assert step.cut == (step.decision == pb.FAILSAFE) and (step.actor, step.episode) in begun
         if step.cut:
             assert step.truncated and step.reward - step.penalty == pytest.approx(GROUND.task.reward.cut)
         else:
             assert step.penalty == 0.0 and step.decision == pb.ALLOWED
-        before = last.get(step.actor)
         if before is not None:
             continues = not (before.terminated or before.truncated)
-            assert (step.episode, step.step) == (
-                (before.episode, before.step + 1) if continues else (before.episode + 1, 0)
-            )
+            following = (before.episode, before.step + 1) if continues else (before.episode + 1, 0)
+            assert (step.episode, step.step) == following
             assert not continues or step.observation == before.next_observation
-        last[step.actor] = step
     cut = sum(step.cut for step in told.steps)
     assert 5 < cut < len(told.steps) / 2
 
 
 def test_without_a_filter_each_robot_executes_what_it_proposes() -> None:
-    told = Told()
-    trainer = BatchTrainer(Learner(GROUND, CONFIG), None, SIZE, "learner", told)
-    for _ in range(3):
-        trainer.period()
-    trainer.close()
+    _, told = trained(safety=None, periods=3)
     for step in told.steps:
         assert step.action == pytest.approx(list(step.proposed)) and not step.decision and not step.penalty
 
@@ -155,12 +150,12 @@ def infos(trainer: BatchTrainer) -> list[dict[str, Any]]:
     return [{"state": state, "goal": goal} for state, goal in zip(env._robots.measured, env._goals, strict=True)]
 
 
-def test_a_resumed_run_goes_on_with_the_next_episodes(run: tuple[Learner, Told], tmp_path: Path) -> None:
+def test_a_resumed_run_goes_on_with_the_next_episodes(tmp_path: Path) -> None:
     learner, _ = trained(periods=20)
     learner.save(tmp_path)
     resumed = Learner(GROUND, CONFIG)
     resumed.restore(tmp_path)
-    _, told = trained(learner=resumed, periods=20)
+    _, told = trained(resumed, periods=20)
     assert resumed.steps == 2 * 20 * SIZE and resumed.metrics().duplicates == 0
     assert resumed.metrics().missing == 0
     assert min(episode.episode for episode in told.episodes) == 1

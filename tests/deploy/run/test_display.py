@@ -40,25 +40,20 @@ def view() -> Launcher:
     return run
 
 
+def pictured(run: Launcher, width: int) -> str:
+    console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
+    console.print(live(run, run.metrics.figures(), Progress()))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("width", [80, 100, 120])
 def test_the_live_picture_fits_the_terminal(view: Launcher, width: int) -> None:
-    console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
-    console.print(live(view, view.metrics.figures(), Progress()))
-    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    shown = pictured(view, width)
     rows = shown.splitlines()
     assert max(map(len, rows)) <= width and len(rows) < 30
-    for word in (
-        "collisions",
-        "interventions",
-        "decide p50 / p99",
-        "critic loss",
-        "safety-1",
-        "[red]no[/]",
-        "[brackets]",
-    ):
-        assert word in shown
-    for name in ("steps lost        123456", "123.45 / 123.45 ms", "543.21 / 543.21 ms"):
-        assert name in shown, "no value is broken"
+    words = ("collisions", "interventions", "decide p50 / p99", "critic loss", "safety-1", "[red]no[/]", "[brackets]")
+    values = ("steps lost        123456", "123.45 / 123.45 ms", "543.21 / 543.21 ms")  # none is broken
+    assert [word for word in (*words, *values) if word not in shown] == []
 
 
 def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,19 +87,18 @@ def rows_of(figures: dict[str, object], verbose: bool = False) -> list[str]:
     return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
 
 
-def test_a_run_ends_with_a_verdict_in_three_lines(view: Launcher) -> None:
+def test_a_run_ends_with_a_verdict_in_three_lines_and_one_for_each_thing_that_went_wrong(view: Launcher) -> None:
     figures = ended(view, finished=True, fallbacks=0, collisions=1, interventions=3, steps=60)
     outcome, answers, following = rows_of(figures)
     assert outcome == "97 of the last 100 episodes reached the goal; 1 collision; 5.0% of 60 steps corrected"
     assert answers == "every answer came in time"
     assert following == f"next: brakeline analyse {figures['folder']} --html report.html"
-
-
-def test_what_went_wrong_has_a_line_of_its_own(view: Launcher) -> None:
     lacks = {"recorded": 6, "missing": 4, "failures": []}
     _, answers, _, stopped, log = rows_of(ended(view, fallbacks=2, log_messages=lacks))
     assert answers.startswith("2 answers came late or not at all")
     assert "brakeline train --resume /very/long" in stopped and log == "messages in the log: 6; NOT in the log: 4"
+    (only,) = rows_of(ended(view, steps=0, learners={}))
+    assert only.startswith("ended before the first step") and "resume" not in only
 
 
 def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:
@@ -113,11 +107,6 @@ def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:
         "4 of the last 5 episodes reached the goal (ground), 0 of the last 2 episodes reached the goal (quadrotor); "
     )
     assert rows_of(ended(view, latest={}))[0].startswith("no episode ended; ")
-
-
-def test_a_run_that_was_ended_before_its_first_step_asks_for_no_resumption(view: Launcher) -> None:
-    (only,) = rows_of(ended(view, steps=0, learners={}))
-    assert only.startswith("ended before the first step") and "resume" not in only
 
 
 def test_all_figures_and_paths_are_whole(view: Launcher) -> None:
@@ -130,9 +119,7 @@ def test_all_figures_and_paths_are_whole(view: Launcher) -> None:
 
 def test_what_a_run_is_at_is_said_from_the_first_second(view: Launcher) -> None:
     young = Launcher(view.config, view.folder, BusSettings())
-    console = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
-    console.print(live(young, young.metrics.figures(), Progress()))
-    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    shown = pictured(young, 80)
     assert "starting recorder, safety-0" in shown and shown.count(" starts ") == len(view.processes)
     for number, child in enumerate(view.processes):
         name = child.spec.name

@@ -3,7 +3,6 @@
 import io
 import itertools
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,11 +28,6 @@ from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Top
 @pytest.fixture
 def launcher(tmp_path: Path) -> Launcher:
     return Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
-
-
-def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
-    launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
-    assert launcher.figures()["log"] is None and launcher.processes[0].spec.name == "safety-0"
 
 
 def say(launcher: Launcher, topic: Topic, message: object) -> None:
@@ -73,9 +67,7 @@ def test_the_launchers_figures_stay_bounded(launcher: Launcher, monkeypatch: pyt
     assert launcher._rejected.count > 0
 
 
-def test_processes_do_not_import_modules_of_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_do_not_import_modules_of_the_working_directory(tmp_path, monkeypatch) -> None:
     """A launched process and a worker of `compare` begin as usual, with the packages that this process has."""
     for name in ("safetensors", "zenoh", "numpy", "pickle", "deploy"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'run')!r}, 'a').write({name!r})")
@@ -131,11 +123,16 @@ def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_pa
     figures = launcher.figures()
     assert figures["log_messages"] == {"recorded": 6, "missing": 4, "failures": [notes["failure"]]}
     assert sum(topic["missing"] for topic in figures["topics"].values()) == 6, "of the recorder's signs of life"
-    shown = printed(summary, figures)
+    shown = summary_of(figures)
     assert "messages in the log: 6; NOT in the log: 4 ([Errno 28] No space left on device)" in shown
     (tmp_path / "run_0003.mcap").write_bytes(b"no log at all")
     (failure,) = launcher.figures()["log_messages"]["failures"][1:]
     assert "run_0003.mcap is not an MCAP file" in failure
+
+
+def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
+    launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
+    assert launcher.figures()["log"] is None and launcher.processes[0].spec.name == "safety-0"
 
 
 def test_only_a_run_in_which_nothing_has_begun_may_end_at_once(launcher: Launcher) -> None:
@@ -156,9 +153,9 @@ def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) ->
     assert (tmp_path / "latest").readlink() == Path("first")
 
 
-def printed(show: Callable[[Console, object], None], figures: object) -> str:
+def summary_of(figures: dict[str, object]) -> str:
     console = Console(file=io.StringIO(), width=200)
-    show(console, figures)
+    summary(console, figures)
     return console.file.getvalue()
 
 
@@ -183,6 +180,6 @@ def test_steps_that_the_learner_refuses_do_not_count(launcher: Launcher) -> None
     say(launcher, STEP, step(0, 9))
     figures = launcher.figures()
     assert (figures["steps"], figures["refused"]) == (20, 4004)
-    assert "4004 steps do not count: repeated, or not permitted by the learner" in printed(summary, figures)
+    assert "4004 steps do not count: repeated, or not permitted by the learner" in summary_of(figures)
     say(launcher, STEP, step(21))
     assert launcher.figures()["steps"] == 21

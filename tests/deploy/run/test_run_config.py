@@ -11,9 +11,10 @@ from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.policy_loading import policy_named
-from brakeline.deploy.run.processes import process_specs
+from brakeline.deploy.run.processes import client_settings, metrics_address, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
+from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.ground_estimator import NoiseLevels
@@ -35,12 +36,9 @@ CHANGED = RunConfig(
 def test_a_saved_configuration_is_read_back(config: RunConfig, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(encode(config))
     assert load(tmp_path / "config.json") == config
-
-
-def test_a_configuration_with_a_former_field_name_is_read() -> None:
-    values = json.loads(encode(CHANGED))
-    values["recipe"] = values.pop("model_config")
-    assert decode(json.dumps(values)) == CHANGED
+    values = json.loads(encode(config))
+    values["recipe"] = values.pop("model_config")  # the former name
+    assert decode(json.dumps(values)) == config
 
 
 def test_an_unknown_or_damaged_configuration_is_refused_with_the_name_of_its_file(tmp_path: Path) -> None:
@@ -64,19 +62,13 @@ def test_an_unknown_or_damaged_configuration_is_refused_with_the_name_of_its_fil
         load(path)
 
 
-@pytest.mark.parametrize("wrong", [{"actors": 0}, {"steps": 0}, {"replicas": 0}, {"robots_per_actor": 0}])
-def test_counts_are_one_or_more(wrong: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="1 or more"):
-        RunConfig(**wrong)  # type: ignore[arg-type]
-
-
-def test_a_deterministic_run_has_one_robot() -> None:
+def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
+    for name in ("actors", "steps", "replicas", "robots_per_actor"):
+        with pytest.raises(ValueError, match="1 or more"):
+            RunConfig(**{name: 0})
     with pytest.raises(ValueError, match="--actors 1"):
         RunConfig(deterministic=True)
     assert RunConfig(deterministic=True, actors=1).learning().lockstep
-
-
-def test_the_learner_shares_the_runs_seed_and_steps() -> None:
     learning = RunConfig(seed=4, steps=77).learning()
     assert (learning.seed, learning.steps, learning.lockstep) == (4, 77, False)
 
@@ -84,11 +76,8 @@ def test_the_learner_shares_the_runs_seed_and_steps() -> None:
 def test_the_processes_of_a_run() -> None:
     names = [spec.name for spec in process_specs(RunConfig(actors=2, replicas=2))]
     assert names == ["recorder", "safety-0", "safety-1", "learner", "actor-0", "actor-1"]
-    assert [spec.name for spec in process_specs(RunConfig(actors=1, method="none"))] == [
-        "recorder",
-        "learner",
-        "actor-0",
-    ]
+    names = [spec.name for spec in process_specs(RunConfig(actors=1, method="none"))]
+    assert names == ["recorder", "learner", "actor-0"]
     certifier = process_specs(RunConfig(actors=1, adapt=True))[2]
     assert (certifier.name, certifier.needed) == ("certify.adapt", False)
     with pytest.raises(ValueError, match="--adapt certifies model sets of the method ddpc, not of sailr"):
@@ -136,3 +125,12 @@ def test_each_process_of_a_flight_can_read_the_robot_by_itself() -> None:
     path = Path(__file__).parents[3] / "examples" / "px4" / "quadrotor_px4.toml"
     (spec,) = (spec for spec in process_specs(FlyCommand(robot=str(path)).config()) if spec.kind == "actor")
     assert robot_with_task(spec.robot).name == "quadrotor-px4-late"
+
+
+@pytest.mark.parametrize(
+    ("launcher", "third"), [("9100", "9103"), ("0.0.0.0:9100", "0.0.0.0:9103"), ("", "")], ids=["here", "there", "none"]
+)
+def test_processes_have_the_ports_after_that_of_their_launcher(launcher: str, third: str, tmp_path: Path) -> None:
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",), metrics=launcher))
+    assert metrics_address(tmp_path, 2) == third
+    assert client_settings(tmp_path).metrics == "", "who looks on does not take a port"

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -43,9 +42,7 @@ def lives(child: SupervisedProcess, clock: list[float], until_it_speaks: float |
 
 
 @pytest.mark.parametrize("speaks", [0.5, 200.0])
-def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
-    speaks: float, clock: list[float], tmp_path: Path
-) -> None:
+def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(speaks, clock, tmp_path) -> None:
     child = Failing(ProcessSpec("learner", "learner", "ground"), tmp_path)
     for _ in range(MOST_FAILURES - 1):
         lives(child, clock, speaks, 2.0)
@@ -56,18 +53,14 @@ def test_however_slowly_it_starts_the_fifth_failure_in_a_row_ends_the_run(
 @pytest.mark.parametrize(
     ("speaks", "after"), [(5.0, HEALTHY_AFTER + 1.0), (None, START_ALLOWANCE + HEALTHY_AFTER + 1.0)]
 )
-def test_a_process_that_was_healthy_may_fail_any_number_of_times(
-    speaks: float | None, after: float, clock: list[float], tmp_path: Path
-) -> None:
+def test_a_process_that_was_healthy_may_fail_any_number_of_times(speaks, after, clock, tmp_path) -> None:
     child = Failing(ProcessSpec("autopilot", "autopilot"), tmp_path)
     for _ in range(3 * MOST_FAILURES):
         lives(child, clock, speaks, after)
     assert child.restarts == 3 * MOST_FAILURES and child.failures == 1
 
 
-def test_a_run_goes_on_without_a_process_that_it_does_not_need(
-    clock: list[float], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_run_goes_on_without_a_process_that_it_does_not_need(clock, tmp_path, caplog) -> None:
     child = Failing(ProcessSpec("certify.adapt", "certifier", needed=False), tmp_path)
     for _ in range(MOST_FAILURES):
         lives(child, clock, 0.5, 2.0)

@@ -1,15 +1,18 @@
-"""What the rivals are pre-trained on."""
+"""What the rivals are pre-trained on, and how a threshold is chosen: by its results in closed loop."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, made_by, pretrain
+from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, config_for, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
+from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
-from tests.robots import GROUND
+from tests.robots import GROUND, QUADROTOR
+
+LITTLE = {"samples": 300, "fit": FitConfig(hidden=(8,), epochs=1, batch=32)}
 
 
 def test_transitions_are_whole_scaled_and_the_same_again():
@@ -35,7 +38,7 @@ def test_costs_are_of_braking_to_the_end():
 
 @pytest.mark.parametrize("config_class", [SecasConfig, SailrConfig])
 def test_a_pretrained_model_says_what_it_cost(config_class):
-    config = config_class(samples=300, fit=FitConfig(hidden=(8,), epochs=1, batch=32))
+    config = config_class(**LITTLE)
     driven = []
     model = pretrain(GROUND, config, lambda: driven.append(1))
     assert len(driven) >= 300 and ready(model).robot is GROUND
@@ -44,3 +47,31 @@ def test_a_pretrained_model_says_what_it_cost(config_class):
     older = replace(GROUND, task=replace(GROUND.task, simulator_version=1))
     assert not made_by(model, older, config), "of another simulator"
     assert type(config) is CONFIGS[model.method]
+
+
+def row(value, oracle, collisions, goals):
+    return ThresholdTrial(value, 10, oracle, 0.0, goals, collisions)
+
+
+def test_safety_counts_among_those_that_cost_the_oracle_nothing():
+    rows = [row(1.0, 10, 3, 5), row(2.0, 10, 1, 4), row(3.0, 10, 1, 6), row(4.0, 9, 0, 9)]
+    assert best_threshold(rows).value == 3.0
+    often = replace(row(0.5, 10, 1, 6), oracle_interventions=0.2)
+    assert best_threshold([often, *rows]).value == 3.0, "of two alike, the one that leaves A* alone"
+    assert best_threshold([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)]).value == 2.0, "the least that any value costs"
+
+
+def test_a_threshold_that_never_steps_in_and_one_that_always_does():
+    model = pretrain(GROUND, SailrConfig(**LITTLE))
+    reported = []
+    never, always = tune_threshold(model, GROUND, (1.0, -1.0), 1, reported.append)
+    assert reported == [never, always]
+    assert never.oracle_goals == 1 and never.oracle_interventions == 0.0
+    assert always.oracle_goals == 0 and always.oracle_interventions == 1.0 and always.greedy_collisions == 0
+
+
+def test_each_robot_has_values_of_its_own():
+    assert max(values_of("secas", GROUND)) <= GROUND.footprint
+    for method in ("secas", "sailr"):
+        for robot in (GROUND, QUADROTOR):
+            assert config_for(method, robot).samples > 1000
