@@ -1,4 +1,4 @@
-"""One short log, and the command line within this process."""
+"""A short log, some minutes of data, and the command line and the readers of foreign logs within this process."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -40,13 +40,8 @@ def python_of(folder):
 
 def last_line(python, script, *words):
     """Run a script, and return the last line of its output."""
-    result = subprocess.run(
-        [python, EXAMPLES / "foreign" / script, *words],
-        check=False,
-        capture_output=True,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
+    command, alone = [python, EXAMPLES / "foreign" / script, *words], os.environ | {"OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, check=False, capture_output=True, text=True, env=alone)
     assert result.returncode == 0, result.stderr
     return result.stdout.strip().splitlines()[-1]
 
@@ -104,11 +99,8 @@ def test_the_table_adds_up_files_and_counts_each_seed_once(tmp_path, capsys):
 
 
 def test_a_run_goes_on_from_the_missing_seeds(tmp_path):
-    lines = [
-        {"robot": "car", "policy": "goal", "filter": filtered, "seed": seed}
-        for filtered, seed in [(1, 0), (0, 1), (1, 3)]
-    ]
-    out = tmp_path / "car.jsonl"
+    out, about = tmp_path / "car.jsonl", {"robot": "car", "policy": "goal"}
+    lines = [about | {"filter": filtered, "seed": seed} for filtered, seed in [(1, 0), (0, 1), (1, 3)]]
     out.write_text("".join(json.dumps(line) + "\n" for line in lines))
     options = SimpleNamespace(robot="car", policy="goal", seeds=(0, 5), out=out)
     assert missing_seeds(options, True) == [1, 2, 4]
@@ -116,9 +108,8 @@ def test_a_run_goes_on_from_the_missing_seeds(tmp_path):
 
 def test_the_path_leads_to_the_goal_through_the_gap_and_out_of_a_disc():
     """A row of discs has one gap; the path begins within a disc."""
-    discs = [
-        Obstacle("cylinder", (0.0, y), (1.0,), margin=-1.0) for y in (-7.5, -6.0, -4.5, -3.0, 1.5, 3.0, 4.5, 6.0, 7.5)
-    ]
+    row = (-7.5, -6.0, -4.5, -3.0, 1.5, 3.0, 4.5, 6.0, 7.5)
+    discs = [Obstacle("cylinder", (0.0, y), (1.0,), margin=-1.0) for y in row]
     adapter = SimpleNamespace(robot=SimpleNamespace(footprint=1.0), half_width=8.0)
     field = DistanceField(adapter, discs, (6.0, 6.0))
     position, distances = np.array([-0.8, 6.0]), []

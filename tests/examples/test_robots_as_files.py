@@ -95,12 +95,16 @@ def test_the_car_drives_on_the_circle_of_its_steering() -> None:
     assert backwards[0] < -0.25 and backwards[2] < -0.1  # steered left, it turns right when it drives backwards
 
 
-def test_the_car_keeps_its_steering_while_it_brakes() -> None:
+def test_the_car_keeps_its_steering_while_it_brakes_and_where_it_is_recorded() -> None:
     car = robot("car")
     assert (braking_plan(car, np.array([0.4, 0.5]))[1:] == [0.0, 0.5]).all()
     vehicle = exact("car")
     drive(vehicle, [0.4, 0.3], [0.4, 0.5], [0.4, 0.5], [0.0, 0.5], [0.0, 0.5], [0.0, 0.5])
     assert vehicle.true[3] == pytest.approx(0.0, abs=0.005) and vehicle.true[4] == pytest.approx(0.5, abs=0.01)
+    (recorded,) = collect.record(car, 1, 3, Conditions())
+    stopped = car.is_stop_input(recorded.inputs)
+    assert stopped.any() and (np.abs(np.diff(recorded.inputs[:, 1])) <= 0.3 + 1e-9).all()
+    assert np.abs(recorded.inputs[stopped, 1]).max() > 0.05
 
 
 def test_the_base_moves_sideways_while_it_turns() -> None:
@@ -160,14 +164,6 @@ def test_clearance_is_measured_from_the_discs_of_the_body(heading: float, nose: 
     for period in (vehicle.initial_period(), vehicle.step(np.zeros(2))):
         assert period.closest == pytest.approx(0.3 - nose - 0.155, abs=1e-3)
         assert period.clearance == pytest.approx(period.closest, abs=1e-3) and not period.collision
-
-
-def test_recorded_inputs_keep_the_steering_at_a_stop() -> None:
-    car = robot("car")
-    (part,) = collect.record(car, 1, 3, Conditions())
-    stopped = car.is_stop_input(part.inputs)
-    assert stopped.any() and (np.abs(np.diff(part.inputs[:, 1])) <= 0.3 + 1e-9).all()
-    assert np.abs(part.inputs[stopped, 1]).max() > 0.05
 
 
 def test_held_out_plans_stay_in_their_tubes(certified: tuple[ModelSet, ValidationReport], recorded: Dataset) -> None:

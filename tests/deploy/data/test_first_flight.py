@@ -104,9 +104,8 @@ def test_the_rule_turns_back_before_the_wall_and_lets_go_of_the_rest() -> None:
     level = QUADROTOR.high()
     near = np.array([31.0, -2.0, 30.0, 5.0, *[0.0] * 5])
     assert BOX.constrain(near, np.array([5.0, 3.0, 0.0]), level) == pytest.approx([-2.5, 3.0, 0.0])
-    assert BOX.constrain(near * [1, 1, 1, -1, 1, 1, 1, 1, 1], np.array([-5.0, 0.0, 0.0]), level)[0] == -5.0, (
-        "it leads back"
-    )
+    leaving = near * [1, 1, 1, -1, 1, 1, 1, 1, 1]
+    assert BOX.constrain(leaving, np.array([-5.0, 0.0, 0.0]), level)[0] == -5.0, "it leads back"
     middle = np.concatenate([BOX.middle, np.full(3, 5.0), np.zeros(3)])
     assert BOX.constrain(middle, level, level) == pytest.approx(level)
 

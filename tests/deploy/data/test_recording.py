@@ -4,7 +4,6 @@ import itertools
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -102,12 +101,13 @@ def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_
 def elsewhere(tmp_path, monkeypatch):
     """An empty store, with small recordings only."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
-    recordings = []
-    original = collect.record
-    monkeypatch.setattr(
-        simulated_recording, "load_or_record", partial(simulated_recording.load_or_record, trajectories=8)
-    )
-    monkeypatch.setattr(collect, "record", lambda *a: (recordings.append(a), original(*a))[1])
+    recordings, record, load_or_record = [], collect.record, simulated_recording.load_or_record
+
+    def few(robot, path=None, trajectories=8, *how, **more):
+        return load_or_record(robot, path, trajectories, *how, **more)
+
+    monkeypatch.setattr(simulated_recording, "load_or_record", few)
+    monkeypatch.setattr(collect, "record", lambda *how: (recordings.append(how), record(*how))[1])
     return recordings
 
 

@@ -105,10 +105,8 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
     names = ("x", "y", "yaw", "speed", "turn", "command speed", "command turn")
     schema = infer_schema(tables_of(write_csv(tmp_path / "a.csv", step * np.arange(1200), np.array(rows), names)))
     ahead, turning = schema.inputs
-    assert (ahead.name, turning.name) == ("speed", "turn") and [c.follows for c in schema.states[3:]] == [
-        "speed",
-        "turn",
-    ]
+    assert (ahead.name, turning.name) == ("speed", "turn")
+    assert [column.follows for column in schema.states[3:]] == ["speed", "turn"]
     assert ahead.change == pytest.approx(0.05) and (ahead.moves, turning.moves) == (True, False)
 
 

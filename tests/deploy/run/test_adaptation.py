@@ -49,18 +49,9 @@ def in_use():
 def steps_of(trajectories, actor="actor-0", first=0, run=1):
     for number, t in enumerate(trajectories, first):
         for k in range(len(t.inputs)):
-            yield pb.Step(
-                header=pb.Header(run=run),
-                robot=ROBOT.name,
-                actor=actor,
-                episode=number,
-                step=k,
-                observation=[1.0],
-                action=t.inputs[k],
-                state=t.states[k + 1],
-                path=t.paths[k].ravel(),
-                turned=t.turned[k],
-            )
+            place = {"robot": ROBOT.name, "actor": actor, "episode": number, "step": k}
+            moved = {"state": t.states[k + 1], "path": t.paths[k].ravel(), "turned": t.turned[k]}
+            yield pb.Step(header=pb.Header(run=run), observation=[1.0], action=t.inputs[k], **place, **moved)
 
 
 def exchange_of(step, widening, version="old"):
@@ -106,9 +97,8 @@ def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(ki
     attempts = drive(kind, driven(2, 7, slip=-0.15), widening=8.0, first=3)
     assert len(attempts) == 1 and "4.0 minutes after the change, at 8 times the sets" in attempts[0].text
     model, data = attempts[0].model, attempts[0].data
-    assert data.periods <= 4 * MINUTE and not any(
-        (t.states == driven(1, 3)[-1].states[5]).any() for t in data.trajectories
-    )
+    before = driven(1, 3)[-1].states[5]
+    assert data.periods <= 4 * MINUTE and not any((t.states == before).any() for t in data.trajectories)
     assert model.version != in_use().version and float(model.about["bound_plan"]) <= ACCEPTED
     fresh = Dataset(ROBOT, driven(3, 6, slip=-0.15))
     outside = certify(fresh, ModelConfig(mode=ONE_STEP))[0]

@@ -50,6 +50,9 @@ def test_a_run_pins_the_mode_and_the_model_set_that_it_begins_with(folder, capsy
     config = begun(folder)
     assert config.model_config.mode == DIRECT
     assert json.loads((folder / CONFIG).read_text())["model_config"]["mode"] == DIRECT
+    capsys.readouterr()
+    prepare(config, folder, resume=True)
+    assert capsys.readouterr().err == "", "its model set is still in use"
     second = use(ONE_STEP, 1.1)
     assert model_path(GROUND, ModelConfig(mode=AUTO)) == model_path(GROUND, ModelConfig(mode=ONE_STEP)), "the last one"
     third = use(DIRECT, 1.2)
@@ -60,14 +63,6 @@ def test_a_run_pins_the_mode_and_the_model_set_that_it_begins_with(folder, capsy
     assert resumed == config
     assert f"goes on with its own model {first.version}" in said and "start a new run to use it" in said
     assert ModelSet.load(model_in_run(config, folder, GROUND)).version == first.version
-
-
-def test_a_resumed_run_says_nothing_if_its_model_set_is_still_in_use(folder, capsys):
-    use(DIRECT, 1.0)
-    config = begun(folder)
-    capsys.readouterr()
-    prepare(config, folder, resume=True)
-    assert capsys.readouterr().err == ""
 
 
 def test_a_run_whose_model_set_is_lost_or_too_loose_is_not_resumed(folder):
