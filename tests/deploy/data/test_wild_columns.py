@@ -59,13 +59,13 @@ def write_cells(path, names, rows):
     return path
 
 
-def exported(time, values, names, fields):
+def exported(driven, names, fields):
     """Write a drive as exported messages do: the names and rows of stamps in ns, a text, and the fields of a row.
 
     fields: from a row of the drive, with the heading as a quaternion, to the cells.
     """
     rows = []
-    for t, (x, y, heading, *others) in zip(time, values, strict=True):
+    for t, (x, y, heading, *others) in zip(*driven, strict=True):
         turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
         rows.append([f"{EPOCH * 10**9 + round(1e9 * t)}", "odom", *fields(t, (x, y), turned, others)])
     return ["%time", "field.header.frame_id", *names], rows
@@ -342,7 +342,7 @@ def test_the_fields_of_exported_messages_are_the_coordinates(driven, plain, tmp_
     names = [f"{pose}position.x", f"{pose}position.y", *(f"{pose}orientation.{part}" for part in "xyzw")]
     # The description calls the speeds v and w, and its inputs as the messages call the speeds.
     names += [f"{twist}linear.x", f"{twist}angular.z", "cmd v", "cmd w"]
-    written = exported(*driven, names, lambda t, position, turned, speeds: (*position, *turned, *speeds))
+    written = exported(driven, names, lambda t, position, turned, speeds: (*position, *turned, *speeds))
     places = ("--map", "v=speed", "w=turn rate", "speed=cmd v", "turn rate=cmd w")
     same(plain, imported(write_cells(tmp_path / "odom.csv", *written), *places), 1e-5)
 
@@ -359,7 +359,7 @@ def test_odometry_with_covariances_becomes_a_description(driven, tmp_path, capsy
         return (*position, z, *turned, *speeds, *rng.uniform(0.0, 0.01, 6))
 
     path, out = tmp_path / "odom.csv", tmp_path / "odom.toml"
-    write_cells(path, *exported(*(part[:600] for part in driven), names, fields))
+    write_cells(path, *exported([part[:600] for part in driven], names, fields))
     assert main(["robot", "new", str(out), "--from", str(path)]) == 0
     assert f"as {'it changes by less than a millimetre: z' if flat else 'they never change: '}" in out.read_text()
     seen = ("heading [rad]", "speed [m/s]", "turn rate [rad/s]") if flat else ("z [m]", "heading [1]")
