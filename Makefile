@@ -55,6 +55,8 @@ compiled: setup
 # (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
+# Five processes with two threads each on two cores wait for each other.
+unit: export OMP_NUM_THREADS = 1
 unit: compiled
 	$(BIN)/python -m pytest -m "not long" -n 5 --dist loadscope --no-loadscope-reorder -rs
 
