@@ -30,6 +30,8 @@ MOST_CHUNK_BYTES = 2**27  # a chunk that declares more is damaged
 BROKEN = (McapError, struct.error, ValueError, EOFError, OverflowError, RuntimeError, zstandard.ZstdError)
 
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
+ROS_PROFILES, ROS_ENCODINGS = ("ros1", "ros2"), ("ros1", "cdr")  # of files, of messages
+OWN_SCHEMAS = "brakeline."  # how the names of Brakeline's message types begin
 
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time; then the payload
@@ -275,6 +277,24 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
         elif opcode in (SCHEMA, CHANNEL):
             tables.add(opcode, data[at + 9 : after])
         at = after
+
+
+def is_ros(path: Path) -> bool:
+    """Return True for an MCAP file of ROS messages: by its profile, or by the first message that decides."""
+    with path.open("rb") as file:
+        try:
+            for item in records(file, path.stat().st_size, lambda key, schema: LogChannel(key, schema, None)):
+                if isinstance(item, Header) and item.profile in ROS_PROFILES:
+                    return True
+                if type(item) is tuple:
+                    channel = item[0].channel
+                    if channel is not None and channel.message_encoding in ROS_ENCODINGS:
+                        return True
+                    if item[0].key.startswith(OWN_SCHEMAS):
+                        return False
+        except NotMcap:
+            return False
+    return False
 
 
 def model_attachment_name(robot: str, version: str) -> str:

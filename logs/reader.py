@@ -7,6 +7,7 @@ for record in read("runs/demo"):
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -14,18 +15,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError, Message
+from mcap.reader import make_reader
 from mcap.records import Attachment, Metadata
 
 from brakeline.errors import Implausible, LogError, NotMcap
-from brakeline.logs.mcap_container import DamagedBytes, LogChannel, Row, records
-from brakeline.logs.mcap_contents import is_ros
+from brakeline.logs.mcap_container import (
+    BROKEN,
+    DamagedBytes,
+    LogChannel,
+    Row,
+    has_whole_summary,
+    is_ros,
+    records,
+)
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.run_clock import RunClock
 from brakeline.logs.segment import ABOUT, CLOCK, STEADY, being_written, name_of, number_of
 from brakeline.messaging.bus.stated_names import check_names
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import check
-from brakeline.messaging.topics import TOPICS
+from brakeline.messaging.topics import TOPICS, Topic
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -202,6 +211,52 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
         taken = sum(other == label or other.startswith(f"{label} (") for other in runs)
         runs[f"{label} ({taken + 1})" if taken else label] = tuple(files)
     return runs
+
+
+def count_of_topic(paths: Paths, topic: Topic) -> int | None:
+    """Return the number of messages of a topic; None if a file has no summary because its recorder was killed.
+
+    Raises:
+        LogError: a path has no log.
+    """
+    root, total = topic.key.split("/", 1)[0], 0
+    for path in find(paths):
+        if (counts := _in_summary(path)) is None:
+            return None
+        total += sum(messages for key, messages in counts.items() if key.split("/", 1)[0] == root)
+    return total
+
+
+def count_by_key(path: Path) -> Counter[str]:
+    """Return the number of messages in a file at each key. A file without a summary is read from front to back.
+
+    Raises:
+        LogError: the file is no log.
+        OSError: it cannot be read.
+    """
+    if (counts := _in_summary(path)) is not None:
+        return counts
+    return Counter(channel.key for channel, *_ in Log((path,)).rows())
+
+
+def _in_summary(path: Path) -> Counter[str] | None:
+    """Return the number of messages at each key by the file's summary; None if it has none."""
+    with path.open("rb") as file:
+        if not has_whole_summary(file, path.stat().st_size):
+            return None
+        file.seek(0)
+        try:
+            summary = make_reader(file).get_summary()
+        except BROKEN:
+            return None
+    if summary is None or summary.statistics is None:
+        return None
+    counts: Counter[str] = Counter()
+    for number, messages in summary.statistics.channel_message_counts.items():
+        if (channel := summary.channels.get(number)) is None:
+            return None
+        counts[channel.topic] += messages
+    return counts
 
 
 def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:

@@ -44,7 +44,7 @@ class ReplayCommand:
     def run(self) -> int:
         """Replay the logs and print the comparison. Returns the exit status: 0, or DIFFERENT."""
         from brakeline.deploy.run.replay_run import replay
-        from brakeline.logs.log_length import count
+        from brakeline.logs.reader import count_of_topic
         from brakeline.messaging.topics import EXCHANGE
 
         values = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
@@ -52,7 +52,7 @@ class ReplayCommand:
         if self.certificate or self.data:
             changes["mode"] = self.mode
         replacement = self._replacement() if changes else None
-        total = count(list(self.logs), EXCHANGE)
+        total = count_of_topic(list(self.logs), EXCHANGE)
         # The warnings of the filter were about the robots of that time.
         with under_way("deciding each request again", total) as advance, errors_only("brakeline.safety"):
             result = replay(list(self.logs), replacement, advance)

@@ -13,8 +13,7 @@ from brakeline.deploy.commands.command_output import console
 from brakeline.deploy.commands.common_options import LATEST, BusOptions, Unprefixed
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
-from brakeline.logs.watch.live_page_server import LivePageServer
-from brakeline.logs.watch.run_report import RunReport
+from brakeline.logs.watch.live_page_server import LivePageServer, RunReport
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.deploy.data.certification import HELD_OUT, MAX_INFLATION
-from brakeline.deploy.data.input_delay import followed_inputs
+from brakeline.deploy.data.input_response import followed_inputs
 from brakeline.deploy.data.sources.quantity_names import column_names, split
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent

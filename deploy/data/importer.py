@@ -17,7 +17,7 @@ from brakeline.deploy.data.sources.isolated_reader import read_isolated
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.deploy.data.stamps import TIME, in_header_units, stamped
 from brakeline.errors import NoSource
-from brakeline.logs.mcap_contents import is_ros
+from brakeline.logs.mcap_container import is_ros
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
 

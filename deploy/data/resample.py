@@ -15,7 +15,7 @@ import numpy as np
 
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
 from brakeline.deploy.data.glitches import without_glitches
-from brakeline.deploy.data.input_delay import estimate_delay, followed_inputs
+from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.motion_check import refuse_contradictions
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve

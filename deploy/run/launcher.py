@@ -20,8 +20,8 @@ from brakeline.errors import LaunchError, LogError
 from brakeline.learner.checkpoint import CHECKPOINT
 from brakeline.learner.checkpoint import exists as checkpoint_exists
 from brakeline.learner.checkpoint import latest as latest_checkpoint
-from brakeline.logs.log_length import count_by_key
 from brakeline.logs.metrics import Metrics
+from brakeline.logs.reader import count_by_key
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.watch.run_history import NOTE, RunHistory, history_to_note
 from brakeline.logs.watch.run_totals import run_totals, totals_to_health

@@ -7,19 +7,25 @@ import logging
 from importlib.metadata import version
 from pathlib import Path
 
-from brakeline.deploy.run.mavlink_json import Derive, frames_as_json
+from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import BadModel
 from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.logs.recorded_robots import RecordedRobots
+from brakeline.logs.recorder import Derive
+from brakeline.logs.segment import Entry
+from brakeline.messaging.bus import Sample
 from brakeline.messaging.robot import Robot, robot_named
 from brakeline.messaging.task import robot_maybe_with_task
+from brakeline.messaging.topics import FRAMES
 from brakeline.safety.methods import Model, load
 from brakeline.safety.model.model_config import DDPC
 
 log = logging.getLogger("brakeline.recorder")
+
+ENCODING = "application/json;mavlink"
 
 
 def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
@@ -85,3 +91,24 @@ def derive_entries(pictures: float, robots: RecordedRobots | None = None) -> Der
         return frames_as_json
     draw = FoxgloveConverter(pictures, robots).from_sample
     return lambda sample: [*draw(sample), *frames_as_json(sample)]
+
+
+def frames_as_json(sample: Sample) -> list[Entry]:
+    """Return a JSON entry for each frame of a FRAMES message, with the frame's time. Other messages give none.
+
+    Other recorders do the same, on the channel `mavlink/SYSTEM/COMPONENT/MESSAGE`:
+    {"header": {"system_id": 1, "component_id": 1, "sequence": 7}, "message": {"type": "HEARTBEAT", …}}
+
+    Raises:
+        Malformed: the message can't be decoded.
+        ValueError: the time of a frame can't be stored.
+    """
+    if sample.topic is not FRAMES:
+        return []
+    entries = []
+    for frame in sample.message().frames:
+        message = decode_frame(frame.raw, frame.outgoing)
+        if message is not None:
+            text = json.dumps(message.described).encode()
+            entries.append(Entry(message.name, ENCODING, text, sample.received, frame.wall_time, 0))
+    return entries

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Self
 
 from brakeline.errors import LogError
 from brakeline.logs.json_values import finite
 from brakeline.logs.viewer import SCRIPTS, STYLES
-from brakeline.logs.watch.run_report import RunReport
 from brakeline.messaging.http_server import MOST_CLIENTS, BoundedHandler, BoundedServer
 
 RATE = 10.0  # Hz of events
@@ -44,6 +44,30 @@ HEADERS = {
 REPORT_HEADERS = HEADERS | {"Content-Security-Policy": "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"}
 
 View = Callable[[], dict[str, Any]]
+
+
+class RunReport:
+    """The report of the run in a folder. Rendering takes seconds, so it happens once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._lock = threading.Lock()
+        self._page = b""
+
+    def page(self) -> bytes:
+        """Return the page.
+
+        Raises:
+            LogError, OSError: the folder has no log that can be read.
+        """
+        from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs  # imported only when they are needed
+        from brakeline.logs.report_page import render
+
+        with self._lock:
+            if not self._page:
+                analysis = analyse_runs(self.folder, AnalysisOptions(pictures=True))
+                self._page = render(analysis.figures(), analysis.by_label()).encode()
+            return self._page
 
 
 class OpenPages:

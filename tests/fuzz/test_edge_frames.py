@@ -13,7 +13,7 @@ from pymavlink.generator.mavcrc import x25crc
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.actors.mavlink.mavlink_decoder import AUTOPILOT, MOST_PARAMETERS, MOST_TEXTS, SENDERS, MavlinkDecoder
-from brakeline.deploy.run.mavlink_json import frames_as_json
+from brakeline.deploy.run.log_contents import frames_as_json
 from brakeline.errors import Malformed
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample

@@ -6,9 +6,8 @@ from random import Random
 import pytest
 
 from brakeline.errors import LogError
-from brakeline.logs.log_length import count_by_key
 from brakeline.logs.mcap_container import MAGIC
-from brakeline.logs.reader import open_log
+from brakeline.logs.reader import count_by_key, open_log
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 

@@ -10,8 +10,7 @@ import pytest
 
 from brakeline.deploy.run.live_page import LivePage
 from brakeline.logs.watch.dashboard import Dashboard
-from brakeline.logs.watch.live_page_server import LivePageServer
-from brakeline.logs.watch.run_report import RunReport
+from brakeline.logs.watch.live_page_server import LivePageServer, RunReport
 from tests.browser import Page
 from tests.logs.conftest import watched
 from tests.logs.sample_log import mixed

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
-from brakeline.deploy.run.mavlink_json import ENCODING, frames_as_json
+from brakeline.deploy.run.log_contents import ENCODING, frames_as_json
 from brakeline.errors import ExportError, Malformed
 from brakeline.logs.log_export import to_tlog
 from brakeline.logs.reader import read
