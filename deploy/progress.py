@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -54,6 +55,18 @@ def silenced() -> Iterator[None]:
         yield
     finally:
         console.quiet = False
+
+
+@contextmanager
+def errors_only(name: str) -> Iterator[None]:
+    """Let a logger pass errors alone until the block ends."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 @contextmanager

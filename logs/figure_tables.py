@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -12,7 +12,7 @@ from rich.text import Text
 from brakeline.logs.episode_stats import CONTACTS, KINDS, RUN_INTO, Figures
 from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.reader import Paths
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import plain_table
 from brakeline.logs.tube_stats import stated
 
 BLOCKS = "▁▂▃▄▅▆▇█"
@@ -43,14 +43,14 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
         verbose: also show the metadata of the log.
     """
     several = len(figures.get("runs", {})) > 1
-    parts = _several(figures) if several else [_table((), _summary(figures)), *_times(figures)]
+    parts = _several(figures) if several else [plain_table((), _summary(figures)), *_times(figures)]
     parts += [_training(robot, training) for robot, training in figures.get("training", {}).items()]
     if figures.get("processes") and figures.get("topics"):
         parts.append(_processes(figures["processes"]))
     if figures.get("topics"):
         counts = ("messages", "missing", "duplicates")
         rows = [(key, *(str(topic[name]) for name in counts)) for key, topic in figures["topics"].items()]
-        parts.append(_table(("topic", *counts), rows))
+        parts.append(plain_table(("topic", *counts), rows))
     if verbose and figures.get("metadata"):
         parts.append(_metadata(figures["metadata"]))
     return Group(*parts, *(Text(cut, "yellow") for cut in figures.get("cuts", ())))
@@ -61,13 +61,17 @@ def _several(figures: Figures) -> list[RenderableType]:
     parts: list[RenderableType] = [_runs(figures["runs"])]
     if groups := figures.get("groups"):
         parts.append(_groups(groups))
-    if pairs := [pair for pair in figures.get("improvements", ()) if pair["probability"] is not None]:
-        rows = [(f"{pair['of']} over {pair['over']}", pair["robot"], _estimate(pair, "probability")) for pair in pairs]
-        parts.append(_table(("a run scores better", "robot", "probability"), rows))
+    pairs = []
+    for pair in figures.get("improvements", ()):
+        interval = "" if pair["interval"] is None else " [{:.2f}, {:.2f}]".format(*pair["interval"])
+        if pair["probability"] is not None:
+            pairs.append((f"{pair['of']} over {pair['over']}", pair["robot"], f"{pair['probability']:.2f}{interval}"))
+    if pairs:
+        parts.append(plain_table(("a run scores better", "robot", "probability"), pairs))
     if differing := figures.get("differences"):
         labels = list(figures["runs"])
-        settings = [(name, *(_setting(row[label]) for label in labels)) for name, row in differing.items()]
-        parts.append(_table(("setting", *labels), settings))
+        settings = [(name, *(known("{}", row[label], "–") for label in labels)) for name, row in differing.items()]
+        parts.append(plain_table(("setting", *labels), settings))
     return parts
 
 
@@ -78,32 +82,20 @@ def _groups(groups: list[Figures]) -> Table:
     for group in groups:
         cells = []
         for name, factor in scores.items():
-            score, unit, digits = group["scores"][name], " %" if factor > 1.0 else "", 1
-            if score["iqm"] is None:
-                cells.append("–")
-                continue
+            score, unit = group["scores"][name], " %" if factor > 1.0 else ""
             interval = score["iqm_interval"]
-            within = "" if interval is None else " [" + ", ".join(f"{factor * v:.{digits}f}" for v in interval) + "]"
-            cells.append(f"{factor * score['iqm']:.{digits}f}{unit}{within}")
+            within = "" if interval is None else " [" + ", ".join(f"{factor * v:.1f}" for v in interval) + "]"
+            cells.append("–" if score["iqm"] is None else f"{factor * score['iqm']:.1f}{unit}{within}")
         steps = " ".join(f"{count:,}" for count in sorted(set(group["steps"])))
         rows.append((group["name"], group["robot"], str(len(group["runs"])), steps, *cells))
-    table = _table(("group", "robot", "runs", "steps", *scores), rows)
+    table = plain_table(("group", "robot", "runs", "steps", *scores), rows)
     table.caption = "interquartile means over runs, of their last 100 episodes; 95 % bootstrap intervals over runs"
     return table
 
 
-def _estimate(row: Figures, name: str) -> str:
-    interval = "" if row["interval"] is None else " [{:.2f}, {:.2f}]".format(*row["interval"])
-    return f"{row[name]:.2f}{interval}"
-
-
-def _setting(value: Any) -> str:
-    return "–" if value is None else str(value)
-
-
 def show_episode(episode: Figures) -> RenderableType:
     """Format one entry of `episode_detail`, step by step."""
-    closest = _optional(", closest approach {:.3f} m", episode["closest"])
+    closest = known(", closest approach {:.3f} m", episode["closest"])
     title = (
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
@@ -114,22 +106,14 @@ def show_episode(episode: Figures) -> RenderableType:
             str(row["step"]),
             *(" ".join(f"{value:.2f}" for value in row[name]) for name in ("state", "proposed", "action")),
             ", ".join(filter(None, (row["decision"] or "-", row["limited"]))),
-            _optional("{:.2f}", row["decide_ms"]),
-            _optional("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
+            known("{:.2f}", row["decide_ms"]),
+            known("> {:.4f}" if row["at_least"] else "{:.4f}", row["margin"]),
             f"{row['clearance']:.3f}",
             row["said"] or row["reason"] or "",
         )
         for row in (row | {"state": row["state"][:2]} for row in episode["rows"])
     ]
-    return Group(Text(title, "bold"), _table(columns, rows))
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[RenderableType]]) -> Table:
-    """Return a table; without `columns`, rows of a name and a value."""
-    table = StackingTable(*columns, show_header=bool(columns), **PLAIN)
-    for row in rows:
-        table.add_row(*row)
-    return table
+    return Group(Text(title, "bold"), plain_table(columns, rows))
 
 
 def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
@@ -139,30 +123,30 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
     setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
     if setup:
         yield "configuration", ", ".join(setup)
-    yield "steps", f"{steps}" + _optional(", {:.1f}/s", figures.get("steps_per_s"))
+    yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))
     if figures.get("refused"):
         yield "[red]steps that do not count[/]", f"{figures['refused']}: repeated, or not permitted by the learner"
-    yield "episodes", f"{episodes}" + _optional(", mean reward {:.2f}", figures["mean_reward"])
+    yield "episodes", f"{episodes}" + known(", mean reward {:.2f}", figures["mean_reward"])
     for name in ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts"):
-        if name == RUN_INTO:
-            yield name.replace("_", " "), _mean_number(figures[name], within.get(name))
-        else:
-            yield name.replace("_", " "), _share(figures[name], episodes, within.get(name))
-    interventions = _share(figures["interventions"], steps, within.get("interventions"))
+        text, interval = share(figures[name], episodes, within.get(name)), within.get(name)
+        if name == RUN_INTO:  # several in one episode are possible, so it has an interval of the mean number
+            text = f"{figures[name]}" + known(", 95 %: {0[0]:.2g} to {0[1]:.2g} in an episode", interval)
+        yield name.replace("_", " "), text
+    interventions = share(figures["interventions"], steps, within.get("interventions"))
     yield "interventions", f"{interventions}, {figures['failsafes']} of them failsafe"
-    yield "adjusted", _share(figures["adjusted"], steps)
+    yield "adjusted", share(figures["adjusted"], steps)
     yield "adjusted for clearance", for_clearance(figures)
     mean, most = figures["mean_speed"], figures["max_speed"]
-    yield "speed", _optional("{:.3f} m/s", mean) + _optional(", at most {:.3f} m/s", most)
-    yield "closest approach", _optional("{:.3f} m, to fixed obstacles", figures.get("closest_approach"))
+    yield "speed", known("{:.3f} m/s", mean) + known(", at most {:.3f} m/s", most)
+    yield "closest approach", known("{:.3f} m, to fixed obstacles", figures.get("closest_approach"))
     containment = figures["containment"]
-    outside = _share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
+    outside = share(containment["violations"], containment["steps"], within.get("violations"), digits=3)
     yield "outside the predicted set", outside
     if figures["recovering"]:
-        yield "recovering", _share(figures["recovering"], steps)
+        yield "recovering", share(figures["recovering"], steps)
     if figures["broken"]:
         yield "obstacles outside their bounds", str(figures["broken"])
-    yield "outside the measurement bound", _share(figures["outside"], steps)
+    yield "outside the measurement bound", share(figures["outside"], steps)
     yield from _safety_rows(figures)
     for robot, learner in figures.get("learners", {}).items():
         yield f"learner {robot}", LEARNER.format(**learner)
@@ -190,15 +174,15 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
         yield "solver", f"{solver['programs']} programs, {solver['failures']} failed ({statuses}); {iterations}"
     plans = figures.get("plans") or {}
     if plans.get("flown"):
-        outside = f"{_share(plans['outside'], plans['flown'])}; {stated(plans)}"
+        outside = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
         yield "verified plans that were followed", f"{plans['flown']}, left their tube: {outside}"
     if plans.get("scored"):
-        wide = f"{_share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
-        yield "windows outside the stated sets", f"{_share(plans['beyond'], plans['scored'])}; {wide}"
+        wide = f"{share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
+        yield "windows outside the stated sets", f"{share(plans['beyond'], plans['scored'])}; {wide}"
     elif plans.get("widening", 1.0) > 1.0:
         yield "sets widened", f"by up to {plans['widening']:.3g} times"
     if plans.get("slowed"):
-        yield "slowed down", f"{_share(plans['slowed'], figures['steps'])} of the steps, {plans['slow_downs']} times"
+        yield "slowed down", f"{share(plans['slowed'], figures['steps'])} of the steps, {plans['slow_downs']} times"
     for name, label in (("unverified", "unverified failsafes"), ("not_finite", "proposals with NaN or infinity")):
         if figures.get(name):
             yield f"[red]{label}[/]", str(figures[name])
@@ -216,39 +200,34 @@ def _runs(runs: dict[str, Figures]) -> Table:
     rows = [
         (
             label,
-            *("-" if run[name] is None else str(run[name]) for name in setup),
-            str(run["steps"]),
-            str(run["episodes"]),
-            *(_share(run[name], run["episodes"]) for name in ends),
-            _share(run["interventions"], run["steps"]),
-            _optional("{:.1f}", run["mean_reward"]),
+            *(known("{}", run[name], "-") for name in setup),
+            *(str(run[name]) for name in ("steps", "episodes")),
+            *(share(run[name], run["episodes"]) for name in ends),
+            share(run["interventions"], run["steps"]),
+            known("{:.1f}", run["mean_reward"]),
         )
         for label, run in runs.items()
     ]
-    return _table(("run", *setup, "steps", "episodes", *ends, "interventions", "reward"), rows)
+    return plain_table(("run", *setup, "steps", "episodes", *ends, "interventions", "reward"), rows)
 
 
 def _times(figures: Figures) -> list[Table]:
     """Format decision times: by part if the log has the exchanges."""
-    columns = ("mean", "std", "p50", "p90", "p99", "max")
+    columns: Sequence[str] = ("mean", "std", "p50", "p90", "p99", "max")
     rows = [
-        [
-            f"{kind} ({row['count']})" if part == "round_trip" else "",
-            part.replace("_", " "),
-            *_milliseconds(row, columns),
-        ]
+        (f"{kind} ({row['count']})" * (part == "round_trip"), part.replace("_", " "), *_milliseconds(row, columns))
         for kind, times in figures.get("latency_ms", {}).items()
         for part, row in times.items()
         if row is not None
     ]
     if rows:
-        return [_table(("decision [ms]", "part", *columns), rows)]
+        return [plain_table(("decision [ms]", "part", *columns), rows)]
     if not (times := figures.get("decision_ms")):
         return []
-    shown = ("mean", "std", "p50", "p99")
+    columns = ("mean", "std", "p50", "p99")
     kinds = {"all": times, **{kind: times[kind] for kind in KINDS.values()}}
-    rows = [[kind, *_milliseconds(row, shown)] for kind, row in kinds.items() if row is not None]
-    return [_table(("decision [ms]", *shown), rows)]
+    rows = [(kind, *_milliseconds(row, columns)) for kind, row in kinds.items() if row is not None]
+    return [plain_table(("decision [ms]", *columns), rows)]
 
 
 def _milliseconds(row: Figures, columns: Sequence[str]) -> list[str]:
@@ -267,7 +246,7 @@ def _training(robot: str, training: Figures) -> Table:
     if stale is not None and stale["max"] > 0:
         versions = "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
         rows.append(("weights behind", "", "", versions))
-    return _table((f"{robot} over training", "first", "last", ""), rows)
+    return plain_table((f"{robot} over training", "first", "last", ""), rows)
 
 
 def _coarse(bins: list[Figures], most: int) -> list[Figures]:
@@ -298,28 +277,25 @@ def _processes(processes: Figures) -> Table:
     rows = []
     for name, process in processes.items():
         longest = f" (longest {process['longest_silence']:.1f} s)" if process["silences"] else ""
-        seconds, rate = f"{process['seconds']:.1f}", _optional("{:.1f}", process["messages_per_s"])
+        seconds, rate = f"{process['seconds']:.1f}", known("{:.1f}", process["messages_per_s"])
         ended = process["notes"].get("died of", process["ended"])
         rows.append((name, str(process["starts"]), seconds, rate, f"{process['silences']}{longest}", ended))
-    return _table(("process", "starts", "alive, s", "messages/s", "silences", "ended"), rows)
+    return plain_table(("process", "starts", "alive, s", "messages/s", "silences", "ended"), rows)
 
 
 def _metadata(metadata: Figures) -> Table:
     """Format the metadata, without the configuration, which is long: --json and --html have it."""
     groups = {name: values for name, values in metadata.items() if name != "configuration" and isinstance(values, dict)}
     rows = [(name, Text(", ".join(f"{k} {v}" for k, v in values.items()))) for name, values in groups.items()]
-    return _table(("metadata", ""), rows)
+    return plain_table(("metadata", ""), rows)
 
 
-def _share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
+def share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:
+    """Format a count with its share, and the interval of the share if it is known."""
     text = f"{count}" + (f" ({count / of:.{digits}%})" if of else "")
     return text + (f", 95 %: {within[0]:.{digits}%} to {within[1]:.{digits}%}" if within is not None else "")
 
 
-def _mean_number(count: int, within: list[float] | None = None) -> str:
-    """Format a count of what may happen several times in an episode, with the interval of its mean number."""
-    return f"{count}" + (f", 95 %: {within[0]:.2g} to {within[1]:.2g} in an episode" if within is not None else "")
-
-
-def _optional(form: str, value: Any) -> str:
-    return "" if value is None else form.format(value)
+def known(form: str, value: Any, otherwise: str = "") -> str:
+    """Format a value that is not None."""
+    return otherwise if value is None else form.format(value)

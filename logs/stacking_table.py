@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -46,3 +47,11 @@ class StackingTable(Table):
                     yield Text.assemble((f"  {head}: " if head else "  ", "dim"), cell)
         if self.caption:
             yield Text.assemble((str(self.caption), "dim italic"))
+
+
+def plain_table(columns: Sequence[str], rows: Iterable[Sequence[RenderableType]]) -> StackingTable:
+    """Return a table without lines; without `columns`, rows of a name and a value."""
+    table = StackingTable(*columns, show_header=bool(columns), **PLAIN)
+    for row in rows:
+        table.add_row(*row)
+    return table

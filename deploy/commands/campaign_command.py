@@ -14,7 +14,7 @@ from brakeline.deploy import progress
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.experiments.task_engine import Engine
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import plain_table
 
 COLLIDED = 3  # exit status
 
@@ -90,9 +90,9 @@ class CampaignCommand:
         (self.results / f"{robot.name}.md").write_text(campaign.markdown(robot.name, driven, found))
         (self.results / f"{robot.name}.json").write_text(json.dumps(table, indent=1) + "\n")
         if not self.json:
-            console.print(_table(campaign.HEADS, campaign.rows_of(driven)))
+            console.print(plain_table(campaign.HEADS, campaign.rows_of(driven)))
             if found:
-                console.print(_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
+                console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
             console.print(f"[dim]{self.results}: {robot.name}.md, {robot.name}.json[/]")
         return table
 
@@ -120,10 +120,3 @@ class CampaignCommand:
 
     def _say(self, name: str, text: str) -> None:
         progress.console.print(f"[dim]{name}:[/] {text}")
-
-
-def _table(heads: tuple[str, ...], rows: list[list[str]]) -> StackingTable:
-    table = StackingTable(*heads, **PLAIN)
-    for row in rows:
-        table.add_row(*row)
-    return table

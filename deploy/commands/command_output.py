@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console, RenderableType
 
 from brakeline.logs.json_values import finite
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import StackingTable, plain_table
 
 # The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
 console = Console(highlight=False, soft_wrap=True)
@@ -18,13 +18,13 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
 def print_json(figures: dict[str, Any]) -> None:
     """Print one JSON object on stdout. Numbers that are not finite become null, paths become text."""
-    print(json.dumps(finite(figures), default=_path_text))
 
+    def path_text(value: object) -> str:
+        if isinstance(value, Path):
+            return str(value)
+        raise TypeError(f"JSON holds no {type(value).__name__}")
 
-def _path_text(value: object) -> str:
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"JSON holds no {type(value).__name__}")
+    print(json.dumps(finite(figures), default=path_text))
 
 
 def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType) -> None:
@@ -46,7 +46,4 @@ def print_counts(figures: dict[str, float], as_json: bool) -> None:
 
 def conditions_table(conditions: dict[str, str]) -> StackingTable:
     """Return a table with one line for each recording condition."""
-    table = StackingTable(show_header=False, **PLAIN)
-    for name, value in conditions.items():
-        table.add_row(name.replace("_", " "), value)
-    return table
+    return plain_table((), [(name.replace("_", " "), value) for name, value in conditions.items()])

@@ -14,7 +14,7 @@ from rich.text import Text
 from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import BusOptions, Json, Robot, Unprefixed
 from brakeline.errors import BadScan
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import StackingTable, plain_table
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
@@ -93,12 +93,12 @@ class QueryCommand:
 
 def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:
     """Return a table of an answer's plan, with its tube. The rivals predict no tube: its columns are then left out."""
-    has_tube = len(answer.tube_center) > 0
-    table = StackingTable("period", *inputs, *(("center [m]", "± [m]") if has_tube else ()), **PLAIN)
-    for k, values in enumerate(answer.plan):
-        tube = (_numbers(answer.tube_center[k]), _numbers(answer.tube_half_width[k])) if has_tube else ()
-        table.add_row(str(k), *(f"{value:.4f}" for value in values), *tube)
-    return table
+    tube = {"center [m]": answer.tube_center, "± [m]": answer.tube_half_width} if len(answer.tube_center) else {}
+    rows = [
+        (str(k), *(f"{value:.4f}" for value in values), *(_numbers(boxes[k]) for boxes in tube.values()))
+        for k, values in enumerate(answer.plan)
+    ]
+    return plain_table(("period", *inputs, *tube), rows)
 
 
 def quantity(name: str, value: float) -> str:

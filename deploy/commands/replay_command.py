@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, Quiet
-from brakeline.deploy.progress import under_way
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.deploy.progress import errors_only, under_way
+from brakeline.logs.stacking_table import plain_table
 
 if TYPE_CHECKING:
     from brakeline.deploy.run.replay_run import Replacement
@@ -84,52 +81,33 @@ class ReplayCommand:
         return filter_for
 
 
-@contextmanager
-def errors_only(name: str) -> Iterator[None]:
-    """Let a logger pass errors alone until the block ends."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
 def print_comparison(figures: dict[str, Any]) -> None:
     """Print the figures of a replay on stdout."""
     from brakeline.deploy.run.replay_run import ROUNDING
+    from brakeline.logs.figure_tables import share
 
     compared = figures["requests"] - figures["unanswered"]
     changes = ", ".join(f"{name} {value}" for name, value in figures["instead"].items())
     heading = f"decided again with {changes}" if changes else "decided again"
     console.print(f"{heading}: {compared} requests; {figures['unanswered']} had no answer")
-    console.print(f"identical in every bit: {share(figures['identical'], compared)}")
+    console.print(f"identical in every bit: {share(figures['identical'], compared, digits=2)}")
     largest = f"; at most {figures['rounding']:.1g}" if figures["equal"] else ""
-    console.print(f"same kind, numbers equal to within {ROUNDING:g}: {share(figures['equal'], compared)}{largest}")
+    equal = f"{share(figures['equal'], compared, digits=2)}{largest}"
+    console.print(f"same kind, numbers equal to within {ROUNDING:g}: {equal}")
     console.print(f"different: {figures['different']}")
     if not figures["different"]:
         return
-    console.print(f"the robot gets the same input in {share(figures['same_input'], compared)}")
-    kinds = StackingTable("decided", "now", "requests", **PLAIN)
-    for logged, row in figures["kinds"].items():
-        for now, number in row.items():
-            kinds.add_row(logged, now, str(number))
-    fields = StackingTable("field", "differs in", "by at most", **PLAIN)
-    for name, field in figures["fields"].items():
-        fields.add_row(name, str(field["count"]), size(field["largest"]))
-    examples = StackingTable("largest differences", "decided", "now", "input", "margin", **PLAIN)
+    console.print(f"the robot gets the same input in {share(figures['same_input'], compared, digits=2)}")
+    kinds = [(logged, now, str(count)) for logged, row in figures["kinds"].items() for now, count in row.items()]
+    fields = [(name, str(field["count"]), size(field["largest"])) for name, field in figures["fields"].items()]
+    examples = []
     for one in figures["examples"]:
         step = f"{one['actor']} episode {one['episode']} step {one['step']}"
         sizes = (size(one["differences"].get(name, 0.0)) for name in ("input", "margin"))
-        examples.add_row(step, one["logged"], one["now"], *sizes)
-    for table in (kinds, fields, examples):
-        console.print(table)
-
-
-def share(count: int, total: int) -> str:
-    """Return a count, with its share of the total."""
-    return f"{count} ({count / total:.2%})" if total else str(count)
+        examples.append((step, one["logged"], one["now"], *sizes))
+    console.print(plain_table(("decided", "now", "requests"), kinds))
+    console.print(plain_table(("field", "differs in", "by at most"), fields))
+    console.print(plain_table(("largest differences", "decided", "now", "input", "margin"), examples))
 
 
 def size(value: float) -> str:

@@ -16,7 +16,7 @@ from brakeline.deploy.data.description_plot import draw_description, summary
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.errors import BadDescription, NoSource
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import plain_table
 from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
 from brakeline.messaging.robot_description import NAME, robot_from_description
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
@@ -98,15 +98,16 @@ class RobotCommand:
         if self.picture is not None:
             draw_description(robot, self.picture)
             values["picture"] = str(self.picture)
-        table = StackingTable(show_header=False, **PLAIN)
-        for label, one in values["inputs"].items():
-            table.add_row(escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
+        rows = [
+            (escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
+            for label, one in values["inputs"].items()
+        ]
         for name, value in values.items():
             if name != "inputs":
                 text = "\n".join(value) if isinstance(value, list) else value
                 text = f"{text:g}" if isinstance(text, float) else str(text)
-                table.add_row(name.replace("_", " "), escape(text))
-        print_result(self.json, values, table)
+                rows.append((name.replace("_", " "), escape(text)))
+        print_result(self.json, values, plain_table((), rows))
         return 0
 
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import BusOptions, Json, Unprefixed
-from brakeline.logs.stacking_table import PLAIN, StackingTable
+from brakeline.logs.stacking_table import plain_table
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.topics import HEALTH, LEARNER
 
@@ -26,6 +26,8 @@ class StatusCommand:
 
     def run(self) -> int:
         """Listen, and print the processes. Returns the exit status."""
+        from brakeline.logs.metrics import learner  # imports NumPy, which the help does not need
+
         processes: dict[str, Any] = {}
         learners: dict[str, Any] = {}
 
@@ -34,9 +36,7 @@ class StatusCommand:
             processes[health.process] = {"pid": health.pid, **dict(health.figures), **dict(health.notes)}
 
         def receive_learner(sample: Sample) -> None:
-            message = sample.message()
-            names = [f.name for f in message.DESCRIPTOR.fields if f.name not in ("header", "robot", "limit")]
-            learners[message.robot] = {name: getattr(message, name) for name in names}
+            learners[sample.message().robot] = learner(sample.message())
 
         with Bus(self.endpoints.bus(), f"viewer.status-{time.time_ns() % 10**6}") as bus:
             bus.subscribe(HEALTH, receive_health)
@@ -46,11 +46,11 @@ class StatusCommand:
         if self.json:
             print_json({"alive": alive, "processes": processes, "learners": learners})
             return 0
-        table = StackingTable("process", "state", "figures", **PLAIN)
-        for name in sorted({*alive, *processes}):
-            state = "[green]alive[/]" if name in alive else "[red]gone[/]"
-            table.add_row(name, state, figures_text(processes.get(name, {})))
-        console.print(table)
+        rows = [
+            (name, "[green]alive[/]" if name in alive else "[red]gone[/]", figures_text(processes.get(name, {})))
+            for name in sorted({*alive, *processes})
+        ]
+        console.print(plain_table(("process", "state", "figures"), rows))
         for robot, figures in learners.items():
             console.print(
                 f"learning {robot}: {figures['steps']} steps, {figures['updates']} updates, "

@@ -7,15 +7,14 @@ results/campaign/<robot>.md, <robot>.json        the table
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands.common_options import PhysicsOptions
 from brakeline.deploy.experiments.comparison_table import markdown_table
+from brakeline.deploy.progress import errors_only
 from brakeline.errors import ResultError
 from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson
 from brakeline.safety.model.model_config import KINDS, ModelConfig
@@ -57,18 +56,6 @@ def model_config_of(name: str) -> ModelConfig:
     if name not in MODEL_SETS:
         raise ValueError(f"no model set is called {name!r}; there are: {', '.join(MODEL_SETS)}")
     return ModelConfig(name, "direct") if name in KINDS else ModelConfig(mode=name)
-
-
-@contextmanager
-def _counting_instead_of_warning() -> Iterator[None]:
-    """Keep the filter from logging each step outside its set: the table counts them, and a changed robot has many."""
-    filter_log = logging.getLogger("brakeline.safety")
-    before = filter_log.level
-    filter_log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        filter_log.setLevel(before)
 
 
 @dataclass(frozen=True)
@@ -120,7 +107,7 @@ class CampaignPart:
             accept_bound=self.accept_bound,
         )
 
-    @_counting_instead_of_warning()
+    @errors_only("brakeline.safety")  # the table counts the steps outside their sets, and a changed robot has many
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
         """Drive the episodes, and keep the logs of those that came too near to something."""
         from brakeline.deploy.experiments.campaign_episodes import CampaignDriver, too_near
@@ -169,7 +156,7 @@ class CampaignSearch:
         """The name of the search."""
         return f"search-{self.cell.arena}-{self.cell.model_set}-{self.cell.perturbation}-{self.episodes}"
 
-    @_counting_instead_of_warning()
+    @errors_only("brakeline.safety")
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
         """Search, and keep the log of the worst episode."""
         from brakeline.deploy.experiments.experiment_jobs import configuration

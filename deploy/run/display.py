@@ -18,7 +18,7 @@ from brakeline.deploy import progress
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.live_page import LivePage
 from brakeline.deploy.run.verdict import verdict
-from brakeline.logs.figure_tables import show
+from brakeline.logs.figure_tables import known, share, show
 from brakeline.logs.stacking_table import PLAIN
 from brakeline.logs.tube_stats import stated
 
@@ -110,11 +110,12 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     """Format the figures in two columns of names and values, for 80 columns."""
     episodes, steps, plans = figures["episodes"], figures["steps"], figures["plans"]
     contained, color = figures["containment"], "bold red" if figures["collisions"] else "green"
+    reward = known("{:.1f}", figures["mean_reward"], "-")
     rows = [
         ("episodes", str(episodes), "goals", share(figures["goals"], episodes)),
-        ("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", known("{:.1f}", figures["mean_reward"])),
+        ("collisions", f"[{color}]{figures['collisions']}[/]", "mean reward", reward),
         ("interventions", share(figures["interventions"], steps), "failsafe", str(figures["failsafes"])),
-        ("adjusted", share(figures["adjusted"], steps), "for clearance", known("{}", figures["for_clearance"])),
+        ("adjusted", share(figures["adjusted"], steps), "for clearance", known("{}", figures["for_clearance"], "-")),
         ("outside the set", share(contained["violations"], contained["steps"]), "no answer", str(figures["fallbacks"])),
     ]
     if plans["flown"]:
@@ -127,7 +128,7 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     notes = {name: note for process in figures["processes"].values() for name, note in process["notes"].items()}
     rows += [("new model set", escape(notes[name]), "", "") for name in sorted(notes) if name.startswith("adaptation ")]
     decide, reply = (
-        known("{0[p50]:.2f} / {0[p99]:.2f} ms", figures[name]) for name in ("decision_ms", "round_trip_ms")
+        known("{0[p50]:.2f} / {0[p99]:.2f} ms", figures[name], "-") for name in ("decision_ms", "round_trip_ms")
     )
     rows.append(("decide p50 / p99", decide, "reply p50 / p99", reply))
     for robot, learner in figures["learners"].items():
@@ -143,11 +144,6 @@ def _figures_table(figures: dict[str, Any]) -> Table:
     return table
 
 
-def known(form: str, value: Any) -> str:
-    """Format a value; `-` for None."""
-    return "-" if value is None else form.format(value)
-
-
 def _processes(run: Launcher) -> Table:
     table = Table(**PLAIN)
     for column in ("process", "state", "restarts"):
@@ -158,11 +154,6 @@ def _processes(run: Launcher) -> Table:
             state = "[yellow]starts[/]"
         table.add_row(child.spec.name, state, str(child.restarts))
     return table
-
-
-def share(count: int, of: int) -> str:
-    """Format a count and its share."""
-    return f"{count} ({count / of:.1%})" if of else str(count)
 
 
 def summary(console: Console, figures: dict[str, Any], verbose: bool = False) -> None:
