@@ -54,10 +54,8 @@ class DecisionStats:
         if solver:
             self.iterations.add(decision.iterations)
             count(self.statuses, solver)
-        if not decision.verified:
-            self.unverified += 1
-        if not all(map(math.isfinite, exchange.request.action)):
-            self.not_finite += 1
+        self.unverified += not decision.verified
+        self.not_finite += not all(map(math.isfinite, exchange.request.action))
         if widths := decision.tube_half_width[:]:
             self.half_width.add(max(widths))
             self.margin.add(decision.margin)

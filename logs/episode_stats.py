@@ -71,9 +71,7 @@ class EpisodeStats:
     speed: float = 0.0  # m/s, summed
     max_speed: float = 0.0  # m/s
     clearance: QuantileSketch = field(default_factory=QuantileSketch)  # m, from the footprint to the nearest obstacle
-    returns: array[float] = field(
-        default_factory=lambda: array("d")
-    )  # per finished episode, without the intervention penalty
+    returns: array[float] = field(default_factory=lambda: array("d"))  # per finished episode, without penalties
     decision_ms: dict[int, QuantileSketch] = field(default_factory=lambda: {kind: QuantileSketch() for kind in KINDS})
     propose_ms: QuantileSketch = field(default_factory=QuantileSketch)
     intervention_rate: ClusteredProportion = field(default_factory=ClusteredProportion)  # by finished episode
@@ -124,12 +122,9 @@ class EpisodeStats:
             self.propose_ms.add(propose_ms)
 
     def _add_failures(self, step: pb.Step) -> None:
-        if step.outside:
-            self.outside += 1
-        if step.compared:
-            self.compared += 1
-            if not step.contained:
-                self.violations += 1
+        self.outside += step.outside
+        self.compared += step.compared
+        self.violations += step.compared and not step.contained
         if step.collision and not self._collided:
             self._collided = True
             self.collisions += 1
@@ -140,10 +135,8 @@ class EpisodeStats:
 
     def _end_episode(self, step: pb.Step) -> None:
         self.returns.append(self._return)
-        if step.goal:
-            self.goals += 1
-        if step.truncated and not step.terminated and not step.cut:
-            self.timeouts += 1
+        self.goals += step.goal
+        self.timeouts += step.truncated and not step.terminated and not step.cut
         steps, interventions = self._begun_at
         self.intervention_rate.add(self.interventions - interventions, self.steps - steps)
         self._episode = None

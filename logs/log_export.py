@@ -63,18 +63,17 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
     for record in robot_steps(paths, robot):
         step = record.message
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
-        values += [pb.Kind.Name(step.decision) if name == "decision" else _plain(step, name) for name in plain]
+        for name in plain:
+            value = getattr(step, name)
+            values.append(
+                pb.Kind.Name(value) if name == "decision" else int(value) if isinstance(value, bool) else value
+            )
         for name, parts in vectors.items():
             row = list(getattr(step, name))
             values += row if len(row) == len(parts) else [""] * len(parts)
         table.writerow(values)
         count += 1
     return count
-
-
-def _plain(step: pb.Step, name: str) -> Any:
-    value = getattr(step, name)
-    return int(value) if isinstance(value, bool) else value
 
 
 def to_tlog(paths: Paths, file: BinaryIO) -> int:

@@ -81,20 +81,19 @@ def compare_groups(runs: Sequence[GroupedRun]) -> Figures:
     members: defaultdict[tuple[str, tuple[tuple[str, str], ...]], list[GroupedRun]] = defaultdict(list)
     for run in sorted(runs, key=lambda run: run.robot):
         setup = dict(_flat(run.setup))
-        members[run.robot, tuple((name, str(value)) for name, value in setup.items() if not _seed(name))].append(run)
+        key = tuple((name, str(value)) for name, value in setup.items() if name.rpartition(".")[2] != "seed")
+        members[run.robot, key].append(run)
     names = _names([dict(setup) for _, setup in members])
     groups = [_group(robot, name, group) for ((robot, _), group), name in zip(members.items(), names, strict=True)]
     for group, color in zip(groups, _colors(groups), strict=True):
         group["color"] = color
-    pairs = itertools.combinations(groups, 2)
-    return {
-        "groups": groups,
-        "improvements": [_improvement(a, b) for a, b in pairs if a["robot"] == b["robot"]],
-    }
-
-
-def _seed(name: str) -> bool:
-    return name.rpartition(".")[2] == "seed"
+    improvements = []
+    for a, b in itertools.combinations(groups, 2):
+        if a["robot"] == b["robot"]:
+            first, second = (np.array(group["scores"]["goals"]["values"]) for group in (a, b))
+            pair = {"robot": a["robot"], "of": a["name"], "over": b["name"]}
+            improvements.append(pair | probability_of_improvement(first, second))
+    return {"groups": groups, "improvements": improvements}
 
 
 def differences(configurations: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -184,13 +183,8 @@ def _interval(values: Array, statistic: Callable[[Array], Array]) -> list[float]
     """Return the percentile bootstrap interval of a statistic over runs. A mean of shares stays within 0 and 1."""
     if values.shape[-1] < 2:
         return None
-    return _percentiles(statistic(_drawn(values)))
-
-
-def _drawn(values: Array) -> Array:
-    """Return resamples (RESAMPLES, tasks · runs) of scores (runs,) or (tasks, runs)."""
-    tasks = np.atleast_2d(values)
-    return np.concatenate([row[_resampled(len(row), task)] for task, row in enumerate(tasks)], axis=1)
+    drawn = [row[_resampled(len(row), task)] for task, row in enumerate(np.atleast_2d(values))]
+    return _percentiles(statistic(np.concatenate(drawn, axis=1)))
 
 
 def _resampled(count: int, task: int = 0) -> NDArray[np.intp]:
@@ -214,12 +208,6 @@ def performance_profile(values: Array) -> Figures:
         tail = 50.0 * (1.0 - CONFIDENCE)
         profile["low"], profile["high"] = np.percentile(drawn, (tail, 100.0 - tail), axis=0).tolist()
     return profile
-
-
-def _improvement(a: Figures, b: Figures) -> Figures:
-    """Return the probability that a run of group `a` scores better than one of group `b`."""
-    first, second = (np.array(group["scores"]["goals"]["values"]) for group in (a, b))
-    return {"robot": a["robot"], "of": a["name"], "over": b["name"], **probability_of_improvement(first, second)}
 
 
 def probability_of_improvement(first: Array, second: Array) -> Figures:

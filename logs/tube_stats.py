@@ -96,7 +96,9 @@ class TubeStats:
         inputs, following = len(now.action), self._own.reply.decision.plan
         start = min(inputs * (self._periods + 1), len(following) - inputs)
         tail, committed = following[max(start, 0) : start + inputs], now.plan[:inputs]
-        return 0 < inputs == len(tail) == len(committed) and all(map(_is_same, committed, tail))
+        # An infinity is the same as itself, and NaN as nothing.
+        same_inputs = all(one == other or abs(one - other) <= SAME for one, other in zip(committed, tail, strict=False))
+        return 0 < inputs == len(tail) == len(committed) and same_inputs
 
     def _compare(self, request: pb.Request) -> None:
         """Compare the measured position with the tube's box at the end of the last period."""
@@ -120,10 +122,6 @@ class TubeStats:
             stated = None if self._own is None else bound_in(self._own.reply.decision)
             self.bound = None if self.bound is None or stated is None else max(self.bound, stated)
         self._own, self._tube, self._periods, self._worst = None, None, 0, 0.0
-
-
-def _is_same(one: float, other: float) -> bool:
-    return one == other or abs(one - other) <= SAME  # an infinity is the same as itself, and NaN as nothing
 
 
 def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from brakeline.deploy.commands import common_options as options
@@ -57,5 +57,5 @@ class BridgeSimCommand:
             if not self.json:
                 errors.print(f"ground on {', '.join(self.router or self.listen)}, {self.arena}; ^C ends it")
             bridge.run(stack.enter_context(stop_on_signals(threading.Event())))
-        print_counts(bridge.outcome.figures(), self.json)
+        print_counts(asdict(bridge.outcome), self.json)
         return 0

@@ -81,6 +81,7 @@ class CompareCommand:
         """Train, evaluate and write the tables. Returns the exit status."""
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.experiments.results_page import page, stored_cells
+        from brakeline.deploy.experiments.tuning_trials import tuning_jobs
         from brakeline.messaging.task import address, robot_with_task
         from brakeline.safety.model.model_config import ModelConfig
 
@@ -94,7 +95,8 @@ class CompareCommand:
                 tables[robot] = self._write(stored_cells(results, robot), [], results / robot)
                 continue
             if self.tune:
-                complete(self._tuning(robot), results, runs, self.engine, self.again, self._print_progress)
+                trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]
+                complete(trials, results, runs, self.engine, self.again, self._print_progress)
                 continue
             jobs = self._jobs(robot)
             filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
@@ -109,11 +111,6 @@ class CompareCommand:
         if self.json:
             print_json(tables)
         return 0
-
-    def _tuning(self, robot: str) -> list[Job]:
-        from brakeline.deploy.experiments.tuning_trials import tuning_jobs
-
-        return list(tuning_jobs(robot, self._methods(robot), self.arenas))
 
     def _methods(self, robot: str) -> tuple[str, ...]:
         methods = compared_on(robot, self.arenas) if self.methods is None else self.methods

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -63,7 +63,7 @@ class PretrainCommand:
         rows = tune_threshold(model, robot, values_of(self.method, robot), self.episodes, self._print_row)
         chosen = best_threshold(rows)
         best = f"best: {chosen.value:g}, which has the fewest collisions of the values at which A* loses no goal"
-        print_result(self.json, {"tried": [row.figures() for row in rows], "best": chosen.value}, best)
+        print_result(self.json, {"tried": [asdict(row) for row in rows], "best": chosen.value}, best)
         return 0
 
     def _print_row(self, row: ThresholdTrial) -> None:

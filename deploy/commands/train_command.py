@@ -40,19 +40,8 @@ class TrainCommand(RunConfig):
 
     # Options that `--help` leaves to `--help-all`.
     expert: ClassVar[tuple[str, ...]] = (
-        *(
-            "physics",
-            "fleet",
-            "robots_per_actor",
-            "penalty",
-            "deadline",
-            "replicas",
-            "from_logs",
-            "practice",
-            "adapt",
-            "change",
-        ),
-        *("deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
+        *("physics", "fleet", "robots_per_actor", "penalty", "deadline", "replicas", "from_logs", "practice", "adapt"),
+        *("change", "deterministic", "record", "rotation", "pictures", "mavlink", "meeting", "learner"),
     )
 
     def __post_init__(self) -> None:

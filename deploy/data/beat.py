@@ -43,10 +43,8 @@ def find_beat(between: Array, step: float) -> Beat | None:
         return None
     times = np.sort(between)[:: math.ceil(len(between) / MOST_TIMES)]
     # The rows of a log are multiples of their own step, whenever the inputs change: it counts only if most do at once.
-    first, longest = (
-        (0.98 if np.median(times) < 1.5 * step else 1.4) * step,
-        min(1.1 * float(np.median(times)), LONGEST),
-    )
+    first = (0.98 if np.median(times) < 1.5 * step else 1.4) * step
+    longest = min(1.1 * float(np.median(times)), LONGEST)
     steps = first * GRID ** np.arange(math.ceil(math.log(max(longest / first, 1.0)) / math.log(GRID)) + 20)
     coherence = np.array([_coherence(times, one) for one in steps])
     best = float(coherence.max())

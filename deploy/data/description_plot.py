@@ -47,6 +47,8 @@ def remarks(robot: Robot) -> list[str]:
 def summary(robot: Robot) -> dict[str, Any]:
     """Return the main figures of a description, as JSON values."""
     rules = zip(robot.action, robot.action_low, robot.action_high, robot.stop, strict=True)
+    distance = nominal_stopping_distance(robot)
+    position = {"way_to_a_stop_m": distance, "footprint_m": robot.footprint, "discs": len(robot.body)}
     return {
         "name": robot.name,
         "period_s": robot.period,
@@ -57,17 +59,12 @@ def summary(robot: Robot) -> dict[str, Any]:
         },
         "plan_s": robot.horizon * robot.period,
         "braking_s": robot.brake_steps * robot.period,
-        **(_figures_of_position(robot) if robot.position_dim else {}),
+        **(position if robot.position_dim else {}),
         "limits": [limit.name for limit in robot.limits],
         "regressors": [robot.state[i] for i in robot.regressor],
         "layout": robot.layout(),
         "remarks": remarks(robot),
     }
-
-
-def _figures_of_position(robot: Robot) -> dict[str, Any]:
-    distance = nominal_stopping_distance(robot)
-    return {"way_to_a_stop_m": distance, "footprint_m": robot.footprint, "discs": len(robot.body)}
 
 
 def draw_description(robot: Robot, path: Path) -> None:

@@ -59,14 +59,6 @@ def slew(one: InferredColumn) -> float | None:
     return None if one.jumps else _outwards(one.change)
 
 
-def _low(one: InferredColumn) -> float:
-    return min(_outwards(one.least), 0.0)
-
-
-def _high(one: InferredColumn) -> float:
-    return max(_outwards(one.most), 0.0)
-
-
 def _state(one: InferredColumn) -> str:
     values: dict[str, Any] = {"unit": one.unit or "1"}
     values |= {"role": one.role} if one.role != "other" else {}
@@ -80,7 +72,8 @@ def _state(one: InferredColumn) -> str:
 
 def _input(one: InferredColumn) -> str:
     most, steers = slew(one), one.unit == "rad"
-    values: dict[str, Any] = {"unit": one.unit or "1", "low": _low(one), "high": _high(one)}
+    values: dict[str, Any] = {"unit": one.unit or "1"}
+    values |= {"low": min(_outwards(one.least), 0.0), "high": max(_outwards(one.most), 0.0)}
     values |= {} if most is None else {"slew": most}
     values |= {"moves": not steers if one.moves is None else one.moves, "stop": "hold" if steers else "ramp"}
     remarks = [] if one.unit else [f"its unit {UNKNOWN}"]

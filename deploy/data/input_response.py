@@ -9,7 +9,7 @@ import numpy as np
 from brakeline.deploy.data.aligned_log import AlignedLog
 from brakeline.deploy.data.motion_check import FEWEST_SPANS, MAX_LAG, SPAN, agreement, same_gain
 from brakeline.deploy.data.sources.quantity_names import COMMAND
-from brakeline.deploy.data.sources.source_table import Array, Series
+from brakeline.deploy.data.sources.source_table import Series
 from brakeline.messaging.robot import Robot
 
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
@@ -38,13 +38,8 @@ def _lagged_correlation(log: AlignedLog, name: str, other: str) -> float:
     """Return the best correlation of an input with a coordinate up to `MAX_LAG` later; 0 if the gain is not near 1."""
     lags = np.arange(0.0, MAX_LAG, max(log.step, 0.025))
     pairs = (log.rows_apart(round(lag / log.step)) for lag in lags)
-    return max(_near_correlation(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
-
-
-def _near_correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 if the gain is not near 1."""
-    value, gain = agreement(one, other)
-    return value if same_gain(gain) else 0.0
+    fits = (agreement(log.columns[name][i], log.columns[other][j]) for i, j in pairs)
+    return max(correlation if same_gain(gain) else 0.0 for correlation, gain in fits)
 
 
 def delay_of(log: AlignedLog, name: str, follower: str) -> float | None:

@@ -39,9 +39,8 @@ class PredictiveConfig:
 
 RivalConfig = SecasConfig | SailrConfig | BarrierConfig | PredictiveConfig
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
-CONFIGS: dict[str, type[RivalConfig]] = {
-    **{SECAS: SecasConfig, SAILR: SailrConfig, CBF: BarrierConfig, PSF: PredictiveConfig}
-}
+CONFIGS: dict[str, type[RivalConfig]] = {SECAS: SecasConfig, SAILR: SailrConfig, CBF: BarrierConfig}
+CONFIGS[PSF] = PredictiveConfig
 
 
 def config_for(method: str, robot: RobotWithTask) -> RivalConfig:

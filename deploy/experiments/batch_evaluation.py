@@ -50,12 +50,12 @@ def drive_batch(
     from brakeline.deploy.experiments.evaluate import FRESH
 
     safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
-    others: dict[str, Any] = {
-        "accept_bound": what.accept_bound,
-        "conditions": what.conditions,
-        "independent": independent,
-    }
-    drive_episodes(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take, **others)
+    drive_episodes(
+        *(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take),
+        accept_bound=what.accept_bound,
+        conditions=what.conditions,
+        independent=independent,
+    )
 
 
 def drive_episodes(

@@ -21,6 +21,11 @@ Array = NDArray[np.float64]
 POINTS = 200  # per curve
 
 
+def _save(picture: Figure, png: Path) -> None:
+    png.parent.mkdir(parents=True, exist_ok=True)
+    picture.savefig(png, dpi=120, metadata={"Software": None})
+
+
 def _smooth(values: Array) -> Array:
     """Return the moving mean over the last `WINDOW` episodes, or all of them at the start."""
     sums = np.concatenate([[0.0], np.cumsum(values)])
@@ -75,8 +80,7 @@ def learning_curves(results: Sequence[dict[str, Any]], png: Path) -> None:
     panels[0].legend(loc="best", frameon=False)
     for axes in panels[2:]:
         axes.set_xlabel(f"steps (means over {WINDOW} episodes, at the mean of their ends)")
-    png.parent.mkdir(parents=True, exist_ok=True)
-    picture.savefig(png, dpi=120, metadata={"Software": None})
+    _save(picture, png)
 
 
 def profiles(goals: Mapping[str, Array], png: Path) -> None:
@@ -96,8 +100,7 @@ def profiles(goals: Mapping[str, Array], png: Path) -> None:
     axes.set_xlim(max(0.0, min(float(scores.min()) for scores in goals.values()) - 0.05), 1.0)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower left", frameon=False)
-    png.parent.mkdir(parents=True, exist_ok=True)
-    picture.savefig(png, dpi=120, metadata={"Software": None})
+    _save(picture, png)
 
 
 def seeds_as_points(found: dict[str, Any], png: Path) -> None:
@@ -122,8 +125,7 @@ def seeds_as_points(found: dict[str, Any], png: Path) -> None:
                 axes.set_ylim(-2.0, 102.0)
             else:
                 axes.set_ylim(bottom=-0.5)
-    png.parent.mkdir(parents=True, exist_ok=True)
-    picture.savefig(png, dpi=120, metadata={"Software": None})
+    _save(picture, png)
 
 
 def _point(axes: Axes, place: int, estimate: MeanEstimate, colour: str) -> None:

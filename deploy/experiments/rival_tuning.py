@@ -8,7 +8,7 @@ by the interventions on A*.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.trials import fresh_trial
@@ -35,10 +35,6 @@ class ThresholdTrial:
     oracle_interventions: float  # share of its steps
     greedy_goals: int
     greedy_collisions: int
-
-    def figures(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
 
 
 def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:

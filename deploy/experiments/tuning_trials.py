@@ -10,7 +10,7 @@ results/<robot>/tuning-<method>-<value>.json
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +54,7 @@ class FilterTuning:
         robot = robot_with_task(self.robot)
         model = method_for(robot, self.method, ModelConfig())
         assert isinstance(model, Pretrained)
-        return {
-            "study": configuration(self),
-            **try_threshold(model, robot, self.value, self.episodes).figures(),
-        }
+        return {"study": configuration(self), **asdict(try_threshold(model, robot, self.value, self.episodes))}
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,10 @@ class SearchedEpisode:
         shifts = FAR * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
         inside = [o for o in drawn.obstacles if o.kind != WALL and len(o.position) == dim and _movable(o, drawn)]
         inside.sort(key=lambda o: float(np.linalg.norm(np.subtract(o.position, drawn.start[:dim]))))
-        moved = {id(o): _shifted(o, shift) for o, shift in zip(inside, shifts, strict=False)}
+        moved = {
+            id(o): replace(o, position=tuple((np.asarray(o.position) + shift).tolist()))
+            for o, shift in zip(inside, shifts, strict=False)
+        }
         obstacles = tuple(moved.get(id(o), o) for o in drawn.obstacles)
         return replace(drawn, obstacles=obstacles, step_limit=PERIODS)
 
@@ -180,7 +183,3 @@ def _movable(obstacle: Obstacle, arena: Arena) -> bool:
     """Return whether this is no floor or ceiling."""
     (low, high) = arena.bounds[0]
     return not obstacle.size or max(obstacle.size) < high - low
-
-
-def _shifted(obstacle: Obstacle, shift: Array) -> Obstacle:
-    return replace(obstacle, position=tuple((np.asarray(obstacle.position) + shift).tolist()))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -173,22 +173,17 @@ class Adaptation:
 
     def _since(self, starts: dict[str, DrivenPeriod]) -> list[pb.Step]:
         """Return the steps of each robot from its start on."""
-
-        def taken() -> Iterator[pb.Step]:
-            for step in self._steps:
-                start = starts.get(step.actor)
-                run = step.header.run
-                if start is not None and run == start.run and DrivenPeriod(run, step.episode, step.step) >= start:
-                    yield step
-
-        return list(taken())
+        return [
+            step
+            for step in self._steps
+            if (start := starts.get(step.actor)) is not None
+            and step.header.run == start.run
+            and DrivenPeriod(step.header.run, step.episode, step.step) >= start
+        ]
 
     def _since_change(self) -> list[pb.Step]:
         robots = self._driving_robots()
         return self._since({name: s.widened for name, s in robots.items() if s.widened is not None})
-
-    def _since_version(self) -> list[pb.Step]:
-        return self._since({name: state.since for name, state in self._driving_robots().items()})
 
     def attempt(self) -> Recertification | None:
         """Fit and check a model set, if it is time; None if it is not."""
@@ -198,8 +193,8 @@ class Adaptation:
             steps = self._since_change()
             why = f"{self._minutes(len(steps)):.1f} minutes after the change, at {self.widening:.2g} times the sets"
         else:
-            again = self._periods(AGAIN)
-            steps = self._since_version() if self._driven >= again else []
+            again, robots = self._periods(AGAIN), self._driving_robots()
+            steps = self._since({n: state.since for n, state in robots.items()}) if self._driven >= again else []
             why = f"after {self._minutes(len(steps)):.1f} minutes without a new one"
             if len(steps) < again:
                 return None
@@ -221,9 +216,8 @@ class Adaptation:
             return Recertification(f"none {why}: {error}")
         if refused := refusal(self.robot, model.about, self.accept_bound) or looser:
             return Recertification(f"none {why}: {refused}")
-        stated = (
-            f"±{1e3 * report.half_width_full:.0f} mm after a full stop, at most {percent(report.bound_plan)} outside"
-        )
+        width, bound = f"±{1e3 * report.half_width_full:.0f} mm", percent(report.bound_plan)
+        stated = f"{width} after a full stop, at most {bound} outside"
         return Recertification(f"{model.version} {why}: {stated}", model, data)
 
 

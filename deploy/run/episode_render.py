@@ -40,11 +40,7 @@ COLOURS["no filter"] = hex_color("unfiltered")
 ARROWS = {"proposed": hex_color("proposed"), "executed": hex_color("executed")}
 EDGE = hex_color("halfspace")  # of the half-space that blocks the proposal
 HITS = 400  # scan hits in one frame
-FREE, HIT, MOVER = (
-    hex_color("free"),
-    hex_color("hit"),
-    hex_color("mover"),
-)  # perceived surroundings: scan and moving obstacles
+FREE, HIT, MOVER = map(hex_color, ("free", "hit", "mover"))  # perceived surroundings: scan and moving obstacles
 FORMATS = (".png", ".gif", ".mp4")
 SPEED = 3.0  # of the film relative to real time
 LAST_FRAMES = 8  # repetitions of the last frame

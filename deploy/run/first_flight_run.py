@@ -58,15 +58,11 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
     from brakeline.deploy.data.first_flight import Box, FirstFlight
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    with (
-        stop_on_signals(
-            threading.Event(), patient=True
-        ) as stop,  # a second signal must not leave the vehicle in the air
-        listening(url, settings.system),  # so that no actor of this machine takes the vehicle
-    ):
-        flight_settings = FlightSettings(
-            url, settings.system, height=settings.height, raise_limits=settings.raise_limits, lead=settings.lead
-        )
+    flight_settings = FlightSettings(
+        url, settings.system, height=settings.height, raise_limits=settings.raise_limits, lead=settings.lead
+    )
+    # A second signal must not leave the vehicle in the air. No actor of this machine may take the vehicle.
+    with stop_on_signals(threading.Event(), patient=True) as stop, listening(url, settings.system):
         vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set)
         try:
             middle = vehicle.current_period.report.measured[:3]

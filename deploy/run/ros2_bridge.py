@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,10 +74,6 @@ class Outcome:
     timeouts: int = 0  # stops because no command arrived
     missed: int = 0  # periods of lockstep without a command
     slips: int = 0  # times that the simulation gave up catching up with real time
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures by name."""
-        return asdict(self)
 
 
 class Bridge:

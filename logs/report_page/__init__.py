@@ -69,14 +69,13 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
         style="\n".join([*map(viewer_file, STYLES), *map(_text, OWN_STYLES)]),
         script="\n".join(['"use strict";', *map(viewer_file, SCRIPTS), *map(_text, OWN_SCRIPTS)]),
         groups=embedded(figures.get("groups", [])),
-        data=embedded([_drawing_data(label, own, pictures) for label, (own, pictures) in runs.items()]),
+        data=embedded(
+            [
+                {"run": label, "setup": {name: own[name] for name in SETUP}, "training": own["training"]} | pictures
+                for label, (own, pictures) in runs.items()
+            ]
+        ),
     )
-
-
-def _drawing_data(label: str, figures: Figures, pictures: Figures) -> Figures:
-    """Return the data for the drawings of one run."""
-    setup = {name: figures[name] for name in SETUP}
-    return {"run": label, "setup": setup, "training": figures["training"]} | pictures
 
 
 def write(path: Path, figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> None:

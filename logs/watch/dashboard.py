@@ -194,15 +194,11 @@ class Dashboard:
             if now - self._figures_at > FIGURES_EVERY:
                 self._figures, self._figures_at = self._counts(), now
             most = TRAIL // max(1, len(self._panels) // MANY)
-            panels = [
-                panel.view(most) | {"promises": [box for other in self._others(name) for box in other.reservation]}
-                for name, panel in sorted(self._panels.items())
-            ]
+            panels = []
+            for name, panel in sorted(self._panels.items()):
+                others = [self._panels[actor] for actor in panel.fleet if actor != name and actor in self._panels]
+                panels.append(panel.view(most) | {"promises": [box for other in others for box in other.reservation]})
             return {"robots": panels, "silent": now - self._last_message} | self._figures
-
-    def _others(self, name: str) -> list[RobotPanel]:
-        """Return the panels of the other robots of the actor's world."""
-        return [self._panels[actor] for actor in self._panels[name].fleet if actor != name and actor in self._panels]
 
     def _counts(self) -> dict[str, Any]:
         figures = self.metrics.figures()

@@ -114,7 +114,8 @@ def _sqlite(path: Path, types: Collection[str], contents: BagContents) -> Iterat
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE +topic_id IN ({marks})"
             for number, stamp, data in file.execute(query, wanted):
                 if isinstance(stamp, int) and isinstance(data, bytes):
-                    yield topics[number], stamp, _unpacked(data)
+                    compressed = data.startswith(ZSTD)
+                    yield topics[number], stamp, zstandard.decompress(data, MOST_BYTES) if compressed else data
                     count += 1
         except (sqlite3.DatabaseError, zstandard.ZstdError) as error:
             contents.damage.append(f"damaged after {count} messages ({error}); the rest is lost")
@@ -127,10 +128,6 @@ def _definitions(file: sqlite3.Connection) -> dict[str, tuple[str, bool]]:
         return {str(name): (str(text), "idl" in str(encoding)) for name, text, encoding in rows}
     except sqlite3.DatabaseError:
         return {}
-
-
-def _unpacked(data: bytes) -> bytes:
-    return zstandard.decompress(data, MOST_BYTES) if data.startswith(ZSTD) else data
 
 
 # --- MCAP ---

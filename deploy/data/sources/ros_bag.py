@@ -113,11 +113,8 @@ def read(path: Path) -> list[Table]:
 
 def files_of(path: Path) -> list[Path]:
     """Return the files of a bag; of a folder those whose names end as those of a bag."""
-    return (
-        [path]
-        if path.is_file()
-        else sorted((file for file in path.iterdir() if file.name.endswith(ENDINGS)), key=natural_order)
-    )
+    files = [path] if path.is_file() else [file for file in path.iterdir() if file.name.endswith(ENDINGS)]
+    return sorted(files, key=natural_order)
 
 
 def _add_messages(file: Path, messages: MessageTables, contents: BagContents) -> None:
@@ -130,7 +127,8 @@ def _add_messages(file: Path, messages: MessageTables, contents: BagContents) ->
         if (store := types[topic]) is None:
             continue
         try:
-            message = _decoded(store, topic, raw)
+            decode = store.deserialize_ros1 if topic.encoding == ROS1 else store.deserialize_cdr
+            message: Any = decode(raw, topic.type)
         except MemoryError:
             raise
         except Exception as error:  # generated code raises many types on damaged messages
@@ -145,10 +143,6 @@ def _add_messages(file: Path, messages: MessageTables, contents: BagContents) ->
             messages.add(topic.name + frames, kind, fields, _stamp(part) or received, received)
     if unreadable:
         contents.damage.append(f"{unreadable.total()} messages are left out: {next(iter(unreadable))}")
-
-
-def _decoded(types: Typestore, topic: BagTopic, raw: bytes) -> Any:
-    return types.deserialize_ros1(raw, topic.type) if topic.encoding == ROS1 else types.deserialize_cdr(raw, topic.type)
 
 
 def _types_or_none(topic: BagTopic, contents: BagContents) -> Typestore | None:
