@@ -24,13 +24,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from brakeline.compilation import compiled
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.error_bounds import envelopes, least_squares, whitening
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features
 from brakeline.safety.model.one_step_fitting import Samples
-
-Array = NDArray[np.float64]
 
 DIRECTIONS = 300  # recorded φ in whose directions the consistent models are bounded to find the samples that matter
 AT_ONCE = 64  # features whose sums over all samples are in memory at once

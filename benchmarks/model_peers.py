@@ -27,7 +27,6 @@ from time import process_time
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.consistent_models import ConsistentModels, LeastSquaresZonotope, Models, ModelTubes, Noise
 from benchmarks.timing import Words
@@ -37,7 +36,7 @@ from brakeline.deploy.data.importer import import_sources
 from brakeline.deploy.data.rival_pretraining import BarrierConfig
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.logs.proportion_intervals import clopper_pearson
-from brakeline.messaging.robot import Robot, robot_named
+from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.stated_share import CONFIDENCE
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
@@ -54,7 +53,6 @@ from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
 from brakeline.sim.sim_conditions import Conditions
 
-Array = NDArray[np.float64]
 Tubes = Callable[[Array], tuple[Array, Array]]  # windows with all inputs (T, r + m + N·m) -> centres, half-widths
 
 OWN_LOG = Path(__file__).parents[1] / "examples" / "own_log"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle_messages import obstacle_messages
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.plan_batch import BatchOutcome
@@ -20,7 +21,6 @@ from brakeline.safety.service.wire import KIND_NUMBERS
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.sim_conditions import Conditions
 
-Array = NDArray[np.float64]
 NextEpisode = Callable[[int], tuple[int, int]]  # number and seed of the next episode of robot i
 
 

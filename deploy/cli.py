@@ -1,4 +1,4 @@
-"""Implement `brakeline COMMAND ...`. GROUPS is THE table of commands, each with an example.
+"""Implement `brakeline COMMAND ...`. TABLE is THE table of commands, each with an example.
 
 Each command is a module `deploy/commands/NAME_command.py` with a dataclass `NameCommand`: its fields are the options,
 and its method `run` returns the exit status. The module is imported when the command runs, so that `--help` answers at
@@ -36,120 +36,104 @@ class CommandEntry(NamedTuple):
     example: str
 
 
-GROUPS: dict[str, dict[str, CommandEntry]] = {
+# For each command what it does, and the arguments of an example.
+TABLE: dict[str, dict[str, tuple[str, str]]] = {
     "See it and train": {
-        "demo": CommandEntry(
-            "Drive a policy without and with the filter, then train one for some minutes.", "brakeline demo"
-        ),
-        "train": CommandEntry(
+        "demo": ("Drive a policy without and with the filter, then train one for some minutes.", ""),
+        "train": (
             "Run all processes of a training on this machine: actors, safety service, learner, recorder.",
-            "brakeline train ground --steps 90000 --actors 2 --seed 0",
+            "ground --steps 90000 --actors 2 --seed 0",
         ),
-        "evaluate": CommandEntry(
+        "evaluate": (
             "Evaluate a policy behind the filter on fresh episodes.",
-            "brakeline evaluate ground --policy astar --episodes 100 --json",
+            "ground --policy astar --episodes 100 --json",
         ),
-        "compare": CommandEntry(
+        "compare": (
             "Train and evaluate each method from the same seeds; write tables and figures. Continues from results/.",
-            "brakeline compare ground --quick",
+            "ground --quick",
         ),
-        "campaign": CommandEntry(
+        "campaign": (
             "Drive many episodes of many kinds behind the filter, and search for the worst case. You can resume it.",
-            "brakeline campaign ground --episodes 10000 --search 1000",
+            "ground --episodes 10000 --search 1000",
         ),
-        "pretrain": CommandEntry(
-            "Drive a robot, and fit the networks of a rival method to the data.", "brakeline pretrain secas ground"
-        ),
+        "pretrain": ("Drive a robot, and fit the networks of a rival method to the data.", "secas ground"),
     },
     "Your own robot": {
-        "robot": CommandEntry(
-            "Write, check or show the description of a robot (a .toml file).", "brakeline robot new my.toml"
-        ),
-        "import": CommandEntry(
+        "robot": ("Write, check or show the description of a robot (a .toml file).", "new my.toml"),
+        "import": (
             "Make a data set from a log of any robot: CSV, Parquet, ROS bags, ArduPilot, PX4 or Brakeline runs.",
-            "brakeline import drive.csv --robot my.toml --picture driven.png",
+            "drive.csv --robot my.toml --picture driven.png",
         ),
-        "collect": CommandEntry(
-            "Record the data set from which the filter learns how a robot moves.",
-            "brakeline collect ground --seed 1",
-        ),
-        "excite": CommandEntry(
+        "collect": ("Record the data set from which the filter learns how a robot moves.", "ground --seed 1"),
+        "excite": (
             "Print the inputs that excite a robot best within a region, or drive them in its simulator.",
-            "brakeline excite my.toml --keep -2 -2 2 2 --minutes 10",
+            "my.toml --keep -2 -2 2 2 --minutes 10",
         ),
-        "certify": CommandEntry(
-            "Fit model sets to recorded data, validate them, and put them to use or publish them.",
-            "brakeline certify ground",
-        ),
+        "certify": ("Fit model sets to recorded data, validate them, and put them to use or publish them.", "ground"),
     },
     "Ask the filter, fly and drive": {
-        "query": CommandEntry(
+        "query": (
             "Ask a running safety service for a decision about a state and an action.",
-            "brakeline query ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
+            "ground --action 0.25 0 --obstacle 'cylinder 0.3 0 0.1'",
         ),
-        "fly": CommandEntry(
+        "fly": (
             "Fly a quadrotor in real time over MAVLink, with autopilot, safety service, actor and recorder.",
-            "brakeline fly --minutes 10 --policy astar",
+            "--minutes 10 --policy astar",
         ),
-        "ros2": CommandEntry(
+        "ros2": (
             "Filter the commands of a ROS 2 robot: cmd_vel_raw in, cmd_vel out. You need no ROS installation.",
-            "brakeline ros2 ground --router tcp/localhost:7447",
+            "ground --router tcp/localhost:7447",
         ),
-        "autopilot": CommandEntry(
+        "autopilot": (
             "Simulate quadrotors behind MAVLink in real time, with the rules of PX4 or ArduPilot.",
-            "brakeline autopilot --rules px4 --url udpout:127.0.0.1:14540 --arena default",
+            "--rules px4 --url udpout:127.0.0.1:14540 --arena default",
         ),
-        "bridge-sim": CommandEntry(
+        "bridge-sim": (
             "Simulate a ground robot as a ROS 2 robot: odom, scan, tf, clock and cmd_vel.",
-            "brakeline bridge-sim --arena dense --seed 3",
+            "--arena dense --seed 3",
         ),
     },
     "Look at runs": {
-        "watch": CommandEntry("Watch a running system on a web page and in Foxglove.", "brakeline watch --port 8787"),
-        "status": CommandEntry("Show the running processes and their figures.", "brakeline status"),
-        "analyse": CommandEntry(
+        "watch": ("Watch a running system on a web page and in Foxglove.", "--port 8787"),
+        "status": ("Show the running processes and their figures.", ""),
+        "analyse": (
             "Compute the figures of one or many logs, also of incomplete ones, and write a report page.",
-            "brakeline analyse runs/latest --html report.html",
+            "runs/latest --html report.html",
         ),
-        "replay": CommandEntry(
+        "replay": (
             "Decide each logged request again, with the same model set or another, and compare the decisions.",
-            "brakeline replay runs/latest --certificate set-membership",
+            "runs/latest --certificate set-membership",
         ),
-        "export": CommandEntry(
+        "export": (
             "Export a log as CSV, Minari data set, .tlog, or MCAP with a picture of each step for Foxglove.",
-            "brakeline export runs/latest --csv steps.csv",
+            "runs/latest --csv steps.csv",
         ),
-        "recover": CommandEntry("Repair damaged logs.", "brakeline recover runs/latest"),
+        "recover": ("Repair damaged logs.", "runs/latest"),
     },
     "Processes on several machines": {
-        "keys": CommandEntry(
+        "keys": (
             "Make keys for processes on several machines, for signers of model sets, and for plan tokens.",
-            "brakeline keys keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
+            "keys safety learner recorder actor-0 actor-1 --host 10.0.0.1",
         ),
-        "router": CommandEntry(
+        "router": (
             "Run a router at which the processes of several machines meet. Linked routers form one bus.",
-            "brakeline router --listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
+            "--listen tls/0.0.0.0:7447 --connect tls/10.0.0.2:7447 --keys keys",
         ),
-        "safety": CommandEntry(
-            "Run a safety service alone.", "brakeline safety ground --listen tls/0.0.0.0:7447 --keys keys"
-        ),
-        "actor": CommandEntry(
+        "safety": ("Run a safety service alone.", "ground --listen tls/0.0.0.0:7447 --keys keys"),
+        "actor": (
             "Run one actor process alone, with one or several robots.",
-            "brakeline actor ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
+            "ground --connect tls/10.0.0.1:7447 --keys keys --name actor-7 --number 7",
         ),
-        "learner": CommandEntry(
-            "Run a learner alone.", "brakeline learner ground --connect tls/10.0.0.1:7447 --keys keys"
-        ),
-        "recorder": CommandEntry(
-            "Run a recorder alone.", "brakeline recorder runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"
-        ),
+        "learner": ("Run a learner alone.", "ground --connect tls/10.0.0.1:7447 --keys keys"),
+        "recorder": ("Run a recorder alone.", "runs/a/run.mcap --connect tls/10.0.0.1:7447 --keys keys"),
     },
     "The command line": {
-        "completion": CommandEntry(
-            "Print the script with which a shell completes commands and options at the Tab key.",
-            "brakeline completion bash",
-        ),
+        "completion": ("Print the script with which a shell completes commands and options at the Tab key.", "bash"),
     },
+}
+GROUPS: dict[str, dict[str, CommandEntry]] = {
+    title: {name: CommandEntry(what, f"brakeline {name} {words}".rstrip()) for name, (what, words) in group.items()}
+    for title, group in TABLE.items()
 }
 COMMANDS: dict[str, CommandEntry] = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 

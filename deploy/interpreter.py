@@ -13,6 +13,8 @@ import sys
 from multiprocessing.context import SpawnContext
 
 PYTHON = (sys.executable, "-P")
+# The environment of a process beside others: two processes with two threads each are slower on two cores.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 PR_SET_PDEATHSIG = 1  # of prctl: the signal that a process gets when its parent dies
 
 
@@ -31,3 +33,9 @@ def end_with_parent(parent: int, by: signal.Signals = signal.SIGTERM) -> bool:
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, by)
     return os.getppid() == parent
+
+
+def end_with_spawner(by: signal.Signals = signal.SIGTERM) -> bool:
+    """Let a signal end this process of `spawning` with its parent; see `end_with_parent`."""
+    parent = multiprocessing.parent_process()
+    return parent is not None and parent.pid is not None and end_with_parent(parent.pid, by)

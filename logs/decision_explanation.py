@@ -6,13 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import UNSTATED, describe_verification, percent, valid_bound
-
-Array = NDArray[np.float64]
 
 EXACT = 1e-4  # of an input's range: two inputs that differ by less are the same
 LEAST = 0.02  # of an input's range: smaller changes are not described

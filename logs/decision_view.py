@@ -6,16 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.logs.decision_explanation import Explanation, explain
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.perception.displayed_map import OUTLINE, DisplayedMap, map_for_display
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

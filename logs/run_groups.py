@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.logs.episode_stats import Figures
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array
 
 METHOD_COLORS = {  # a palette for colour-blind readers
     **{"ddpc": "#0072b2", "sailr": "#e69f00", "secas": "#009e73", "none": "#d55e00"},

@@ -10,16 +10,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.logs.decision_explanation import bound_in
 from brakeline.logs.decision_view import tube_boxes
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import Array
 from brakeline.messaging.stated_share import UNSTATED, percent
-
-Array = NDArray[np.float64]
 
 SAME = 1e-6  # input units: rounding between a plan and its tail in the next request
 SMALLEST, MOST = 1e-9, 1e9  # m; a ratio that is not finite counts as MOST

@@ -62,14 +62,20 @@ class AutopilotCommand:
 
     def run(self) -> int:
         """Fly until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
-        result = self._fly_simulated() if self.px4 is None else self._fly_px4(self.px4)
+        wind = Wind(self.wind, gust=self.gust)
+        result: ServerStats | px4_simulation.FlightResult
+        if self.px4 is None:
+            settings = settings_from(autopilot_run.AutopilotSettings, self, wind=wind)
+            result = autopilot_run.fly(settings, self._print_start)
+        else:
+            result = self._fly_px4(self.px4, wind)
         if self.json:
             print_json(asdict(result))
         else:
             errors.print(str(result))
         return 0
 
-    def _fly_px4(self, folder: Path) -> px4_simulation.FlightResult:
+    def _fly_px4(self, folder: Path, wind: Wind) -> px4_simulation.FlightResult:
         if self.vehicles != 1 or self.airborne or self.rules != "px4":
             raise ValueError(
                 "a real PX4 flies one vehicle, by its own rules, and starts on the ground: leave out the option"
@@ -80,15 +86,10 @@ class AutopilotCommand:
             self,
             folder=folder,
             noise=SensorNoise(scale=self.sensors, gps_position=self.gps),
-            wind=Wind(self.wind, gust=self.gust),
+            wind=wind,
             parameters=timeout | self.parameters,
         )
         return px4_simulation.fly(settings, self._print_px4_start)
-
-    def _fly_simulated(self) -> ServerStats:
-        wind = Wind(self.wind, gust=self.gust)
-        settings = settings_from(autopilot_run.AutopilotSettings, self, wind=wind)
-        return autopilot_run.fly(settings, self._print_start)
 
     def _print_start(self, arena: Arena) -> None:
         if not self.json:

@@ -32,16 +32,26 @@ class ExportCommand:
 
     def run(self) -> int:
         """Write the files. Returns the exit status."""
-        writers = {"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}
-        formats = [name for name in writers if getattr(self, name) is not None]
-        if not formats:
-            raise ValueError(
-                f"no format to export to: give one or more of {', '.join(f'--{name}' for name in writers)}"
-            )
+        from brakeline.logs.log_export import to_foxglove, to_tlog
+
         figures: dict[str, Any] = {}
-        for name in formats:
-            with under_way(f"writing {getattr(self, name)}"):
-                figures[name] = writers[name]()
+        if self.csv is not None:
+            with under_way(f"writing {self.csv}"):
+                figures["csv"] = self._csv(self.csv)
+        if self.minari is not None:
+            from brakeline.logs.minari_export import to_minari
+
+            with under_way(f"writing {self.minari}"):
+                figures["minari"] = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
+        if self.foxglove is not None:
+            with under_way(f"writing {self.foxglove}"):
+                written = to_foxglove(list(self.logs), self.foxglove)
+                figures["foxglove"] = {"path": str(self.foxglove), "messages": written}
+        if self.tlog is not None:
+            with under_way(f"writing {self.tlog}"), self.tlog.open("wb") as file:
+                figures["tlog"] = {"path": str(self.tlog), "frames": to_tlog(list(self.logs), file)}
+        if not figures:
+            raise ValueError("no format to export to: give one or more of --csv, --minari, --foxglove, --tlog")
         counts = {
             written["path"]: ", ".join(f"{count} {unit}" for unit, count in written.items() if unit != "path")
             for written in figures.values()
@@ -49,36 +59,16 @@ class ExportCommand:
         print_result(self.json, figures, *(f"{path}: {text}" for path, text in counts.items()))
         return 0
 
-    def _csv(self) -> dict[str, Any]:
+    def _csv(self, path: Path) -> dict[str, Any]:
         from brakeline.errors import ExportError
         from brakeline.logs.log_export import to_csv
 
-        assert self.csv is not None
         robot = robot_with_task(self.robot)
-        self.csv.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with self.csv.open("w", newline="") as file:
-                return {"path": str(self.csv), "steps": to_csv(list(self.logs), robot, file)}
+            with path.open("w", newline="") as file:
+                return {"path": str(path), "steps": to_csv(list(self.logs), robot, file)}
         except ExportError:
-            if self.csv.is_file():  # it has a header alone; a pipe has no file to delete
-                self.csv.unlink()
+            if path.is_file():  # it has a header alone; a pipe has no file to delete
+                path.unlink()
             raise
-
-    def _minari(self) -> dict[str, Any]:
-        from brakeline.logs.minari_export import to_minari
-
-        assert self.minari is not None
-        return to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
-
-    def _tlog(self) -> dict[str, Any]:
-        from brakeline.logs.log_export import to_tlog
-
-        assert self.tlog is not None
-        with self.tlog.open("wb") as file:
-            return {"path": str(self.tlog), "frames": to_tlog(list(self.logs), file)}
-
-    def _foxglove(self) -> dict[str, Any]:
-        from brakeline.logs.log_export import to_foxglove
-
-        assert self.foxglove is not None
-        return {"path": str(self.foxglove), "messages": to_foxglove(list(self.logs), self.foxglove)}

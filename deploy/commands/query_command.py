@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.markup import escape
 from rich.text import Text
 
@@ -18,15 +17,13 @@ from brakeline.logs.stacking_table import StackingTable, plain_table
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import KINDS, Obstacle
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot import Array, robot_named
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import describe_verification
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.filter_client import Answer
-
-Array = NDArray[np.float64]
 
 # Attributes of an answer that --json prints.
 SHOWN = (

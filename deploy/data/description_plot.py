@@ -6,11 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import FEEDBACK, HOLD, RAMP, Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import FEEDBACK, HOLD, RAMP, Array, Robot
 
 
 def full_stop_inputs(robot: Robot) -> Array:

@@ -14,19 +14,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.deploy.data.excitation import MOST_HELD, excitation
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.progress import under_way
 from brakeline.errors import BadData
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
 from brakeline.safety.model.dataset import Dataset, Trajectory, bends
 from brakeline.safety.model.windows import displacement
-
-Array = NDArray[np.float64]
 
 FEWEST = 3  # periods; shorter trajectories are dropped
 LONGEST = 300  # periods per trajectory; then the environment is reset

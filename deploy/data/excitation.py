@@ -10,11 +10,8 @@ import math
 from collections.abc import Generator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 MOST_LEAD = 4  # largest number of random targets before a plan
 MOST_HELD = 3  # periods for which a target is held, in addition to the periods until the robot reaches it

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.deploy.data.certification import certify_supported
@@ -21,13 +20,11 @@ from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.excitation import limit_slew, random_target
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.errors import BadData, FlightEnded, Unsupported
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.validation import ValidationReport
 from brakeline.safety.model.windows import FREE, windows
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger("brakeline.collect")
 

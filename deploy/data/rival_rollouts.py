@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.rival_networks import FitConfig
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.braking import brake
 from brakeline.safety.rivals.sailr import normalised_input
 from brakeline.safety.rivals.secas import Constraints
 from brakeline.sim.scripted_policies import Policy, scripted
 
-Array = NDArray[np.float64]
 Each = Callable[[], object]
 
 SEED_OFFSET = 5_000_000  # added to the seed, so that training and evaluation use other episodes

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brakeline.logs.proportion_intervals import clopper_pearson
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array
 
 RESAMPLES = 4000
 CONFIDENCE = 0.95

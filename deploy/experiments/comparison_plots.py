@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import NAMES, WINDOW, spans
 from brakeline.logs.run_groups import METHOD_COLORS, performance_profile
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array
 
 POINTS = 200  # per curve
 

@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.trials import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
+from brakeline.messaging.robot import Array
 from brakeline.safety.model.model_config import DDPC
 
 Result = dict[str, Any]
 Row = dict[str, Any]
-Array = NDArray[np.float64]
 
 NAMES = {name: method.label for name, method in METHODS.items()}
 PAPER = Path(__file__).with_name("paper.json")

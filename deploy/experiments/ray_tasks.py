@@ -18,6 +18,7 @@ from typing import Any
 
 from brakeline.deploy.data.data_paths import data_root
 from brakeline.deploy.experiments.task_engine import LONGEST_LINE, Say, StudyTask, T, folder_of
+from brakeline.deploy.interpreter import ONE_THREAD
 from brakeline.errors import NoCluster
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import REAL_TIME_SUFFIX, TASK_SEPARATOR
@@ -36,7 +37,10 @@ def run_on_ray(tasks: Sequence[T], address: str, runs: Path, say: Say) -> Iterat
     failure: BaseException | None = None
     with _connected(address) as ray:
         supplies = {name: ray.put(supplies_of(name)) for name in {task.robot for task in tasks}}
-        said = ray.remote(num_cpus=0)(_Said).options(scheduling_strategy=_this_node(ray)).remote()
+        here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+            ray.get_runtime_context().get_node_id(), soft=True
+        )
+        said = ray.remote(num_cpus=0)(_Said).options(scheduling_strategy=here).remote()
         run = ray.remote(num_cpus=1, max_calls=1, max_retries=RETRIES)(_run_remotely)  # a process for each task
         under_way = {run.remote(task, supplies[task.robot], said): task for task in tasks}
         while under_way:
@@ -96,8 +100,7 @@ def _connected(address: str) -> Iterator[Any]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import ray
 
-    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    options: dict[str, Any] = {"runtime_env": {"env_vars": one_thread}, "log_to_driver": False}
+    options: dict[str, Any] = {"runtime_env": {"env_vars": ONE_THREAD}, "log_to_driver": False}
     if address == LOCAL:
         options["include_dashboard"] = False
     try:
@@ -111,12 +114,6 @@ def _connected(address: str) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
-
-
-def _this_node(ray: Any) -> Any:
-    """Return the strategy that places an actor on the node of this process, if it can."""
-    node = ray.get_runtime_context().get_node_id()
-    return ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=True)
 
 
 class _Said:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
@@ -23,11 +22,11 @@ from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
+from brakeline.messaging.robot import Array
 from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_config import DDPC
 
-Array = NDArray[np.float64]
 Result = dict[str, Any]
 SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend")  # in all cells of a robot
 CELL = re.compile(r"-s\d+\.json$")

@@ -6,7 +6,6 @@ Keep the imports of this module light: a worker imports what its task needs.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 import tyro
 
-from brakeline.deploy.interpreter import end_with_parent, spawning
+from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
 from brakeline.messaging.structured_text import parse_json
 
 LONGEST_LINE = 500  # characters per progress message
@@ -119,16 +118,11 @@ _to_parent: list[Connection] = []  # in a worker: the pipe on which it reports i
 
 
 def _start_worker(progress: Connection) -> None:
-    """Start a worker that ends with its parent, however the parent ends.
-
-    NumPy gets one thread: two processes with two threads each are slower on two cores.
-    """
+    """Start a worker that ends with its parent, however the parent ends."""
     _to_parent.append(progress)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
+    os.environ |= ONE_THREAD
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends workers too, without a traceback
-    parent = multiprocessing.parent_process()
-    if parent is None or parent.pid is None or not end_with_parent(parent.pid, signal.SIGKILL):
+    if not end_with_spawner(signal.SIGKILL):
         os._exit(1)
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.campaign_episodes import ROWS, CampaignDriver, Row
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
@@ -21,13 +20,11 @@ from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoArena
 from brakeline.messaging.obstacle import WALL, Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.scripted_policies import Policy
-
-Array = NDArray[np.float64]
 
 MOVED = 6  # obstacles that a candidate moves
 PIECES = 10  # of the proposed inputs

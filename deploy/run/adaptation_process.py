@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import os
 import sys
 import threading
@@ -13,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from brakeline.deploy.interpreter import end_with_parent, spawning
+from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
 from brakeline.deploy.run.adaptation import Adaptation, Recertification
 from brakeline.deploy.run.processes import CERTIFIER
 from brakeline.errors import BadModel, BrakelineError
@@ -137,8 +136,7 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
     bus = settings.bus
     here = tuple(endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in bus.listen)
     client = replace(bus, connect=bus.connect or here, listen=(), metrics="", patience=START_ALLOWANCE)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"  # of the certifier; NumPy of this process has its threads already
+    os.environ |= ONE_THREAD  # of the certifier; NumPy of this process has its threads already
     process = spawning().Process(target=_start_beside, args=(replace(settings, bus=client),), daemon=True)
     process.start()
     try:
@@ -150,8 +148,7 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
 
 
 def _start_beside(settings: CertifierSettings) -> None:
-    parent = multiprocessing.parent_process()
-    if parent is None or parent.pid is None or not end_with_parent(parent.pid):
+    if not end_with_spawner():
         return
     os.nice(10)
     try:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.episode_runner import EPISODE_STRIDE, ActorIdentity
 from brakeline.deploy.batch_robots import BatchRobots
@@ -18,12 +17,12 @@ from brakeline.errors import LaunchError
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.sim.scripted_policies import RandomPolicy
 from brakeline.sim.sim_conditions import Conditions
 
-Array = NDArray[np.float64]
 Sink = Callable[[int, pb.Step | pb.Episode], None]  # takes what robot i publishes
 
 ALL_DUE = 1 << 30  # updates

@@ -18,7 +18,6 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrow, FancyBboxPatch, Patch, Polygon, Rectangle
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import EpisodeRunner
@@ -28,11 +27,9 @@ from brakeline.logs.episode_stats import KINDS as DECISIONS
 from brakeline.logs.viewer.palette import hex_color
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.perception.displayed_map import DisplayedMap
 from brakeline.sim.scripted_policies import Policy
-
-Array = NDArray[np.float64]
 
 KINDS = {pb.UNKNOWN: "no filter", **DECISIONS}
 COLOURS = {kind: hex_color(kind) for kind in ("allowed", "adjusted", "failsafe", "recovering")}

@@ -12,8 +12,8 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
@@ -38,8 +38,6 @@ from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import RealtimeGroundRobot, SpinningLidar
 from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, changes_of
 from brakeline.sim.sim_conditions import Conditions
-
-Array = NDArray[np.float64]
 
 ODOM, BASE, LASER = "odom", "base_footprint", "base_scan"
 LARGEST_LAG = 0.2  # s behind real time, beyond which the simulation gives up catching up

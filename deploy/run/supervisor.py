@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from brakeline.deploy.interpreter import PYTHON
+from brakeline.deploy.interpreter import ONE_THREAD, PYTHON
 from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
 from brakeline.errors import LaunchError
 
@@ -40,8 +40,8 @@ class SupervisedProcess:
         """Start the process. Its output goes to logs/NAME.log in the run's folder."""
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
-        environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-        environment["MUJOCO_GL"] = "disable"  # MuJoCo draws nothing; looking for a display would start another process
+        # MuJoCo draws nothing; looking for a display would start another process.
+        environment = os.environ | ONE_THREAD | {"MUJOCO_GL": "disable"}
         with (logs / f"{self.spec.name}.log").open("ab") as errors:
             self.popen = subprocess.Popen(
                 [*PYTHON, "-m", "brakeline.deploy.run.run_process", str(self.folder), self.spec.name],
