@@ -47,6 +47,11 @@ class WorkProgress:
         self._done = done
 
 
+def say(name: str, text: str) -> None:
+    """Print the progress of a part of a study."""
+    console.print(f"[dim]{name}:[/] {text}")
+
+
 @contextmanager
 def silenced() -> Iterator[None]:
     """Show no progress within the block."""

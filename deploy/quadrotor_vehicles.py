@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,9 @@ from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.hil_sensors import SensorNoise
-from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import QUADROTOR, Quadrotor
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import MakeVehicle
-from brakeline.sim.wind import Wind
 
 
 def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
@@ -29,13 +26,15 @@ def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle
 
     tap: is called with each MAVLink frame. Raises ValueError as `changes_of`.
     """
-    return partial(
-        embedded_quadrotor,
-        noise=conditions.flight_noise,
-        wind=conditions.wind,
-        tap=tap,
-        changes=changes_of(conditions),
-    )
+    noise, wind, changes = conditions.flight_noise, conditions.wind, changes_of(conditions)
+    # The autopilot brakes when a setpoint is late by one control period.
+    parameters = {SETPOINT_TIMEOUT["px4"]: QUADROTOR.period}
+
+    def make(arena: Arena, rng: np.random.Generator) -> LockstepQuadrotor:
+        vehicle = Quadrotor(arena, rng, noise, wind, changes=changes)
+        return LockstepQuadrotor(Autopilot(vehicle, "px4", parameters=parameters, quiet=True), QUADROTOR, tap)
+
+    return make
 
 
 def changes_of(conditions: Conditions) -> dict[str, float]:
@@ -47,31 +46,6 @@ def changes_of(conditions: Conditions) -> dict[str, float]:
     names = ("payload_kg", "weak_motor")
     conditions.check(*names, "wind")
     return {name: getattr(conditions, name) for name in names if name in conditions.unusual}
-
-
-def embedded_quadrotor(
-    arena: Arena,
-    rng: np.random.Generator,
-    noise: QuadrotorNoise | None = None,
-    wind: Wind | None = None,
-    rules: str = "px4",
-    *,
-    tap: FrameTap | None = None,
-    changes: dict[str, float] | None = None,
-) -> LockstepQuadrotor:
-    """Return a quadrotor behind a simulated autopilot, over MAVLink in memory.
-
-    The autopilot brakes when a setpoint is late by one control period.
-
-    Args:
-        rules: px4 or ardupilot.
-        tap: is called with each MAVLink frame.
-        changes: of the vehicle's physics, as `Quadrotor.alter` takes them.
-    """
-    parameters = {SETPOINT_TIMEOUT[rules]: QUADROTOR.period}
-    vehicle = Quadrotor(arena, rng, noise, wind, changes=changes)
-    autopilot = Autopilot(vehicle, rules, parameters=parameters, quiet=True)
-    return LockstepQuadrotor(autopilot, QUADROTOR, tap)
 
 
 def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:

@@ -289,11 +289,8 @@ def _vector(x: float, y: float, z: float) -> Vector3:
 
 
 def _pose(position: Iterable[float], yaw: float = 0.0) -> Pose:
-    return Pose(position=_vector(*[*position, 0.0, 0.0, 0.0][:3]), orientation=_turn(yaw))
-
-
-def _turn(yaw: float) -> Quaternion:
-    return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+    turn = Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+    return Pose(position=_vector(*[*position, 0.0, 0.0, 0.0][:3]), orientation=turn)
 
 
 def _text(words: str, at: Iterable[float], color: Color, above: float = 0.0) -> TextPrimitive:

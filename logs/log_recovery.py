@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 
@@ -96,8 +97,11 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> No
     writer: Any = mcap.writer.Writer(sink, chunk_size=CHUNK)
     numbers: dict[LogChannel, int] = {}
     schemas: dict[tuple[str, bytes], int] = {}
-    writer.start(profile=_profile(source, size), library="brakeline recover")
-    for item in records(source, size, _channel):
+    items = records(source, size)
+    first = next(items, None)
+    # The profile, such as `ros2`, says whose messages the file holds.
+    writer.start(profile=first.profile if isinstance(first, Header) else "", library="brakeline recover")
+    for item in chain(() if first is None else (first,), items):
         if type(item) is tuple:
             series, log_time, publish_time, payload = item
             if series not in numbers:
@@ -113,17 +117,6 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> No
         elif isinstance(item, Attachment):
             writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.data)
     writer.finish()
-
-
-def _channel(key: str, schema: str) -> LogChannel:
-    return LogChannel(key, key, None)
-
-
-def _profile(source: IO[bytes], size: int) -> str:
-    """Return the profile in the file's header, such as `ros2`: it says whose messages the file holds."""
-    first = next(records(source, size, _channel), None)
-    source.seek(0)
-    return first.profile if isinstance(first, Header) else ""
 
 
 def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:

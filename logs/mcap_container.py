@@ -139,7 +139,12 @@ class _Tables:
                 self.series[channel.id] = series
 
 
-def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel]) -> Iterator[Item]:
+def raw_channel(key: str, schema: str) -> LogChannel:
+    """Return a channel whose messages are not decoded."""
+    return LogChannel(key, key, None)
+
+
+def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel] = raw_channel) -> Iterator[Item]:
     """Yield the header, messages, metadata, attachments and damage of a file, in order.
 
     Args:
@@ -283,14 +288,14 @@ def is_ros(path: Path) -> bool:
     """Return True for an MCAP file of ROS messages: by its profile, or by the first message that decides."""
     with path.open("rb") as file:
         try:
-            for item in records(file, path.stat().st_size, lambda key, schema: LogChannel(key, schema, None)):
+            for item in records(file, path.stat().st_size):
                 if isinstance(item, Header) and item.profile in ROS_PROFILES:
                     return True
                 if type(item) is tuple:
-                    channel = item[0].channel
+                    channel, schema = item[0].channel, item[0].schema
                     if channel is not None and channel.message_encoding in ROS_ENCODINGS:
                         return True
-                    if item[0].key.startswith(OWN_SCHEMAS):
+                    if schema is not None and schema.name.startswith(OWN_SCHEMAS):
                         return False
         except NotMcap:
             return False

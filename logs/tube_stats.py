@@ -134,20 +134,13 @@ def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
 def figures(parts: Iterable[TubeStats]) -> Figures:
     """Return the figures of all actors."""
     every = list(parts)
-    parts = [part for part in every if part.flown]
-    stated = [part.bound for part in parts]
+    stated = [part.bound for part in every if part.flown]
     known = [bound for bound in stated if bound is not None]
-    return {
-        "flown": sum(part.flown for part in parts),
-        "outside": sum(part.outside for part in parts),
-        "excess": max((part.excess for part in parts), default=0.0),
+    counts = ("flown", "outside", "scored", "beyond", "beyond_widened", "slowed", "slow_downs")
+    return {name: sum(getattr(part, name) for part in every) for name in counts} | {
+        "excess": max((part.excess for part in every), default=0.0),
         "bound": max(known) if known and len(known) == len(stated) else None,
-        "scored": sum(part.scored for part in every),
-        "beyond": sum(part.beyond for part in every),
-        "beyond_widened": sum(part.beyond_widened for part in every),
         "widening": max((part.widening for part in every), default=1.0),
-        "slowed": sum(part.slowed for part in every),
-        "slow_downs": sum(part.slow_downs for part in every),
     }
 
 

@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from brakeline.deploy import progress
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.experiments.task_engine import Engine
+from brakeline.deploy.progress import say
 from brakeline.logs.stacking_table import plain_table
 
 COLLIDED = 3  # exit status
@@ -80,10 +80,10 @@ class CampaignCommand:
         for cell in cells:  # a mistyped name ends the campaign before it begins; models are made once
             self._prepare(robot, cell)
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
-        results = complete(parts, self.runs, self.runs, self.engine, self.again, self._say)
+        results = complete(parts, self.runs, self.runs, self.engine, self.again, say)
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
         searches = [CampaignSearch(cell, self.search) for cell in searched.values()]
-        found = complete(searches, self.runs, self.runs, self.engine, self.again, self._say)
+        found = complete(searches, self.runs, self.runs, self.engine, self.again, say)
         driven = cells_of(parts, results)
         table = {"robot": robot.name, "cells": driven, "searches": found}
         self.results.mkdir(parents=True, exist_ok=True)
@@ -117,6 +117,3 @@ class CampaignCommand:
         what = cell.evaluation()
         if what.method != "none":
             method_for(robot, what.method, what.model_config, what.accept_bound)
-
-    def _say(self, name: str, text: str) -> None:
-        progress.console.print(f"[dim]{name}:[/] {text}")

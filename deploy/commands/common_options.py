@@ -79,18 +79,11 @@ Pictures = Annotated[
         "of intervention. 0 draws none at all."
     ),
 ]
-Verbose = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(aliases=("-v",), help="Print all figures and conditions."),
-]
-Quiet = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(aliases=("-q",), help="Show no progress."),
-]
-Watch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Open a live page in a browser.")]
-Json = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help="Print one JSON object on stdout.")]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Verbose = Annotated[Flag, tyro.conf.arg(aliases=("-v",), help="Print all figures and conditions.")]
+Quiet = Annotated[Flag, tyro.conf.arg(aliases=("-q",), help="Show no progress.")]
+Watch = Annotated[Flag, tyro.conf.arg(help="Open a live page in a browser.")]
+Json = Annotated[Flag, tyro.conf.arg(help="Print one JSON object on stdout.")]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.markdown import Markdown
 
-from brakeline.deploy import progress
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
@@ -26,6 +25,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 )
 from brakeline.deploy.experiments.experiment_jobs import Job, complete
 from brakeline.deploy.experiments.task_engine import Engine
+from brakeline.deploy.progress import say
 from brakeline.learner.learner_config import TD3Config
 
 QUICK = Path("runs/quick")
@@ -96,13 +96,13 @@ class CompareCommand:
                 continue
             if self.tune:
                 trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]
-                complete(trials, results, runs, self.engine, self.again, self._print_progress)
+                complete(trials, results, runs, self.engine, self.again, say)
                 continue
             jobs = self._jobs(robot)
             filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
             for method in sorted(filters):  # make the models that several trainings need, before all of them
                 method_for(robot_with_task(robot), method, ModelConfig())
-            finished = complete(jobs, results, runs, self.engine, self.again or self.quick, self._print_progress)
+            finished = complete(jobs, results, runs, self.engine, self.again or self.quick, say)
             cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
             tables[robot] = self._write(cells, others, results / robot)
@@ -136,9 +136,6 @@ class CompareCommand:
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))
         return jobs
-
-    def _print_progress(self, name: str, text: str) -> None:
-        progress.console.print(f"[dim]{name}:[/] {text}")
 
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
         """Write the tables and figures of a robot, and return its figures."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,17 +81,14 @@ class CampaignDriver:
             return self._drive_batch(first, episodes, each)
         rows = []
         for number in range(first, first + episodes):
-            table = EpisodeTable(ROWS)
-            for step in self.steps(number):
-                table.step(step)
-            rows.append(table.rows[0])
+            rows.append(self.row(number))
             each()
         return rows
 
-    def steps(self, number: int, log: TrialLog | None = None, policy: Policy | None = None) -> Iterator[pb.Step]:
-        """Yield the steps of an episode, which a log may record with all requests. policy: instead of the cell's."""
+    def row(self, number: int, log: TrialLog | None = None, policy: Policy | None = None) -> Row:
+        """Drive an episode, which a log may record with all requests. policy: instead of the cell's."""
         runner = EpisodeRunner(self.robot, self.env, ActorIdentity(ACTOR, 0, self.what.seed), filtered=bool(self.ask))
-        policy = policy or self.policy(number)
+        policy, table = policy or self.policy(number), EpisodeTable(ROWS)
         message = runner.begin(number)
         if log is not None:
             log.put(EPISODE, message)
@@ -99,7 +96,8 @@ class CampaignDriver:
             step = take_step(runner, policy, self.ask, requests=log)
             if log is not None:
                 log.put_step(step)
-            yield step
+            table.step(step)
+        return table.rows[0]
 
     def policy(self, number: int) -> Policy:
         """Return the policy of an episode. A scripted one draws from the episode's own seed."""
@@ -123,11 +121,8 @@ class CampaignDriver:
 
     def record(self, number: int, path: Path) -> Row:
         """Drive an episode again, write its log, and return its row."""
-        table = EpisodeTable(ROWS)
         with self.log(path, episode=str(number)) as log:
-            for step in self.steps(number, log):
-                table.step(step)
-        return table.rows[0]
+            return self.row(number, log)
 
     def _in_a_batch(self) -> bool:
         try:

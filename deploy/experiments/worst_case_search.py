@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.experiments.campaign_episodes import ROWS, CampaignDriver, Row
+from brakeline.deploy.experiments.campaign_episodes import CampaignDriver, Row
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
-from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog
+from brakeline.deploy.experiments.trials import TrialLog
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoArena
 from brakeline.messaging.obstacle import WALL, Obstacle
@@ -103,10 +103,7 @@ def search(
     def drive(candidate: SearchedEpisode, log: TrialLog | None = None) -> Row:
         base = draw_arena(what.arena, np.random.default_rng((what.seed, candidate.number)), robot)
         drawn[:] = [candidate.arena(base, robot)]
-        table = EpisodeTable(ROWS)
-        for step in driver.steps(candidate.number, log, candidate.policy(robot)):
-            table.step(step)
-        return table.rows[0]
+        return driver.row(candidate.number, log, candidate.policy(robot))
 
     found = _Found()
     size = MOVED * robot.position_dim + PIECES * robot.action_dim

@@ -43,10 +43,8 @@ def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[
     for name in config.robots:
         robot = robot_maybe_with_task(name)
         model = method_for(robot, config.method, config.model_config, config.accept_bound, build=simulated)
-        source, kept = (
-            method_path(robot, config.method, config.model_config),
-            archive_path(folder, robot.name, model.version),
-        )
+        source = method_path(robot, config.method, config.model_config)
+        kept = archive_path(folder, robot.name, model.version)
         kept.parent.mkdir(parents=True, exist_ok=True)
         for path in (source, seal_of(source)):
             if path.exists():

@@ -136,7 +136,7 @@ def _definitions(file: sqlite3.Connection) -> dict[str, tuple[str, bool]]:
 def _mcap(path: Path, types: Collection[str], contents: BagContents) -> Iterator[Stored]:
     topics: dict[LogChannel, BagTopic] = {}
     with path.open("rb") as file:
-        for item in records(file, path.stat().st_size, lambda key, schema: LogChannel(key, key, None)):
+        for item in records(file, path.stat().st_size):
             if isinstance(item, DamagedBytes):
                 contents.damage.append(str(item))
             elif type(item) is tuple:
