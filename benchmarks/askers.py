@@ -19,14 +19,12 @@ from collections import Counter
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks import situations
-from benchmarks.safety_processes import cells, keys_for, used, with_plan_tokens
+from benchmarks.safety_processes import cells, keys_for, piped, used, with_plan_tokens
 from benchmarks.timing import Figures
-from brakeline.deploy.interpreter import spawning
 from brakeline.errors import BusError, Late
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -89,23 +87,15 @@ def _row(
     clients: int, cell: tuple[list[str], list[int], list[int]], keys: Path, payloads: list[bytes]
 ) -> dict[str, float]:
     endpoints, services, routers = cell
-    spawn, number = spawning(), max(PROCESSES, len(endpoints))
-    pipes, started = [], list[Any]()
-    for i in range(number):
-        mine, theirs = spawn.Pipe(duplex=False)
-        settings = BusSettings(connect=(endpoints[i % len(endpoints)],), keys=keys)
-        started.append(spawn.Process(target=_ask, args=(settings, payloads, clients // number, theirs), daemon=True))
-        pipes.append(mine)
+    number = max(PROCESSES, len(endpoints))
+    settings = [BusSettings(connect=(endpoints[i % len(endpoints)],), keys=keys) for i in range(number)]
     before = used(services), used(routers)
-    for process in started:
-        process.start()
     answered, counts = list[float](), Counter[str]()
-    for pipe in pipes:
-        times, numbers = json.loads(pipe.recv_bytes())
-        answered += times
-        counts.update(numbers)
-    for process in started:
-        process.join()
+    with piped(_ask, [(one, payloads, clients // number) for one in settings]) as pipes:
+        for pipe in pipes:
+            times, numbers = json.loads(pipe.recv_bytes())
+            answered += times
+            counts.update(numbers)
     took, due = np.array(answered or [np.nan]), len(answered) + counts.total()
     asked = max(1, due - counts["skipped"])
     return {

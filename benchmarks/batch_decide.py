@@ -14,7 +14,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks import situations
-from benchmarks.timing import Figures
+from benchmarks.timing import Figures, spread_of
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.batch.decision_arrays import KINDS, DecisionArrays
@@ -61,14 +61,8 @@ def beside(ready: Filter, requests: list[Request]) -> dict[str, float]:
     for _ in range(BLOCKS):
         batch = seconds(lambda: ready.decide_batch(arrays), repeats)
         times.append((batch, seconds(lambda: [ready.decide(request) for request in requests], repeats)))
-    least, ratios = np.min(times, axis=0), [loop / batch for batch, loop in times]
-    return {
-        "batch 1/s": len(requests) / least[0],
-        "loop 1/s": len(requests) / least[1],
-        "ratio": float(np.median(ratios)),
-        "ratio low": min(ratios),
-        "ratio high": max(ratios),
-    }
+    least, ratios = np.min(times, axis=0), np.array([loop / batch for batch, loop in times])
+    return {"batch 1/s": len(requests) / least[0], "loop 1/s": len(requests) / least[1], **spread_of(ratios)}
 
 
 def seconds(call: Callable[[], object], repeats: int) -> float:

@@ -17,10 +17,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from benchmarks.timing import Figures
+from benchmarks.timing import Figures, spread_of
 from brakeline.deploy.interpreter import spawning
-from brakeline.deploy.policy_loading import POLICY_FOLDER
-from brakeline.messaging.policy_weights import MLP
+from brakeline.deploy.policy_loading import TRAINED, network_named
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
@@ -51,7 +50,8 @@ def run() -> Figures:
                 figures[f"{name}, filtered, {size} robots: beside SyncVectorEnv of {PEERS}"] = beside(
                     size, batch, vector, PEERS
                 )
-                figures[f"{name}, no filter, {size} robots: beside one"] = beside(size, _alone(robot, size), alone)
+                plain = _driven(BatchNavigationEnv(robot, size), robot)
+                figures[f"{name}, no filter, {size} robots: beside one"] = beside(size, plain, alone)
         figures[f"{name}, filtered, {PROCESSES} processes of {LARGE} robots: by the clock"] = by_the_clock(name)
     _draw({name: {n: figures[f"{name}, filtered, {n} robots: beside one"] for n in SIZES[name]} for name in SIZES})
     return figures
@@ -100,14 +100,9 @@ def beside(size: int, batch: Act, peer: Act, peer_size: int = 1) -> dict[str, fl
     for act in (batch, batch, peer):
         act()
     costs = np.array([(_cost(batch, size), _cost(peer, peer_size)) for _ in range(BLOCKS)])
-    ratios = costs[:, 1] / costs[:, 0]
-    return {
-        "batch steps/s": 1.0 / costs[:, 0].min(),
-        "peer steps/s": 1.0 / costs[:, 1].min(),
-        "ratio": float(np.median(ratios)),
-        "ratio low": float(ratios.min()),
-        "ratio high": float(ratios.max()),
-    }
+    batch_cost, peer_cost = costs.min(axis=0).tolist()
+    rates = {"batch steps/s": 1.0 / batch_cost, "peer steps/s": 1.0 / peer_cost}
+    return rates | spread_of(costs[:, 1] / costs[:, 0])
 
 
 def _cost(act: Act, size: int) -> float:
@@ -119,20 +114,10 @@ def _cost(act: Act, size: int) -> float:
     return (process_time() - before) / (periods * size)
 
 
-def trained(robot: RobotWithTask) -> MLP:
-    """Return the stored policy of a robot."""
-    return MLP.load(POLICY_FOLDER / robot.name / "trained.safetensors", robot)
-
-
 def _filtered(robot: RobotWithTask, size: int) -> Act:
     """Return a period of `size` robots of a batch behind the filter."""
     env = BatchSafetyWrapper(BatchNavigationEnv(robot, size), Filter.load(robot.name))
     return _driven(env, robot)
-
-
-def _alone(robot: RobotWithTask, size: int) -> Act:
-    """Return a period of `size` robots of a batch without a filter."""
-    return _driven(BatchNavigationEnv(robot, size), robot)
 
 
 def _vector(robot: RobotWithTask, size: int) -> Act:
@@ -143,7 +128,7 @@ def _vector(robot: RobotWithTask, size: int) -> Act:
 
 def _driven(env: VectorEnv[Any, Any, Any], robot: RobotWithTask) -> Act:
     """Return a period of all robots of a vector environment, with the trained policy and exploration."""
-    policy, rng = trained(robot), np.random.default_rng(0)
+    policy, rng = network_named(TRAINED, robot, 0), np.random.default_rng(0)
     observations, _ = env.reset(seed=0)
 
     def act() -> None:
@@ -158,7 +143,7 @@ def _single(robot: RobotWithTask, filtered: bool) -> Act:
     """Return a period of one robot in `NavigationEnv`, which begins the next episode at the end of one."""
     env: gymnasium.Env[Any, Any] = NavigationEnv(robot)
     env = SafetyWrapper(env, Filter.load(robot.name)) if filtered else env
-    policy, rng = trained(robot), np.random.default_rng(0)
+    policy, rng = network_named(TRAINED, robot, 0), np.random.default_rng(0)
     observation, _ = env.reset(seed=0)
 
     def act() -> None:

@@ -178,11 +178,7 @@ def ours(recording: Recording, config: ModelConfig) -> tuple[dict[str, float | s
     started = process_time()
     model, _, _ = certify_supported(recording.data, config)
     fitted_s = process_time() - started
-    tube, robot = model.tube(), model.robot
-    inputs = np.where(robot.translates, robot.high(), 0.0)
-    z = np.concatenate(
-        [robot.state_at_inputs(inputs)[list(robot.regressor)], inputs, np.tile(inputs, robot.free_steps)]
-    )
+    tube, z = model.tube(), braking(model.robot, fastest(model.robot))
 
     def one() -> None:
         exact = tube.at(z)

@@ -12,9 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 
-from benchmarks.timing import Figures
+from benchmarks.timing import Figures, processor_times
 from brakeline.deploy.interpreter import PYTHON
 
 STEPS = 4000
@@ -32,28 +31,13 @@ def training(out: Path, record: bool) -> tuple[float, float]:
     command = [*PYTHON, "-m", "brakeline.deploy.cli", *words, "--record" if record else "--no-record"]
     run, looks = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL), []
     while run.poll() is None:
-        looks.append(processor_time(run.pid, out))
+        looks.append(processor_times(run.pid))
         time.sleep(LOOK)
     assert run.stdout is not None
     figures = json.loads(run.stdout.read())
     if figures["steps"] < STEPS:
         raise RuntimeError(f"the run of {out} took {figures['steps']} of {STEPS} steps")
     return figures["steps"] / figures["driven_s"], _share(looks)
-
-
-def processor_time(launcher: int, out: Path) -> dict[str, float]:
-    """Return the processor time of each living process of a run [s], by name."""
-    found = {}
-    for process in psutil.process_iter(["cmdline"]):
-        words = process.info["cmdline"] or []
-        child = "brakeline.deploy.run.run_process" in words and str(out) in words
-        if child or process.pid == launcher:
-            try:
-                times = process.cpu_times()
-            except psutil.Error:  # it has just ended
-                continue
-            found[words[-1] if child else "launcher"] = times.user + times.system
-    return found
 
 
 def _share(looks: list[dict[str, float]]) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import psutil
 
 from benchmarks import situations
+from benchmarks.timing import processor_time
 from brakeline.deploy.interpreter import spawning
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -47,6 +49,28 @@ def route(settings: BusSettings, name: str, ready: Event, stop: Event) -> None:
     with Bus(settings, name):
         ready.set()
         stop.wait()
+
+
+@contextmanager
+def piped(target: Callable[..., None], arguments: Sequence[tuple[Any, ...]]) -> Iterator[list[Connection]]:
+    """Start a process for each tuple of arguments, to which its end of a pipe is added; end them with the block.
+
+    Yields:
+        The other ends of the pipes. A closed pipe asks a process to end.
+    """
+    spawn, started, pipes = spawning(), list[Any](), list[Connection]()
+    for one in arguments:
+        mine, theirs = spawn.Pipe()
+        started.append(spawn.Process(target=target, args=(*one, theirs), daemon=True))
+        pipes.append(mine)
+        started[-1].start()
+    try:
+        yield pipes
+    finally:
+        for pipe in pipes:
+            pipe.close()
+        for process in started:
+            process.join(5.0)
 
 
 @contextmanager
@@ -105,14 +129,14 @@ def keys_for(folder: Path, *names: str) -> Path:
     return folder
 
 
-def with_plan_tokens(requests: list[pb.Request], keys: Path, asker: str = "client") -> list[pb.Request]:
-    """Add the plan tokens that services with these keys accept from the process `asker`."""
+def with_plan_tokens(requests: list[pb.Request], keys: Path) -> list[pb.Request]:
+    """Add the plan tokens that services with these keys accept from the process `client`."""
     authenticator = PlanAuthenticator.of(keys)
     for request in requests:
-        request.plan_token = authenticator.plan_token(request, robot_named(request.robot), asker)
+        request.plan_token = authenticator.plan_token(request, robot_named(request.robot), "client")
     return requests
 
 
 def used(pids: list[int]) -> float:
     """Return the processor time of processes so far [s]."""
-    return sum(sum(psutil.Process(pid).cpu_times()[:2]) for pid in pids)
+    return sum(processor_time(psutil.Process(pid)) for pid in pids)

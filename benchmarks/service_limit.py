@@ -20,21 +20,19 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zenoh
 
 from benchmarks import situations
-from benchmarks.safety_processes import processes, serve, used
+from benchmarks.safety_processes import piped, processes, serve, used
 from benchmarks.timing import Figures
-from brakeline.deploy.interpreter import spawning
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, configuration
 from brakeline.messaging.free_ports import free_endpoint
@@ -125,27 +123,28 @@ def _endless(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def _ask(settings: BusSettings, names: Sequence[str], payloads: list[bytes], pipe: Connection) -> None:
-    """Run the askers of a process: each message is a rate, 0 for as soon as possible; the answer is the outcomes."""
+    """Run the askers of a process: each message is a rate, -1 for as soon as possible; the answer is the outcomes."""
     os.nice(5)  # the service comes first, so that it is the limit
     with zenoh.open(configuration(settings, "client")) as session:
         askers = Askers(session, names, payloads)
         pipe.send_bytes(b"ready")
-        while rate := json.loads(pipe.recv_bytes()):
-            outcomes = askers.again_and_again() if rate < 0.0 else askers.at_a_rate(rate)
-            pipe.send_bytes(json.dumps([outcomes.seconds, outcomes.counts, outcomes.first]).encode())
+        with suppress(EOFError):
+            while rate := float(pipe.recv_bytes()):
+                outcomes = askers.again_and_again() if rate < 0.0 else askers.at_a_rate(rate)
+                pipe.send_bytes(json.dumps([outcomes.seconds, outcomes.counts, outcomes.first]).encode())
 
 
 class Crowd:
     """Processes with askers."""
 
-    def __init__(self, pipes: Sequence[Connection], askers: int, service: int) -> None:
-        self._pipes, self._askers, self._service = pipes, askers, service
+    def __init__(self, pipes: Sequence[Connection], service: int) -> None:
+        self._pipes, self._service = pipes, service
 
     def row(self, rate: float = 0.0) -> dict[str, float]:
         """Let the askers ask at a rate in all, or as fast as they get answers, and return the figures."""
         before, waited, began = used([self._service]), _waited(self._service), time.monotonic()
         for pipe in self._pipes:
-            pipe.send_bytes(json.dumps(rate / len(self._pipes) or -1.0).encode())
+            pipe.send_bytes(str(rate / len(self._pipes) or -1.0).encode())
         outcomes = Outcomes()
         for pipe in self._pipes:
             seconds, counts, first = json.loads(pipe.recv_bytes())
@@ -177,25 +176,13 @@ def _waited(pid: int) -> float:
 
 @contextmanager
 def _crowd(endpoint: str, askers: int, payloads: list[bytes], service: int) -> Iterator[Crowd]:
-    spawn, started, pipes = spawning(), list[Any](), list[Connection]()
-    number = min(PROCESSES, askers)
-    for i in range(number):
-        mine, theirs = spawn.Pipe()
-        names = [f"client.{i}-{k}" for k in range(askers // number)]
-        args = BusSettings(connect=(endpoint,)), names, payloads, theirs
-        started.append(spawn.Process(target=_ask, args=args, daemon=True))
-        started[-1].start()
-        pipes.append(mine)
-    try:
+    number, settings = min(PROCESSES, askers), BusSettings(connect=(endpoint,))
+    names = [[f"client.{i}-{k}" for k in range(askers // number)] for i in range(number)]
+    with piped(_ask, [(settings, some, payloads) for some in names]) as pipes:
         for pipe in pipes:
             pipe.recv_bytes()
         time.sleep(1.0)  # until every asker knows the service
-        yield Crowd(pipes, askers, service)
-    finally:
-        for pipe in pipes:
-            pipe.send_bytes(b"0")
-        for process in started:
-            process.join(5.0)
+        yield Crowd(pipes, service)
 
 
 def run() -> Figures:

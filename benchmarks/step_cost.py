@@ -21,10 +21,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import psutil
 
 from benchmarks.step_stages import stages
-from benchmarks.timing import Figures
+from benchmarks.timing import Figures, processor_times
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run.processes import ENDPOINT, client_settings
 from brakeline.messaging.bus import Bus, Sample
@@ -59,12 +58,11 @@ class Run:
         if message.process.startswith("actor") and message.figures["steps"]:
             self.steps.setdefault(message.process, []).append((time.monotonic(), message.figures["steps"]))
 
-    def look(self, launcher: psutil.Process) -> None:
+    def look(self, launcher: int) -> None:
         """Read the processor times of the launcher and of the processes that it started."""
         now = time.monotonic()
-        for process in (launcher, *launcher.children()):
-            name = "launcher" if process is launcher else process.cmdline()[-1]
-            self.used.setdefault(name, []).append((now, sum(process.cpu_times()[:2])))
+        for name, spent in processor_times(launcher).items():
+            self.used.setdefault(name, []).append((now, spent))
 
     def taken(self, at: float) -> float:
         """Return the number of steps of all actors until a time."""
@@ -113,11 +111,10 @@ def watched(tree: Path, robot: str) -> dict[str, float]:
                 if process.poll() is not None:
                     raise RuntimeError(folder.with_suffix(".txt").read_text()[-2000:])
                 time.sleep(0.1)
-            launcher = psutil.Process(process.pid)
             with Bus(client_settings(folder), "viewer") as bus:
                 bus.subscribe(HEALTH, run.take)
                 while process.poll() is None and run.taken(time.monotonic()) < 0.9 * STEPS[robot]:
-                    run.look(launcher)
+                    run.look(process.pid)
                     time.sleep(0.2)
     return run.figures()
 

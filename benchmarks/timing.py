@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
+import psutil
 
 Figures = dict[str, dict[str, float]]  # numbers by row and column
 Words = dict[str, dict[str, float | str]]  # the same, with texts
@@ -36,6 +37,27 @@ def each(calls: Sequence[Callable[[], object]]) -> dict[str, float]:
         call()
         seconds.append(perf_counter() - before)
     return milliseconds(seconds[min(WARM_UP, len(seconds) // 2) :])
+
+
+def processor_time(process: psutil.Process) -> float:
+    """Return the processor time of a process so far [s]."""
+    return float(sum(process.cpu_times()[:2]))
+
+
+def processor_times(launcher: int) -> dict[str, float]:
+    """Return the processor time [s] of a launcher and of the processes of its run that live, by their names."""
+    times: dict[str, float] = {}
+    with suppress(psutil.NoSuchProcess):
+        top = psutil.Process(launcher)
+        for process in (top, *top.children(recursive=True)):
+            with suppress(psutil.Error, IndexError):  # it has just ended
+                times["launcher" if process == top else process.cmdline()[-1]] = processor_time(process)
+    return times
+
+
+def spread_of(ratios: np.ndarray) -> dict[str, float]:
+    """Return the median, the least and the largest of some ratios."""
+    return {"ratio": float(np.median(ratios)), "ratio low": float(ratios.min()), "ratio high": float(ratios.max())}
 
 
 @contextmanager

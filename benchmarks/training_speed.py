@@ -11,14 +11,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import psutil
 
-from benchmarks.timing import Figures
+from benchmarks.timing import Figures, processor_times
 from brakeline.learner.learner_output import POLICY
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -68,7 +66,7 @@ def trained(out: Path, backend: str, seed: int) -> list[Snapshot]:
     snapshots: list[Snapshot] = []
     started, seen, policy = time.monotonic(), 0, out / "learner" / POLICY
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        spent: dict[int, float] = {}
+        spent: dict[str, float] = {}
         while process.poll() is None:
             time.sleep(0.2)
             spent |= processor_times(process.pid)
@@ -79,18 +77,6 @@ def trained(out: Path, backend: str, seed: int) -> list[Snapshot]:
     if process.returncode:
         raise RuntimeError(f"{' '.join(command)} failed: see {out}/logs")
     return snapshots
-
-
-def processor_times(root: int) -> dict[int, float]:
-    """Return the processor time [s] of a process and of all below it, by process."""
-    times = {}
-    with suppress(psutil.NoSuchProcess):
-        top = psutil.Process(root)
-        for process in (top, *top.children(recursive=True)):
-            with suppress(psutil.NoSuchProcess):
-                spent = process.cpu_times()
-                times[process.pid] = spent.user + spent.system
-    return times
 
 
 def reached(robot: RobotWithTask, snapshots: list[Snapshot]) -> dict[str, float]:

@@ -47,10 +47,7 @@ class RunAnalysis:
     def __init__(self, label: str, log: Log, options: AnalysisOptions | None = None, prefix: str = "") -> None:
         """Read the log.
 
-        Args:
-            label: name of the run.
-            options: what to compute besides the figures.
-            prefix: for the names of actors, to distinguish runs.
+        prefix: for the names of actors, to distinguish runs.
         """
         self.label, self.log, self.prefix = label, log, prefix
         self.options = options or AnalysisOptions()

@@ -123,10 +123,7 @@ class Metrics:
     def add(self, key: str, message: Any, received: int | None = None) -> bool:
         """Add a message that was published at `key`; return False for one that is only counted: repeated, or refused.
 
-        Args:
-            key: on the bus.
-            message: of the type of the topic.
-            received: time of receipt on a clock without jumps [ns]. Defaults to the time of publication.
+        received: time of receipt on a clock without jumps [ns]. Defaults to the time of publication.
 
         Raises:
             Implausible: the message is from a new publisher, actor or process, and there are too many.

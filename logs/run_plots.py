@@ -33,13 +33,9 @@ OF_GROUPS = {"goals": "goals reached", "reward": "reward of an episode", "interv
 
 
 def draw(figures: Figures, path: Path) -> None:
-    """Plot learning curves to a file, one column for each robot kind; its ending says the format (png, pdf, svg).
+    """Plot the figures of a `LogAnalysis` to a file, one column for each robot kind. Its ending says the format.
 
     Several runs are drawn as groups of runs that differ only in their seed: the mean, and the 95 % interval over runs.
-
-    Args:
-        figures: of `LogAnalysis`.
-        path: the file; its folder is created.
     """
     if figures.get("groups"):
         picture = _groups(figures["groups"])

@@ -48,7 +48,6 @@ def certify(
     True
 
     Args:
-        data: the recorded trajectories.
         model_config: error bound, mode, windows and first inflation.
         until_held: widen the envelopes by any factor, until no held-out plan leaves its set.
         progress: called with the share of the work that is done; by mode one-step only.
@@ -100,11 +99,9 @@ def certify_supported(
     """Certify with plan windows if the data hold enough of them, else with free windows.
 
     Args:
-        data: the recorded trajectories.
         model_config: its kind of windows is replaced.
         windows: `plan` or `free` to try one kind only.
-        until_held: see `certify`.
-        progress: see `certify`.
+        until_held, progress: see `certify`.
 
     Returns:
         The model set, its validation report, and for each kind that failed the reason.

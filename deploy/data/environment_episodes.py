@@ -56,9 +56,6 @@ def collect(
     30
 
     Args:
-        env: the environment.
-        robot: the robot's description.
-        periods: number of periods to record.
         seed: draws the inputs and the episodes.
         held: largest number of periods for which an input is held: enough to reach the top speed.
         state: (env, observation, info) -> measured state (n,). Defaults to `info["state"]`.

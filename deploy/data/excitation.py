@@ -46,8 +46,6 @@ def excitation(
     For a robot that stops by feedback, send the measured state (n,) after each period: `u = inputs.send(state)`.
 
     Args:
-        robot: gives bounds, slew limits and plan schedule.
-        rng: the random generator.
         held: largest number of periods for which a target is held. A robot that needs long to reach its top speed
             needs more; some lead-ins then jump between bounds.
         before: input in force (m,); zero by default.

@@ -44,7 +44,6 @@ def tables_of(path: Path, options: LogOptions = PLAIN) -> list[Table]:
     """Read the tables of a foreign log, in a process of its own.
 
     Args:
-        path: the source.
         options: gives the column and the unit of the stamps, the topics to prefer, and the limits.
 
     Raises:
@@ -105,8 +104,6 @@ def import_sources(
     """Import one or more recordings of one robot as one data set.
 
     Args:
-        paths: the sources.
-        robot: its description names the columns.
         options: where the columns are in the sources, and in which units.
         delay: time in s by which the stamps of the inputs are too early.
         hold: time in s for which an input is valid after its last message.

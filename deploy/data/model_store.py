@@ -42,7 +42,6 @@ def model_for(
 
     Args:
         robot: the robot, with its description of today.
-        model_config: error bound and mode.
         accept_bound: largest accepted bound on the share of plans that leave their tubes, in [0, 1]. Defaults to the
             limit in the robot's description.
         build: False for a vehicle that is not simulated here. Data from the simulator say nothing about it, so

@@ -60,7 +60,6 @@ def resample(
     """Resample the tables of a source to a data set.
 
     Args:
-        tables: the tables of the source.
         robot: its description gives period, columns and bounds.
         options: where the columns are in the source, and in which units.
         delay: time in s by which the stamps of the inputs are too early.

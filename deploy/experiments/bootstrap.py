@@ -34,9 +34,7 @@ def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0)
 
     Each resample draws, with replacement, as many seeds as there are, and for each as many episodes as it has.
 
-    Args:
-        above, below: one array (episodes,) per seed.
-        seed: seed of the resampling.
+    above, below: one array (episodes,) per seed. seed: of the resampling.
 
     Raises:
         ValueError: there is no seed, or a seed has no episode.
@@ -60,13 +58,13 @@ def mean(values: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
     return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed)
 
 
-def rate(happened: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
+def rate(happened: Sequence[ArrayLike]) -> MeanEstimate:
     """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed.
 
     If it never or always happened, all resamples are alike: then the interval is the exact one of Clopper and Pearson,
     which takes all episodes as independent.
     """
-    estimate, episodes = mean(happened, seed), sum(len(np.asarray(each)) for each in happened)
+    estimate, episodes = mean(happened), sum(len(np.asarray(each)) for each in happened)
     if 0.0 < estimate.value < 1.0:
         return estimate
     low, high = clopper_pearson(round(estimate.value * episodes), episodes) or (0.0, 1.0)

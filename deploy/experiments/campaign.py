@@ -207,13 +207,9 @@ class CellFigures:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures with exact 95 % intervals (`logs/proportion_intervals.py`)."""
-        arena, policy, model_set, perturbation = self.cell
         touched = self.count["collision"] + self.count["contact_moving"]
         return {
-            "arena": arena,
-            "policy": policy,
-            "model_set": model_set,
-            "perturbation": perturbation,
+            **dict(zip(("arena", "policy", "model_set", "perturbation"), self.cell, strict=True)),
             "model": self.model,
             "episodes": self.episodes,
             "steps": self.count["steps"],
@@ -224,9 +220,7 @@ class CellFigures:
             "timeouts": self.count["timeout"],
             "interventions": self.count["interventions"],
             "interventions_interval": self._interventions.interval(),
-            "failsafes": self.count["failsafes"],
-            "compared": self.count["compared"],
-            "violations": self.count["violations"],
+            **{name: self.count[name] for name in ("failsafes", "compared", "violations")},
             "violations_interval": clopper_pearson(self.count["violations"], self.count["compared"]),
             "closest": self.closest,
             "near": self.near,

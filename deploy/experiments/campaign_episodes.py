@@ -51,11 +51,8 @@ class CampaignDriver:
     """The robot, policy and filter of a cell.
 
     Attributes:
-        robot: the robot.
         what: policy, method, model set, arena, conditions and seed.
-        model: of the filter; None without one.
-        ask: asks the filter; None without one.
-        env: its environment.
+        model, ask: of the filter; None without one.
     """
 
     robot: RobotWithTask

@@ -61,7 +61,6 @@ class Engine:
         """Run tasks, and yield each with its result once it is there.
 
         Args:
-            tasks: the tasks.
             runs: folder of their files, `runs/<robot>/<name>` for each.
             say: called with a task's name and its progress.
 

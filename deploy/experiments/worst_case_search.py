@@ -79,9 +79,7 @@ def search(
 ) -> dict[str, Any]:
     """Search for so many episodes, and write the log of the worst one.
 
-    Args:
-        what: arena, method, model set, conditions, seed.
-        path: of the log.
+    what: gives arena, method, model set, conditions and seed.
 
     Returns:
         `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, `history` (the

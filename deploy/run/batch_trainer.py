@@ -8,6 +8,7 @@ the same weights.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
 from brakeline.sim.scripted_policies import RandomPolicy
-from brakeline.sim.sim_conditions import Conditions
 
 Sink = Callable[[int, pb.Step | pb.Episode], None]  # takes what robot i publishes
 
@@ -43,13 +43,8 @@ class BatchTrainer:
         size: int,
         name: str,
         sink: Sink,
-        *,
-        arena: str = "default",
         seed: int = 0,
-        penalty: float = 1.0,
-        accept_bound: float | None = None,
-        conditions: Conditions | None = None,
-        ends_on_intervention: bool = False,
+        **options: Any,
     ) -> None:
         """Let all robots join the learner, and begin their first episodes.
 
@@ -57,8 +52,7 @@ class BatchTrainer:
             safety: the filter; without one, each robot executes what it proposes.
             name: of the process, from which `actor_names` makes the robots' names.
             sink: takes all steps and episodes.
-            penalty: for a correction by the whole range of an input.
-            ends_on_intervention: see `EpisodeRunner`.
+            options: of `BatchRobots`. The penalty is 1 by default.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -70,18 +64,8 @@ class BatchTrainer:
         self.actors = actor_names(name, size)
         self._episodes = [self._join(actor) for actor in self.actors]
         self._identities = [ActorIdentity(actor, i, seed) for i, actor in enumerate(self.actors)]
-        self._robots = BatchRobots(
-            robot,
-            self.actors,
-            safety,
-            self._next_episode,
-            arena=arena,
-            seed_key=seed,
-            penalty=penalty,
-            accept_bound=accept_bound,
-            conditions=conditions,
-            ends_on_intervention=ends_on_intervention,
-        )
+        options = {"seed_key": seed, "penalty": 1.0} | options
+        self._robots = BatchRobots(robot, self.actors, safety, self._next_episode, **options)
         # A resumed run draws other noise than the interrupted one: it begins with other episodes, too.
         self._rng = np.random.default_rng((seed, EPISODE_STRIDE, learner.steps))
         self._random = [RandomPolicy(robot, rng) for rng in self._rng.spawn(size)]

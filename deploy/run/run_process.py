@@ -85,26 +85,22 @@ def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetting
 
 def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
     from brakeline.actors.actor_process import ActorSettings, run
+    from brakeline.deploy.commands.common_options import settings_from
     from brakeline.deploy.policy_loading import policy_named
     from brakeline.deploy.vehicle_factory import environment, fleet_world
 
-    settings = ActorSettings(
+    settings = settings_from(
+        ActorSettings,
+        config,
         bus=bus,
         robot=spec.robot,
         name=spec.name,
         number=spec.number,
         robots=config.robots_per_actor,
         fleet=config.fleet > 0,
-        seed=config.seed,
-        arena=config.arena,
-        method=config.method,
-        penalty=config.penalty,
         deadline=60.0 if config.deterministic else config.deadline,
         lockstep=config.deterministic,
         practice=config.practice or (PRACTICE if config.adapt else 0.0),
-        change=config.change,
-        mavlink=config.mavlink,
-        steps=config.steps,
     )
     propose = partial(policy_named, config.policy, robot_with_task(spec.robot)) if config.policy else None
     if config.flights:

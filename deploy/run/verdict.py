@@ -27,11 +27,7 @@ class LatestEpisodes:
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """Return the verdict on a run: three lines, and one more for each thing that went wrong.
-
-    Args:
-        figures: of a launcher (`Launcher.figures`).
-    """
+    """Return the verdict on a run by `Launcher.figures`: three lines, and one more for each thing that went wrong."""
     if not (figures["steps"] or figures.get("from_logs") or figures["learners"]):
         return [f"ended before the first step; nothing was driven, see {figures['folder']}/logs if you did not end it"]
     lines = [_outcome(figures), _answers(figures)] if figures["steps"] else []
