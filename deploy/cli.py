@@ -14,19 +14,47 @@ import os
 import sys
 from contextlib import nullcontext
 from copy import copy
-from dataclasses import fields, is_dataclass, make_dataclass
+from dataclasses import fields, is_dataclass, make_dataclass, replace
 from importlib.metadata import version
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import docstring_parser
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from brakeline.deploy import progress
-from brakeline.deploy.option_parsing import registry
 from brakeline.extras import missing_extra
+
+# tyro shows `X | None` as `{None}|X`, takes the word None, and names Python's NoneType if it can't parse a value. An
+# option that is left out is None already, so that only X is shown and parsed.
+registry = ConstructorRegistry()
+
+
+@registry.primitive_rule
+def _optional_value(
+    info: PrimitiveTypeInfo,
+) -> PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None:
+    kinds = get_args(info.type)
+    if NoneType not in kinds or len(kinds) != 2:
+        return None
+    (kind,) = (kind for kind in kinds if kind is not NoneType)
+    spec = registry.get_primitive_spec(PrimitiveTypeInfo.make(kind, parent_markers=info.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return spec
+    return replace(
+        spec,
+        is_instance=lambda value: value is None or spec.is_instance(value),
+        str_from_instance=lambda value: ["none"] if value is None else spec.str_from_instance(value),
+    )
 
 
 class CommandEntry(NamedTuple):

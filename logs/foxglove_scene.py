@@ -35,7 +35,7 @@ from brakeline.logs.arena_view import closes, half_width
 from brakeline.logs.decision_explanation import NO_ANSWER, Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
-from brakeline.logs.viewer.palette import rgb_color
+from brakeline.logs.viewer import rgb_color
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL
 from brakeline.messaging.ray_directions import LidarRays

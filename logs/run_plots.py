@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.logs.episode_stats import Figures
-from brakeline.logs.viewer.palette import hex_color
+from brakeline.logs.viewer import hex_color
 
 
 def _value_or_nan(name: str) -> Callable[[Figures], float]:

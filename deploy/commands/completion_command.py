@@ -25,8 +25,7 @@ class CompletionCommand:
 
 def completion(shell: str) -> str:
     """Return the text that a shell evaluates to complete `brakeline`, its commands and their options."""
-    from brakeline.deploy.cli import COMMANDS, command_class
-    from brakeline.deploy.option_parsing import registry
+    from brakeline.deploy.cli import COMMANDS, command_class, registry
 
     commands = {name: command_class(name) for name in COMMANDS}
     printed = io.StringIO()

@@ -39,7 +39,7 @@ class ExportCommand:
             with under_way(f"writing {self.csv}"):
                 figures["csv"] = self._csv(self.csv)
         if self.minari is not None:
-            from brakeline.logs.minari_export import to_minari
+            from brakeline.logs.log_export import to_minari
 
             with under_way(f"writing {self.minari}"):
                 figures["minari"] = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)

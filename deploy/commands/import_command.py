@@ -52,8 +52,7 @@ class ImportCommand:
         """Import the logs. Returns the exit status; 1 if the data can't give a model set."""
         from brakeline.deploy.data import importer
         from brakeline.deploy.data.build_lock import folder_lock
-        from brakeline.deploy.data.coverage import coverage
-        from brakeline.deploy.data.coverage_plot import draw_coverage
+        from brakeline.deploy.data.coverage import coverage, draw_coverage
         from brakeline.deploy.data.data_paths import record_path
         from brakeline.deploy.data.log_options import LogOptions
         from brakeline.deploy.data.sources.isolated_reader import ReadLimits

@@ -11,7 +11,7 @@ from brakeline.deploy.commands.command_output import console, errors, print_resu
 from brakeline.deploy.commands.common_options import Json, Quiet, Robot
 
 if TYPE_CHECKING:
-    from brakeline.deploy.experiments.rival_tuning import ThresholdTrial
+    from brakeline.deploy.experiments.tuning_trials import ThresholdTrial
     from brakeline.messaging.task import RobotWithTask
     from brakeline.safety.rivals.pretrained import Pretrained
 
@@ -58,7 +58,7 @@ class PretrainCommand:
         return 0
 
     def _tune(self, model: Pretrained, robot: RobotWithTask) -> int:
-        from brakeline.deploy.experiments.rival_tuning import best_threshold, tune_threshold, values_of
+        from brakeline.deploy.experiments.tuning_trials import best_threshold, tune_threshold, values_of
 
         rows = tune_threshold(model, robot, values_of(self.method, robot), self.episodes, self._print_row)
         chosen = best_threshold(rows)

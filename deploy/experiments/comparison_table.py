@@ -150,13 +150,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def without_times(value: Any) -> Any:
-    """Remove the times: the rest must be equal in two comparisons from the same seeds."""
-    if isinstance(value, dict):
-        return {name: without_times(inner) for name, inner in value.items() if not name.endswith("[ms]")}
-    return value
-
-
 PERCENT = ("goal rate", "collision rate", "interventions", *TOUCHED, *THIRDS)
 DIGITS = {"mean speed [m/s]": ".3g", "max speed [m/s]": ".3g", "decision [ms]": ".2f", "its std [ms]": ".2f"}
 

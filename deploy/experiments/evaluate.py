@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -74,12 +74,6 @@ def asking(models: ModelRegistry) -> Ask:
         return list(pb.ReplyBatch.FromString(answer(payload)).replies)
 
     return ask
-
-
-def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
-    """Yield the steps of one episode of a robot that is alone."""
-    for (step,) in run_episode(RobotGroup([driver]), [policy], question, number):
-        yield step
 
 
 def prepare_evaluation(

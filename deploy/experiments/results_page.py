@@ -16,8 +16,13 @@ import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
-from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold
-from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, value_in_use
+from brakeline.deploy.experiments.tuning_trials import (
+    SETTINGS,
+    ThresholdTrial,
+    best_learner,
+    best_threshold,
+    value_in_use,
+)
 from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
 from brakeline.logs.proportion_intervals import clopper_pearson

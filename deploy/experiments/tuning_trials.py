@@ -1,8 +1,12 @@
 """Tune one setting of every rival with the same budget, as jobs whose results the results page lists.
 
-Each rival tries four values. A filter is tried as in `rival_tuning.py`. A learner trains once with each value, from a
-seed that no comparison uses, and drives 120 fresh episodes in the first arena. Among the values whose goals come within
-`NEARLY` of the most, its best one has the fewest collisions, then the most goals.
+Each rival tries four values. Among the values of a filter with which A* loses no goal, choose the one with the fewest
+collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then
+by the interventions on A*. The results are the `rivals` of the task files.
+
+A learner trains once with each value, from a seed that no comparison uses, and drives 120 fresh episodes in the first
+arena. Among the values whose goals come within `NEARLY` of the most, its best one has the fewest collisions, then the
+most goals.
 
 results/<robot>/tuning-<method>-<value>.json
 """
@@ -16,9 +20,13 @@ from typing import Any
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import CellConfig, cell_configs, learning
+from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.learner.learner_config import TD3Config
-from brakeline.safety.model.model_config import DDPC, ModelConfig
+from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS, ModelConfig
+from brakeline.safety.rivals.pretrained import Pretrained
 
 SEED = 1000  # of the trainings
 EPISODES = 60  # for each of the two policies that try a filter
@@ -27,6 +35,71 @@ SETTINGS: dict[str, tuple[str, tuple[float, ...]]] = {  # of learners: field of 
     "lagrange": ("multiplier_rate", (1.0, 3.0, 10.0, 30.0)),
     "sac": ("actor_rate", (1e-4, 3e-4, 1e-3, 3e-3)),
 }
+
+ORACLE, GREEDY = "astar", "greedy"
+VALUES = {
+    SAILR: (0.03, 0.05, 0.08, 0.15),  # η; its authors' is 0.08
+    CBF: (0.5, 1.0, 2.0, 4.0),  # α [1/s]
+    PSF: (0.0, 0.01, 0.02, 0.04),  # margin [m]
+}
+SETTING = {SECAS: "clearance", SAILR: "threshold", CBF: "rate", PSF: "margin"}
+
+
+@dataclass(frozen=True)
+class ThresholdTrial:
+    """A value of `SETTING` (SECAS: its margin to the footprint) and its results over `episodes` per policy."""
+
+    value: float
+    episodes: int
+    oracle_goals: int
+    oracle_interventions: float  # share of its steps
+    greedy_goals: int
+    greedy_collisions: int
+
+
+def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
+    """Return the values of a method's setting to try."""
+    return robot.task.rivals.margins if method == SECAS else VALUES[method]
+
+
+def try_threshold(
+    model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default"
+) -> ThresholdTrial:
+    """Evaluate the model with another threshold on fresh episodes."""
+    setting = robot.footprint + value if model.method == SECAS else value
+    question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
+    oracle, greedy = (fresh_trial(robot, arena, policy, question, episodes) for policy in (ORACLE, GREEDY))
+    reached, driven = oracle.columns(), greedy.columns()
+    return ThresholdTrial(
+        value,
+        episodes,
+        oracle_goals=int(sum(reached["goal"])),
+        oracle_interventions=sum(reached["interventions"]) / max(oracle.decisions, 1),
+        greedy_goals=int(sum(driven["goal"])),
+        greedy_collisions=int(sum(driven["collision"])),
+    )
+
+
+def tune_threshold(
+    model: Pretrained,
+    robot: RobotWithTask,
+    values: Sequence[float],
+    episodes: int,
+    say: Callable[[ThresholdTrial], object] = lambda row: None,
+) -> list[ThresholdTrial]:
+    """Evaluate every value, and call `say` after each one."""
+    rows = []
+    for value in values:
+        rows.append(try_threshold(model, robot, value, episodes))
+        say(rows[-1])
+    return rows
+
+
+def best_threshold(rows: Sequence[ThresholdTrial]) -> ThresholdTrial:
+    """Return the best row by the rule of this module."""
+    most = max(row.oracle_goals for row in rows)
+    without_loss = [row for row in rows if row.oracle_goals == most]
+    return min(without_loss, key=lambda row: (row.greedy_collisions, -row.greedy_goals, row.oracle_interventions))
 
 
 @dataclass(frozen=True)
@@ -47,9 +120,6 @@ class FilterTuning:
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
         """Drive the episodes, and return the figures."""
         from brakeline.deploy.data.model_store import method_for
-        from brakeline.deploy.experiments.rival_tuning import try_threshold
-        from brakeline.messaging.task import robot_with_task
-        from brakeline.safety.rivals.pretrained import Pretrained
 
         robot = robot_with_task(self.robot)
         model = method_for(robot, self.method, ModelConfig())
@@ -89,8 +159,6 @@ class LearnerTuning:
 
 def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
     """Return the value of the tuned setting with which a cell was made; None if its file does not say."""
-    from brakeline.deploy.experiments.rival_tuning import SETTING
-    from brakeline.safety.model.model_config import SECAS
 
     method = cell["study"]["method"]
     if method in SETTINGS:
@@ -101,8 +169,6 @@ def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
 
 def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> list[FilterTuning | LearnerTuning]:
     """Return the jobs that tune the rivals among some methods."""
-    from brakeline.deploy.experiments.rival_tuning import values_of
-    from brakeline.messaging.task import robot_with_task
 
     jobs: list[FilterTuning | LearnerTuning] = []
     task = robot_with_task(robot).task

@@ -24,7 +24,7 @@ from brakeline.actors.episode_runner import EpisodeRunner
 from brakeline.logs.decision_explanation import Explanation
 from brakeline.logs.decision_view import DecisionView, decision_view
 from brakeline.logs.episode_stats import KINDS as DECISIONS
-from brakeline.logs.viewer.palette import hex_color
+from brakeline.logs.viewer import hex_color
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL, Obstacle
 from brakeline.messaging.robot import Array, Robot

@@ -23,8 +23,7 @@ from brakeline.learner.checkpoint import latest as latest_checkpoint
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import count_by_key
 from brakeline.logs.recorded_robots import RecordedRobots
-from brakeline.logs.watch.run_history import NOTE, RunHistory, history_to_note
-from brakeline.logs.watch.run_totals import run_totals, totals_to_health
+from brakeline.logs.watch.run_history import NOTE, RunHistory, history_to_note, run_totals, totals_to_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.bus import BusSettings

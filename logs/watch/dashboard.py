@@ -16,8 +16,7 @@ from brakeline.logs.episode_view import LETTERS
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
-from brakeline.logs.watch.run_history import NOTE, RunHistory, history_from_note
-from brakeline.logs.watch.run_totals import run_totals, totals_from_health
+from brakeline.logs.watch.run_history import NOTE, RunHistory, history_from_note, run_totals, totals_from_health
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.rejected_messages import headline

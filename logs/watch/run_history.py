@@ -1,6 +1,7 @@
-"""Keep the counts of a run over its steps in a bounded number of rows, for curves from the run's beginning.
+"""The counts of a run, and their history over its steps in a bounded number of rows.
 
-The launcher sends its rows in a note of its Health messages, for viewers that start later than the run.
+The launcher sends both in its Health messages, for viewers that start later than the run: the count NAME of a robot
+kind in the figure `ROBOT NAME`, the rows in a note.
 """
 
 from __future__ import annotations
@@ -8,10 +9,11 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from brakeline.errors import BadText
-from brakeline.logs.watch.run_totals import Totals
+from brakeline.logs.metrics import Metrics
 from brakeline.messaging.structured_text import parse_json
 
 NOTE = "history"  # of the launcher's Health message
@@ -21,6 +23,40 @@ FIRST_WIDTH = 50.0  # steps between two rows
 MOST_ROBOTS = 50
 
 History = dict[str, list[list[float]]]  # by robot kind: rows of COLUMNS, each counted from the run's beginning
+
+
+COUNTS = ("steps", "episodes", "goals", "collisions", "interventions", "failsafes", "reward")  # reward: the sum
+
+Totals = dict[str, dict[str, float]]  # by robot kind and name of the count
+
+
+def run_totals(metrics: Metrics) -> Totals:
+    """Return the counts of the metrics, which another thread may extend meanwhile."""
+    totals: Totals = {}
+    for stats in metrics.actors.copy().values():
+        if stats.robot:
+            counts = totals.setdefault(stats.robot, dict.fromkeys(COUNTS, 0.0))
+            returns = stats.returns[:]
+            counts["episodes"] += len(returns)
+            counts["reward"] += math.fsum(returns)
+            for name in ("steps", "goals", "collisions", "interventions", "failsafes"):
+                counts[name] += getattr(stats, name)
+    return totals
+
+
+def totals_to_health(totals: Totals) -> dict[str, float]:
+    """Encode counts as figures of a Health message."""
+    return {f"{robot} {name}": value for robot, counts in totals.items() for name, value in counts.items()}
+
+
+def totals_from_health(figures: Mapping[str, float]) -> Totals:
+    """Decode counts from a Health message, without robot kinds whose counts are incomplete or invalid."""
+    totals: Totals = {}
+    for key, value in figures.items():
+        robot, _, name = key.partition(" ")
+        if name in COUNTS and math.isfinite(value) and (value >= 0.0 or name == "reward"):
+            totals.setdefault(robot, {})[name] = value
+    return {robot: counts for robot, counts in totals.items() if len(counts) == len(COUNTS)}
 
 
 class RunHistory:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.actors.decision_guard import Ask
+from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.vehicle_factory import environment
@@ -20,10 +21,16 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, STEP, Topic
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.sim.scripted_policies import scripted
+from brakeline.sim.scripted_policies import Policy, scripted
 from tests.robots import GROUND
 
 Change = Callable[[pb.Exchange], None]
+
+
+def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
+    """Yield the steps of one episode of a robot that is alone."""
+    for (step,) in run_episode(RobotGroup([driver]), [policy], question, number):
+        yield step
 
 
 def drive(

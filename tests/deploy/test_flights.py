@@ -9,10 +9,11 @@ import pytest
 from benchmarks import perception_cost
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.run_dataset import trajectories_of
-from brakeline.deploy.experiments.evaluate import Evaluation, episode, evaluate, prepare_evaluation
+from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, prepare_evaluation
 from brakeline.logs.episode_stats import KINDS
 from brakeline.sim.sim_conditions import Conditions, Perception, SensorFaults
 from tests.accepting import BOUND
+from tests.deploy.drive import episode
 from tests.robots import QUADROTOR
 
 ROBOT = QUADROTOR.in_real_time()

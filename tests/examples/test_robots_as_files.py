@@ -14,7 +14,7 @@ import pytest
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.certification import certify
-from brakeline.deploy.experiments.evaluate import FRESH, episode, in_process
+from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
@@ -33,6 +33,7 @@ from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Vehicle
 from tests.accepting import BOUND
 from tests.arenas import staged_arena
+from tests.deploy.drive import episode
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("car", "omni")

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 import tyro
 
-from brakeline.deploy.cli import COMMANDS, command_class, main
+from brakeline.deploy.cli import COMMANDS, command_class, main, registry
 from brakeline.deploy.commands.completion_command import completion
-from brakeline.deploy.option_parsing import registry
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 

@@ -9,8 +9,15 @@ import pytest
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.watch.dashboard import STUCK, Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer
-from brakeline.logs.watch.run_history import MOST_ROWS, RunHistory, history_from_note, history_to_note
-from brakeline.logs.watch.run_totals import run_totals, totals_from_health, totals_to_health
+from brakeline.logs.watch.run_history import (
+    MOST_ROWS,
+    RunHistory,
+    history_from_note,
+    history_to_note,
+    run_totals,
+    totals_from_health,
+    totals_to_health,
+)
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.browser import Page
 from tests.logs.conftest import Say, watched

@@ -13,8 +13,7 @@ from brakeline.logs.episode_sampler import POINTS, EpisodeSampler
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.log_analysis import LogAnalysis
 from brakeline.logs.report_page import render
-from brakeline.logs.viewer import SCRIPTS, viewer_file
-from brakeline.logs.viewer.palette import hex_color, rgb_color
+from brakeline.logs.viewer import SCRIPTS, hex_color, rgb_color, viewer_file
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from tests.browser import Page

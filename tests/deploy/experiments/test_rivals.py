@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, config_for, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.deploy.experiments.rival_tuning import ThresholdTrial, best_threshold, tune_threshold, values_of
+from brakeline.deploy.experiments.tuning_trials import ThresholdTrial, best_threshold, tune_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
 from tests.robots import GROUND, QUADROTOR

@@ -10,7 +10,6 @@ import pytest
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.cli import main
 from brakeline.deploy.data.excitation_plan import RegionExcitation
-from brakeline.deploy.experiments.evaluate import episode
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadData
@@ -18,6 +17,7 @@ from brakeline.logs.reader import read
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import PLAN, windows
+from tests.deploy.drive import episode
 from tests.robots import GROUND
 
 CAR = str(Path(__file__).parents[3] / "examples" / "car" / "car.toml")

@@ -6,7 +6,7 @@ from PIL import Image
 
 from brakeline.deploy.experiments.evaluate import Evaluation, prepare_evaluation
 from brakeline.deploy.run.episode_render import Film, record, save
-from brakeline.logs.viewer.palette import rgb_color
+from brakeline.logs.viewer import rgb_color
 from tests.robots import GROUND
 
 
