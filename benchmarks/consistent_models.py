@@ -31,7 +31,6 @@ from brakeline.safety.model.one_step import Features
 from brakeline.safety.model.one_step_fitting import Samples
 
 DIRECTIONS = 300  # recorded φ in whose directions the consistent models are bounded to find the samples that matter
-AT_ONCE = 64  # features whose sums over all samples are in memory at once
 MOST_EDGES = 10_000  # that a linear program follows
 ROUNDING = 1e-10  # of a multiplier or a slope, relative to the largest entry
 

@@ -234,17 +234,14 @@ class Flights:
     def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset, vehicles: int) -> str:
         with ExitStack() as stack:
             parameters = {} if upset.ends else upset.parameters
-            urls, systems = zip(*(self._switched_on(stack, parameters) for _ in range(vehicles)), strict=True)
+            places = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(vehicles)]
+            switched = [switched_on(self._setup, self._start, place, parameters) for place in places]
+            urls, systems = zip(*map(stack.enter_context, switched), strict=True)
             stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0]))
             option = "--system" if vehicles == 1 else "--systems"
             where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
             command = [*words, *self._setup.accepting, *self._setup.words, *where]
             return printed_figures(command, self.data, 60.0 * minutes + BEYOND)
-
-    def _switched_on(self, stack: ExitStack, parameters: Mapping[str, float]) -> tuple[str, int]:
-        """Start an autopilot until the stack ends. Returns its URL and its system id."""
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        return stack.enter_context(switched_on(self._setup, self._start, folder, parameters))
 
     @contextmanager
     def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:

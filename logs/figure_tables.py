@@ -51,8 +51,11 @@ def show(figures: Figures, verbose: bool = False) -> RenderableType:
         counts = ("messages", "missing", "duplicates")
         rows = [(key, *(str(topic[name]) for name in counts)) for key, topic in figures["topics"].items()]
         parts.append(plain_table(("topic", *counts), rows))
-    if verbose and figures.get("metadata"):
-        parts.append(_metadata(figures["metadata"]))
+    if verbose and (metadata := figures.get("metadata")):
+        # Without the configuration, which is long: --json and --html have it.
+        groups = {name: v for name, v in metadata.items() if name != "configuration" and isinstance(v, dict)}
+        rows = [(name, Text(", ".join(f"{k} {v}" for k, v in group.items()))) for name, group in groups.items()]
+        parts.append(plain_table(("metadata", ""), rows))
     return Group(*parts, *(Text(cut, "yellow") for cut in figures.get("cuts", ())))
 
 
@@ -281,13 +284,6 @@ def _processes(processes: Figures) -> Table:
         ended = process["notes"].get("died of", process["ended"])
         rows.append((name, str(process["starts"]), seconds, rate, f"{process['silences']}{longest}", ended))
     return plain_table(("process", "starts", "alive, s", "messages/s", "silences", "ended"), rows)
-
-
-def _metadata(metadata: Figures) -> Table:
-    """Format the metadata, without the configuration, which is long: --json and --html have it."""
-    groups = {name: values for name, values in metadata.items() if name != "configuration" and isinstance(values, dict)}
-    rows = [(name, Text(", ".join(f"{k} {v}" for k, v in values.items()))) for name, values in groups.items()]
-    return plain_table(("metadata", ""), rows)
 
 
 def share(count: int, of: int, within: list[float] | None = None, digits: int = 1) -> str:

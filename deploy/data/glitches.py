@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.sources.quantity_names import Place, Places
+from brakeline.deploy.data.sources.quantity_names import Places, with_values
 from brakeline.deploy.data.sources.source_table import Array, Table
 
 Rows = NDArray[np.intp]
@@ -47,14 +46,10 @@ def without_glitches(
             continue
         notes += _named(table, column, rows, "the recording is cut there" if name in inputs else "left out")
         if name not in inputs:
-            clean[name] = _missing(table, column, rows)
+            known = values.copy()
+            known[rows] = np.nan
+            clean[name] = with_values((table, column), known)
     return clean, notes
-
-
-def _missing(table: Table, column: str, rows: Rows) -> Place:
-    values = table.columns[column].copy()
-    values[rows] = np.nan
-    return replace(table, columns=table.columns | {column: values}), column
 
 
 def _named(table: Table, column: str, rows: Rows, cut: str) -> list[str]:

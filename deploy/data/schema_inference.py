@@ -43,6 +43,7 @@ from brakeline.deploy.data.sources.quantity_names import (
     choice_notes,
     fields_named,
     first_ranked,
+    with_values,
 )
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.deploy.data.stamps import TIME
@@ -323,7 +324,7 @@ def _in_si(places: Places, options: LogOptions) -> tuple[Places, dict[str, str]]
         table, column = places[name]
         values = in_si(table.columns[column], options.units[name], si) if si else None
         if values is not None:
-            places = places | {name: (replace(table, columns=table.columns | {column: values}), column)}
+            places = places | {name: with_values(places[name], values)}
     return places, units
 
 

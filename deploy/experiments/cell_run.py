@@ -160,7 +160,8 @@ class CellRun:
 
     def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
         self.say(trial.name)
-        policy = self._policy(trial)
+        name = str(self.folder / POLICY) if trial.policy == TRAINED else UNTRAINED
+        policy = network_named(name, self.robot, self.cell.seed)
         with self._log(trial.name, trial) as log:
             if self.cell.backend == "single":
                 driver, ask = self._driver(trial, FRESH, trial.name)
@@ -184,10 +185,6 @@ class CellRun:
         begin, numbers = partial(log.put, EPISODE), range(trial.episodes)
         drive_episodes(self.robot, self._safety(trial), policy, trial.arena, FRESH, numbers, take, begin)
         return table
-
-    def _policy(self, trial: TrialConfig) -> MLP:
-        name = str(self.folder / POLICY) if trial.policy == TRAINED else UNTRAINED
-        return network_named(name, self.robot, self.cell.seed)
 
     def _safety(self, trial: TrialConfig) -> BatchMethod | None:
         """Return what decides for a batch; None for the method `none`."""

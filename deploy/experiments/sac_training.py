@@ -59,7 +59,11 @@ class RobotsAsVecEnv(VecEnv):
         self._announce(begun)
         rewards = np.array([step.reward - step.penalty for step in steps], np.float32) * np.float32(self._reward_scale)
         ended = np.array([step.terminated or step.truncated for step in steps])
-        infos = [_info(step) if step.terminated or step.truncated else {} for step in steps]
+        infos: list[dict[str, Any]] = [{} for _ in steps]
+        for info, step in zip(infos, steps, strict=True):
+            if step.terminated or step.truncated:  # what Stable-Baselines3 needs of the last step of an episode
+                info["terminal_observation"] = np.array(step.next_observation, np.float32)
+                info["TimeLimit.truncated"] = step.truncated and not step.terminated
         return self._robots.observations, rewards, ended, infos
 
     def close(self) -> None:
@@ -80,12 +84,6 @@ class RobotsAsVecEnv(VecEnv):
     def _announce(self, begun: list[int]) -> None:
         for number in begun:
             self._begin(self._robots.episode_message(number))
-
-
-def _info(step: pb.Step) -> dict[str, Any]:
-    """Return what Stable-Baselines3 needs of the last step of an episode."""
-    after = np.array(step.next_observation, np.float32)
-    return {"terminal_observation": after, "TimeLimit.truncated": step.truncated and not step.terminated}
 
 
 def train_sac(

@@ -135,7 +135,9 @@ class EpisodeTable:
 
     def step(self, step: pb.Step) -> None:
         """Add the next step of an actor."""
-        begin, row = self._running.get(step.actor) or self._begin(step.actor)
+        if step.actor not in self._running:
+            self._running[step.actor] = self.decisions, {name: column.start for name, column in self.which.items()}
+        begin, row = self._running[step.actor]
         for name, column in self.which.items():
             row[name] = column.combine(row[name], column.value(step))
         spent = COLUMNS["milliseconds"].value(step)
@@ -146,10 +148,6 @@ class EpisodeTable:
             del self._running[step.actor]
             self.rows.append(row)
             self.spans.append((begin, self.decisions))
-
-    def _begin(self, actor: str) -> tuple[int, dict[str, float]]:
-        self._running[actor] = self.decisions, {name: column.start for name, column in self.which.items()}
-        return self._running[actor]
 
     def pop(self) -> dict[str, float]:
         """Remove the row of the episode that ended last, and return it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from brakeline.actors.learner_client import LearnerClient
@@ -142,8 +142,9 @@ def _feed(process: Process, settings: FeederSettings) -> bool:
         actor.publisher.put(step)
         figures["published"] += 1
     log.info("published %d logged steps; the learner knew %d", figures["published"], figures["known"])
-    if settings.alone:
-        _await_last_updates(actors, stop)
+    deadline = time.monotonic() + (LAST_UPDATES_TIMEOUT if settings.alone else 0.0)
+    while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):
+        time.sleep(0.05)
     return not stop()
 
 
@@ -154,10 +155,3 @@ def _renumber(step: pb.Step, actor: ReplayedActor) -> None:
     step.header.time = time_of_step
     step.index = actor.index
     step.weights_version = 0 if actor.client.policy is None else actor.client.policy.version
-
-
-def _await_last_updates(actors: dict[str, ReplayedActor], stop: Callable[[], bool]) -> None:
-    """Give the learner time for its last updates."""
-    deadline = time.monotonic() + LAST_UPDATES_TIMEOUT
-    while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):
-        time.sleep(0.05)

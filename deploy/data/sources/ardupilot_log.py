@@ -36,18 +36,14 @@ def _filter(c: Columns) -> Columns:
     return enu("position", c, ("PN", "PE", "PD")) | velocity | along_body(velocity, yaw) | attitude
 
 
-def _guided(c: Columns) -> Columns:
-    """Return guided velocities. The log holds cm/s (north, east, up), whatever unit it declares."""
-    return enu("command.velocity", c | {"down": -c["vZ"]}, ("vX", "vY", "down"), CENTI)
-
-
 KINDS = {
     "XKF1": MessageKind(0, _filter),
     "NKF1": MessageKind(1, _filter),
     "IMU": MessageKind(0, lambda c: {"yaw rate": -c["GyrZ"]} | force(c, ("AccX", "AccY", "AccZ"))),
     "THR": MessageKind(0, lambda c: {"command.body.x": c["DesSpeed"]}),
     "STER": MessageKind(0, lambda c: {"command.yaw rate": -np.radians(c["DesTurnRate"])}),
-    "GUID": MessageKind(0, _guided),
+    # Guided velocities are in cm/s (north, east, up), whatever unit the log declares.
+    "GUID": MessageKind(0, lambda c: enu("command.velocity", c | {"down": -c["vZ"]}, ("vX", "vY", "down"), CENTI)),
     "PSCN": MessageKind(TARGET, lambda c: {"command.velocity.y": c["DVN"]}),
     "PSCE": MessageKind(TARGET, lambda c: {"command.velocity.x": c["DVE"]}),
     "PSCD": MessageKind(TARGET, lambda c: {"command.velocity.z": -c["DVD"]}),

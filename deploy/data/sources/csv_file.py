@@ -104,10 +104,12 @@ def _dialect(path: Path) -> _Dialect:
         rows = [(i, " ".join(line.split())) for i, line in rows]
         sample = [line for _, line in rows[:SAMPLE]]
     width = Counter(len(_cells(line, separator)) for line in sample[1:] or sample).most_common(1)[0][0]
-    decimal = "," if separator != "," and _decimal_commas(sample, separator) else "."
+    numbers = [cell for line in sample for cell in _cells(line, separator) if NUMBER.fullmatch(cell)]
+    commas = sum("," in cell for cell in numbers) > sum("." in cell for cell in numbers)
+    decimal = "," if separator != "," and commas else "."
     names = _cells(rows[0][1], separator)
-    numbers = sum(bool(NUMBER.fullmatch(cell)) for cell in names)
-    if numbers >= 0.5 * len(names) or all(NUMBER.fullmatch(cell) or cell.lower() in MISSING for cell in names):
+    digits = sum(bool(NUMBER.fullmatch(cell)) for cell in names)
+    if digits >= 0.5 * len(names) or all(NUMBER.fullmatch(cell) or cell.lower() in MISSING for cell in names):
         names = _commented_names(comments, rows[0][0], separator, width)
         if not names:
             names = [f"column {i + 1}" for i in range(width)]
@@ -167,12 +169,6 @@ def _cells(line: str, separator: str) -> list[str]:
     else:
         cells = line.split(separator)
     return [cell.strip().strip('"').strip() for cell in cells]
-
-
-def _decimal_commas(sample: list[str], separator: str) -> bool:
-    """Return whether numbers have decimal commas."""
-    numbers = [cell for line in sample for cell in _cells(line, separator) if NUMBER.fullmatch(cell)]
-    return sum("," in cell for cell in numbers) > sum("." in cell for cell in numbers)
 
 
 def _commented_names(comments: list[tuple[int, str]], before: int, separator: str, width: int) -> list[str]:

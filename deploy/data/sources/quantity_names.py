@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.sources.source_table import Table, notes_of
+from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.deploy.data.unit_table import in_si
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
@@ -145,6 +145,12 @@ def choice_notes(tables: Sequence[Table], places: Places) -> list[str]:
     ]
 
 
+def with_values(place: Place, values: Array) -> Place:
+    """Return a place whose field has other values."""
+    table, column = place
+    return replace(table, columns=table.columns | {column: values}), column
+
+
 def _folded(name: str) -> str:
     """Return a name without case, spaces and signs."""
     return "".join(character for character in name.lower() if character.isalnum())
@@ -158,4 +164,4 @@ def _in_unit(place: Place, name: str, given: str, unit: str) -> Place:
     values = in_si(table.columns[column], given, unit)
     if values is None:
         raise NoSource(f"--unit {name}={given}: {name} is in {unit or '1'}, to which {given} cannot be converted")
-    return replace(table, columns=table.columns | {column: values}), column
+    return with_values(place, values)
