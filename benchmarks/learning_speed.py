@@ -40,25 +40,41 @@ class Plain:
 
     def update(self, s: torch.Tensor, a: torch.Tensor, r: torch.Tensor, n: torch.Tensor) -> None:
         """Learn from a batch of observations, actions, rewards (B, 1) and next observations."""
-        c, (actor, critics) = self.config, self.targets
+        c = self.config
         with torch.no_grad():
             noise = (torch.randn_like(a) * c.target_noise).clamp(-c.target_noise_clip, c.target_noise_clip)
-            joint = torch.cat([n, (actor(n) + noise).clamp(-1, 1)], 1)
-            y = r + c.gamma * torch.minimum(critics[0](joint), critics[1](joint))
-        loss = torch.stack([nn.functional.mse_loss(q(torch.cat([s, a], 1)), y) for q in self.critics]).sum()
+            y = r + c.gamma * self.least(torch.cat([n, (self.targets[0](n) + noise).clamp(-1, 1)], 1))
+        loss = self.loss(torch.cat([s, a], 1), y)
         self.critic_optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.critic_optimiser.step()
         self.updates += 1
         if self.updates % c.policy_delay == 0:
-            gain = -self.critics[0](torch.cat([s, self.actor(s)], 1)).mean()
+            gain = -self.first(torch.cat([s, self.actor(s)], 1)).mean()
             self.actor_optimiser.zero_grad()
-            gain.backward()
+            gain.backward()  # type: ignore[no-untyped-call]
             self.actor_optimiser.step()
             with torch.no_grad():
-                for target, source in zip(self.targets, (self.actor, self.critics), strict=True):
-                    for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
-                        slow.lerp_(fast, self.config.tau)
+                self.follow()
+
+    def least(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the least value (B, 1) of the slow critics for inputs (B, in)."""
+        return torch.minimum(self.targets[1][0](x), self.targets[1][1](x))
+
+    def loss(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Return the sum of the critics' mean squared errors."""
+        return torch.stack([nn.functional.mse_loss(q(x), y) for q in self.critics]).sum()
+
+    def first(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the values (B, 1) of the first critic."""
+        values: torch.Tensor = self.critics[0](x)
+        return values
+
+    def follow(self) -> None:
+        """Move the slow networks towards the others."""
+        for target, source in zip(self.targets, (self.actor, self.critics), strict=True):
+            for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
+                slow.lerp_(fast, self.config.tau)
 
 
 class Stacked(Plain):
@@ -84,28 +100,19 @@ class Stacked(Plain):
             x = torch.baddbmm(bias, x, weight).relu()
         return torch.baddbmm(biases[-1], x, weights[-1])
 
-    def update(self, s: torch.Tensor, a: torch.Tensor, r: torch.Tensor, n: torch.Tensor) -> None:
-        """Learn from a batch, as `Plain.update`."""
-        c, slow_actor = self.config, self.targets[0]
-        with torch.no_grad():
-            noise = (torch.randn_like(a) * c.target_noise).clamp(-c.target_noise_clip, c.target_noise_clip)
-            joint = torch.cat([n, (slow_actor(n) + noise).clamp(-1, 1)], 1)
-            y = r + c.gamma * self.values(joint, self.slow_weights, self.slow_biases).amin(0)
-        loss = 2.0 * (self.values(torch.cat([s, a], 1), self.weights, self.biases) - y).square().mean()
-        self.critic_optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.critic_optimiser.step()
-        self.updates += 1
-        if self.updates % c.policy_delay == 0:
-            first = [[part.detach()[:1] for part in parts] for parts in (self.weights, self.biases)]
-            gain = -self.values(torch.cat([s, self.actor(s)], 1), *first).mean()
-            self.actor_optimiser.zero_grad()
-            gain.backward()  # type: ignore[no-untyped-call]
-            self.actor_optimiser.step()
-            fast = [part.detach() for part in (*self.weights, *self.biases, *self.actor.parameters())]
-            slow = [*self.slow_weights, *self.slow_biases, *slow_actor.parameters()]
-            with torch.no_grad():
-                torch._foreach_lerp_(slow, fast, c.tau)
+    def least(self, x: torch.Tensor) -> torch.Tensor:
+        return self.values(x, self.slow_weights, self.slow_biases).amin(0)
+
+    def loss(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return 2.0 * (self.values(x, self.weights, self.biases) - y).square().mean()
+
+    def first(self, x: torch.Tensor) -> torch.Tensor:
+        return self.values(x, *([part.detach()[:1] for part in parts] for parts in (self.weights, self.biases)))
+
+    def follow(self) -> None:
+        fast = [part.detach() for part in (*self.weights, *self.biases, *self.actor.parameters())]
+        slow = [*self.slow_weights, *self.slow_biases, *self.targets[0].parameters()]
+        torch._foreach_lerp_(slow, fast, self.config.tau)
 
 
 def products(config: TD3Config, inputs: int) -> Callable[[], None]:

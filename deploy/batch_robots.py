@@ -107,12 +107,13 @@ class BatchRobots:
             cut = self._outcome.decided & (self._outcome.answers.kind == KINDS.index(FAILSAFE))
             penalty = np.where(cut, np.maximum(rewards - self._robot.task.reward.cut, 0.0), 0.0)
         ended = terminated | truncated
+        decided = False if self._outcome is None else self._outcome.decided[:, None]
         columns: dict[str, Any] = {
             "episode": episodes,
             "step": steps,
             "index": index,
             "observation": seen,
-            "proposed": np.where(self._decided() | np.isfinite(self._proposals), self._proposals, self._inputs),
+            "proposed": np.where(decided | np.isfinite(self._proposals), self._proposals, self._inputs),
             "action": self._inputs,
             "next_observation": infos.get("final_obs", self.observations),
             "reward": rewards,
@@ -158,12 +159,6 @@ class BatchRobots:
             step = pb.Step(actor=name, **common, **dict(zip(columns, row, strict=True)))
             step.header.time = time
             yield step
-
-    def _decided(self) -> NDArray[np.bool_]:
-        """Return (N, 1) whether the filter decided about a robot's proposal."""
-        if self._outcome is None:
-            return np.zeros((len(self.names), 1), dtype=bool)
-        return self._outcome.decided[:, None]
 
     def _draw_episode(self, number: int) -> int:
         """Return the seed of a robot's next episode, which begins now."""

@@ -18,7 +18,8 @@ UNKNOWN = "cannot be inferred from the log"
 
 def fill_template(template: str, schema: InferredSchema, source: str) -> str:
     """Return the template with the values that the log shows; comments mark values that it does not show."""
-    horizon, brake = periods(schema)
+    brake, late = brake_periods(schema.period, schema.states, schema.inputs)
+    horizon, brake = min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
     states = [f"# error: {UNKNOWN}.", *map(_state, schema.states)]
     inputs = ["# low, high, slew: the ranges in the log, rounded outwards. The robot may allow more."]
     inputs += [*map(_input, schema.inputs)] if schema.inputs else [f"# Inputs {UNKNOWN}: these come from the template."]
@@ -48,17 +49,6 @@ def _verbatim(*lines: str) -> str:
     return "".join(f"{line}\n" for line in lines).replace("\\", r"\\")
 
 
-def periods(schema: InferredSchema) -> tuple[int, int]:
-    """Return (horizon, brake) in periods from the braking and the delays in the log: an estimate, not a bound."""
-    brake, late = brake_periods(schema.period, schema.states, schema.inputs)
-    return min(1 + brake + late + 1, MOST_PERIODS), min(brake, MOST_PERIODS - 2)
-
-
-def slew(one: InferredColumn) -> float | None:
-    """Return the slew limit of an input per period, or None if the input jumps."""
-    return None if one.jumps else _outwards(one.change)
-
-
 def _state(one: InferredColumn) -> str:
     values: dict[str, Any] = {"unit": one.unit or "1"}
     values |= {"role": one.role} if one.role != "other" else {}
@@ -71,7 +61,7 @@ def _state(one: InferredColumn) -> str:
 
 
 def _input(one: InferredColumn) -> str:
-    most, steers = slew(one), one.unit == "rad"
+    most, steers = None if one.jumps else _outwards(one.change), one.unit == "rad"
     values: dict[str, Any] = {"unit": one.unit or "1"}
     values |= {"low": min(_outwards(one.least), 0.0), "high": max(_outwards(one.most), 0.0)}
     values |= {} if most is None else {"slew": most}

@@ -88,8 +88,11 @@ def collect(
             recorded += added
             advance(added)
     if chord_deviation is None:
+        # Twice a·T²/8 in m: a path with acceleration a leaves its chord by a·T²/8 within a period T. The second
+        # differences of the positions are a·T².
         sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-        chord_deviation = 0.0 if sampled else _chord_deviation_bound(robot, trajectories)
+        sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
+        chord_deviation = 0.0 if sampled else max((float(size.max()) for size in sizes), default=0.0) / 4.0
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
     data = Dataset(robot, tuple(trajectories), about, chord_deviation)
     data.check()
@@ -139,12 +142,3 @@ class _Environment:
 
     def _state(self, observation: Any, info: dict[str, Any]) -> Array:
         return np.array(self.view(self.env, observation, info), dtype=float)
-
-
-def _chord_deviation_bound(robot: Robot, trajectories: list[Trajectory]) -> float:
-    """Return twice a·T²/8 in m: a path with acceleration a leaves its chord by a·T²/8 within a period T.
-
-    The second differences of the positions are a·T².
-    """
-    sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
-    return max((float(size.max()) for size in sizes), default=0.0) / 4.0

@@ -49,11 +49,6 @@ def delay_of(log: AlignedLog, name: str, follower: str) -> float | None:
     return estimate_delay(recordings, log.period)
 
 
-def largest_change(log: AlignedLog, name: str) -> float:
-    """Return the largest change of an input over one period."""
-    return float(np.abs(log.change(name, *log.spans(log.period))).max())
-
-
 def braking_per_period(log: AlignedLog, name: str) -> float:
     """Return the 95 % quantile of the decrease of a coordinate's magnitude per period, without noise."""
     i, j = log.spans(log.period)

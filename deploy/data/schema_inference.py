@@ -20,7 +20,6 @@ from brakeline.deploy.data.input_response import (
     braking_per_period,
     delay_of,
     followers_of_inputs,
-    largest_change,
     moves_alone,
 )
 from brakeline.deploy.data.log_options import PLAIN, LogOptions
@@ -141,7 +140,7 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
     for count in (1, 2, 3, 4, 5, 8, 10, 15, 20):
         log.period = count * beat
         states, inputs = _states(log, others, pairs), _inputs(log)
-        if stop_periods(log.period, states, inputs) <= LONGEST_PLAN:
+        if sum(brake_periods(log.period, states, inputs)) <= LONGEST_PLAN:
             break
     why += f"; {count} of them, so that a stop takes at most {LONGEST_PLAN}" if count > 1 else ""
     return InferredSchema(float(f"{log.period:.3g}"), why, tuple(states), tuple(inputs), tuple(dict.fromkeys(notes)))
@@ -183,14 +182,8 @@ def _period(log: AlignedLog) -> tuple[float, str]:
     return period, GUESS
 
 
-def stop_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> int:
-    """Return how many periods the strongest braking and the delays take: an estimate, not a bound."""
-    brake, late = brake_periods(period, states, inputs)
-    return brake + late
-
-
 def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> tuple[int, int]:
-    """Return the periods of the braking, and those of the longest delay."""
+    """Return the periods of the strongest braking, and those of the longest delay: estimates, not bounds."""
     ramps = [(max(-c.least, c.most), c.change) for c in inputs if c.jumps is False and c.change > 0.0]
     falls = [(max(abs(c.least), abs(c.most)), c.change) for c in states if c.follows and c.change > 0.0]
     brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
@@ -212,10 +205,9 @@ def _states(log: AlignedLog, others: Sequence[str], pairs: dict[str, str]) -> li
 
 
 def _inputs(log: AlignedLog) -> list[InferredColumn]:
-    return [
-        _column(log, n, name=_plain(n, log), change=largest_change(log, n), moves=moves_alone(log, n))
-        for n in log.inputs
-    ]
+    spans = log.spans(log.period)
+    most = {n: float(np.abs(log.change(n, *spans)).max()) for n in log.inputs}  # changes over one period
+    return [_column(log, n, name=_plain(n, log), change=most[n], moves=moves_alone(log, n)) for n in log.inputs]
 
 
 def _column(log: AlignedLog, column: str, name: str = "", unit: str = "", **more: Any) -> InferredColumn:

@@ -143,20 +143,7 @@ class CellRun:
         """Train another learner with many robots at once, as `_train_single` returns it."""
         from brakeline.deploy.experiments.sac_training import train_sac  # Stable-Baselines3 is an extra
 
-        cell = self.cell
-        return train_sac(
-            self.robot,
-            self._safety(trial),
-            cell.name,
-            cell.robots,
-            cell.td3,
-            cell.steps,
-            cell.seed,
-            take,
-            begin,
-            arena=trial.arena,
-            penalty=cell.penalty,
-        )
+        return train_sac(self.robot, self._safety(trial), self.cell, take, begin)
 
     def _evaluate(self, trial: TrialConfig) -> dict[str, Any]:
         self.say(trial.name)

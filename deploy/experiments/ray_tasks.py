@@ -70,11 +70,6 @@ def supplies_of(robot: str) -> Files:
     return {str(path.relative_to(data_root())): path.read_bytes() for path in paths}
 
 
-def files_in(folder: Path) -> Files:
-    """Return all files below a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 def write_files(folder: Path, files: Files) -> None:
     """Write files below a folder, each atomically.
 
@@ -141,4 +136,5 @@ def _run_remotely(task: StudyTask, supplies: Files, said: Any) -> tuple[Any, Fil
         say(f"begun on {os.uname().nodename}")
         result = task.run(folder, say)
         say(f"took {time.time() - started:.0f} s")
-        return result, files_in(folder) if folder.exists() else {}
+        written = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+        return result, {str(path.relative_to(folder)): path.read_bytes() for path in written}

@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from brakeline.actors.episode_runner import ActorIdentity
 from brakeline.deploy.batch_robots import BatchRobots
+from brakeline.deploy.experiments.comparison_cells import CellConfig
 from brakeline.deploy.run.batch_trainer import actor_names
-from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
@@ -87,35 +87,25 @@ class RobotsAsVecEnv(VecEnv):
 
 
 def train_sac(
-    robot: RobotWithTask,
-    safety: BatchMethod | None,
-    names: str,
-    size: int,
-    config: TD3Config,
-    steps: int,
-    seed: int,
-    take: Take,
-    begin: Begin,
-    **options: Any,
+    robot: RobotWithTask, safety: BatchMethod | None, cell: CellConfig, take: Take, begin: Begin
 ) -> tuple[MLP, int]:
-    """Train a policy, and return it with the number of updates.
+    """Train the policy of a cell in its first arena, and return it with the number of updates.
 
     Args:
         safety: decides; None: each robot executes what it proposes.
-        names: of the process, from which `actor_names` makes the names of `size` robots.
-        config: the settings that SAC shares with TD3; its learning rate is the actor's.
+        cell: its settings of TD3 are those that SAC shares with it; the learning rate is the actor's.
         take, begin: called with each step, and with the description of each episode.
-        options: arena, penalty: see `BatchRobots`.
     """
     torch.set_num_threads(1)
-    actors, episodes = actor_names(names, size), [0] * size
+    config, actors, episodes = cell.td3, actor_names(cell.name, cell.robots), [0] * cell.robots
 
     def next_episode(number: int) -> tuple[int, int]:
         episodes[number] += 1
         episode = episodes[number] - 1
-        return episode, ActorIdentity(actors[number], number, seed).episode_seed(episode)
+        return episode, ActorIdentity(actors[number], number, cell.seed).episode_seed(episode)
 
-    robots = BatchRobots(robot, actors, safety, next_episode, seed_key=seed, **options)
+    options: dict[str, Any] = {"arena": cell.arenas[0], "seed_key": cell.seed, "penalty": cell.penalty}
+    robots = BatchRobots(robot, actors, safety, next_episode, **options)
     env = RobotsAsVecEnv(robot, robots, config.reward_scale, take, begin)
     try:
         model = SAC(
@@ -128,12 +118,12 @@ def train_sac(
             tau=config.tau,
             gamma=config.gamma,
             n_steps=config.n_step,
-            gradient_steps=max(1, round(config.updates_per_step * size)),  # for one step of each robot
+            gradient_steps=max(1, round(config.updates_per_step * cell.robots)),  # for one step of each robot
             policy_kwargs={"net_arch": list(config.hidden)},
-            seed=seed,
+            seed=cell.seed,
             device="cpu",
         )
-        model.learn(total_timesteps=steps)
+        model.learn(total_timesteps=cell.steps)
     finally:
         env.close()
     return MLP(robot, _layers(model)), int(model._n_updates)

@@ -95,7 +95,9 @@ class LivePage:
                 return
             self._url = json.loads(line)["page"]
             self.notice = f"live page: {self._url}"
-            if self._browser and has_display():
+            # Without a display, Python would open a browser for text in the terminal.
+            display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            if self._browser and (display or sys.platform in ("darwin", "win32")):
                 webbrowser.open(self._url)
             self._ended.wait()
         popen.terminate()
@@ -110,11 +112,6 @@ class LivePage:
             return launcher_pid(self._folder) == os.getpid()
         except (OSError, ValueError, KeyError):
             return False
-
-
-def has_display() -> bool:
-    """Return whether this machine shows windows. Without any, Python would open a browser for text in the terminal."""
-    return sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def main(parent: str, *words: str) -> int:

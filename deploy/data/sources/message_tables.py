@@ -33,32 +33,12 @@ class MessageKind(NamedTuple):
 
 
 @dataclass
-class _Rows:
-    """Consecutive messages with the same fields: their numbers, message by message."""
-
-    names: tuple[str, ...]
-    count: int = 0
-    numbers: array[float] = field(default_factory=lambda: array("d"))
-
-
-@dataclass
 class _Stream:
     """The messages of one table."""
 
     kind: MessageKind
     stamps: array[int] = field(default_factory=lambda: array("q"))  # of each message: number, stamp, receive time [ns]
-    parts: list[_Rows] = field(default_factory=list)
-
-    def columns(self) -> Columns:
-        """Return a column (T,) for each field, NaN where a message does not have it."""
-        columns: Columns = {}
-        total, row = len(self.stamps) // 3, 0
-        for part in self.parts:
-            values = np.array(part.numbers).reshape(part.count, len(part.names))
-            for i, name in enumerate(part.names):
-                columns.setdefault(name, np.full(total, np.nan))[row : row + part.count] = values[:, i]
-            row += part.count
-        return columns
+    columns: dict[str, array[float]] = field(default_factory=dict)  # of each field: NaN where a message lacks it
 
 
 class MessageTables:
@@ -84,11 +64,11 @@ class MessageTables:
             return
         numbers = {field: float(value) for field, value in fields if isinstance(value, int | float)}
         stream = self._streams.setdefault(name, _Stream(kind))
-        names = tuple(numbers)
-        if not stream.parts or stream.parts[-1].names != names:
-            stream.parts.append(_Rows(names))
-        stream.parts[-1].count += 1
-        stream.parts[-1].numbers.extend(numbers.values())
+        for column in numbers:
+            if column not in stream.columns:
+                stream.columns[column] = array("d", [np.nan]) * (len(stream.stamps) // 3)
+        for column, values in stream.columns.items():
+            values.append(numbers.get(column, np.nan))
         stream.stamps.extend((self._count, stamp, received))
         self._count += 1
 
@@ -124,7 +104,7 @@ class MessageTables:
 
     def _table(self, name: str, clock: _Clock, since: int) -> Table:
         stream, order = self._streams[name], np.argsort(clock.times, kind="stable")
-        columns = {field: values[order] for field, values in stream.columns().items()}
+        columns = {field: np.array(values)[order] for field, values in stream.columns.items()}
         time = (clock.times[order] - since) / 1e9
         table = Table(name, time, columns, clock.runs[order], rank=stream.kind.rank)
         return with_quantities(table, stream.kind, self.path)
