@@ -159,7 +159,6 @@ class LearnerTuning:
 
 def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
     """Return the value of the tuned setting with which a cell was made; None if its file does not say."""
-
     method = cell["study"]["method"]
     if method in SETTINGS:
         return float(cell["study"]["td3"][SETTINGS[method][0]])
@@ -169,7 +168,6 @@ def value_in_use(cell: dict[str, Any], footprint: float) -> float | None:
 
 def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> list[FilterTuning | LearnerTuning]:
     """Return the jobs that tune the rivals among some methods."""
-
     jobs: list[FilterTuning | LearnerTuning] = []
     task = robot_with_task(robot).task
     for method in methods:

@@ -178,7 +178,7 @@ def read_here(reader: str, path: Path) -> list[Table]:
 def _answer(reader: str, path: Path, out: IO[bytes]) -> None:
     """Write the tables, or the error, to `out`."""
     try:
-        np.savez(out, **packed(read_here(reader, path)))
+        _save(out, packed(read_here(reader, path)))
         return
     except MemoryError:
         header: dict[str, Any] = {"memory": True}
@@ -188,7 +188,11 @@ def _answer(reader: str, path: Path, out: IO[bytes]) -> None:
         header = {"error": str(error)}
     out.seek(0)
     out.truncate()
-    np.savez(out, **{HEADER: _as_array(header)})
+    _save(out, {HEADER: _as_array(header)})
+
+
+def _save(out: IO[bytes], arrays: dict[str, Any]) -> None:
+    np.savez(out, **arrays)
 
 
 def set_limits(seconds: float, size: int) -> None:
