@@ -99,11 +99,8 @@ def to_tlog(paths: Paths, file: BinaryIO) -> int:
     return count
 
 
-def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
-    """Write a log's messages to `out` with new Foxglove scenes, and return the number of messages.
-
-    Args:
-        rate: scenes per second and actor; infinity draws every step.
+def to_foxglove(paths: Paths, out: Path) -> int:
+    """Write a log's messages to `out` with new Foxglove scenes of all steps, and return the number of messages.
 
     Raises:
         ExportError: `out` exists, or the log has no message.
@@ -113,7 +110,7 @@ def to_foxglove(paths: Paths, out: Path, rate: float = math.inf) -> int:
     if out.exists():
         raise ExportError(f"{out} exists already")
     log = open_log(paths)
-    converter = FoxgloveConverter(rate, log.robots)
+    converter = FoxgloveConverter(math.inf, log.robots)
     segment: Segment | None = None
     count = 0
     batch: list[Entry] = []

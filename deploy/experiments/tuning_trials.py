@@ -62,13 +62,11 @@ def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
     return robot.task.rivals.margins if method == SECAS else VALUES[method]
 
 
-def try_threshold(
-    model: Pretrained, robot: RobotWithTask, value: float, episodes: int, arena: str = "default"
-) -> ThresholdTrial:
+def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episodes: int) -> ThresholdTrial:
     """Evaluate the model with another threshold on fresh episodes."""
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    oracle, greedy = (fresh_trial(robot, arena, policy, question, episodes) for policy in (ORACLE, GREEDY))
+    oracle, greedy = (fresh_trial(robot, "default", policy, question, episodes) for policy in (ORACLE, GREEDY))
     reached, driven = oracle.columns(), greedy.columns()
     return ThresholdTrial(
         value,
