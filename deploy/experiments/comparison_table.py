@@ -189,10 +189,6 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
-def _head(method: str, counts: dict[str, int]) -> str:
-    return f"{NAMES[method]}, n = {counts[method]}" if method in counts else method
-
-
 def markdown(figures: dict[str, Any]) -> str:
     """Return the tables of one robot as Markdown, with the paper's figures in italics."""
     robot, counts = figures["robot"], {method: len(seeds) for method, seeds in figures["seeds"].items()}
@@ -217,5 +213,6 @@ def markdown(figures: dict[str, Any]) -> str:
             beside = [_paper(robot, row, method) for method in methods]
             if part not in ("training", "deployment") and any(beside):
                 rows.append(["*paper*", *(f"*{text}*" if text else "" for text in beside)])
-        lines += [f"## {part}", "", *markdown_table(["", *(_head(m, counts) for m in methods)], rows), ""]
+        heads = [f"{NAMES[m]}, n = {counts[m]}" if m in counts else m for m in methods]
+        lines += [f"## {part}", "", *markdown_table(["", *heads], rows), ""]
     return "\n".join(lines)

@@ -205,7 +205,8 @@ def _main(found: RobotResults) -> list[str]:
     rows = []
     for method in found.cells:
         counts = [_share(*found.collisions(method, arena)) for arena in found.arenas]
-        rows.append([METHODS[method].label, *counts, _range(found.training_collisions(method))])
+        trained = found.training_collisions(method)
+        rows.append([METHODS[method].label, *counts, f"{np.mean(trained):.1f} ({min(trained)} to {max(trained)})"])
     lines += [*markdown_table(heads, rows), ""]
     heads = ["method", "steps to 90 % of goals", "runs that got there"]
     heads += [f"interventions, `{arena}`" for arena in found.arenas]
@@ -241,10 +242,6 @@ def _steps(figures: Result) -> str:
 def _share(count: int, episodes: int) -> str:
     low, high = clopper_pearson(count, episodes) or (0.0, 1.0)
     return f"{count} of {episodes:,}: {100.0 * count / episodes:.2f} % [{100.0 * low:.2f}, {100.0 * high:.2f}]"
-
-
-def _range(counts: Sequence[int]) -> str:
-    return f"{np.mean(counts):.1f} ({min(counts)} to {max(counts)})"
 
 
 def _improvements(found: RobotResults) -> list[str]:
