@@ -19,6 +19,7 @@ from brakeline.errors import BadData, BadModel, BadStep, ErrorBoundError, Implau
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
+from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
@@ -31,7 +32,7 @@ MEMORY = 20.0  # minutes of driving, of all robots of the kind together
 PAUSE = 1.0  # minutes of driving from one attempt to the next
 SPARE = 1.2  # factor on the driving that the accepted bound needs: windows must not cross the ends of trajectories
 TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
-DOMAIN = 0.75  # least ratio of the recorded range of a speed or an input to that of the model set in use
+DOMAIN = 0.6  # least ratio of the recorded range of a speed or an input to that of the model set in use
 MOST_ROBOTS = 10_000
 SILENT = 30.0  # s after which a robot counts as gone
 
@@ -228,8 +229,9 @@ def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -
     if covered < DOMAIN:
         return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
     new, old = (_mean_half_width(m, data) for m in (model, in_use))
-    if new > TIGHTER * widening * old:
-        return f"its sets are {new / (widening * old):.2g} times as wide as those in use, as widened"
+    old *= Filter(in_use).constraints.plan_widening(widening)
+    if new > TIGHTER * old:
+        return f"its sets are {new / old:.2g} times as wide as those in use, as widened"
     return ""
 
 
@@ -242,4 +244,7 @@ def _mean_half_width(model: ModelSet, data: Dataset) -> float:
     z = windows(data, robot.horizon, FREE).z
     if model.model_config.windows == PLAN:
         z = z[:, : robot.regressor_dim + robot.free_steps * robot.action_dim]
-    return float(model.steps[-1].half_widths(z)[:, : robot.position_dim].mean())
+    half_widths = model.steps[-1].half_widths(z)[:, : robot.position_dim].mean(axis=1)
+    if model.one_step is not None:
+        half_widths *= model.one_step.stretches(robot, z)[:, -1]
+    return float(half_widths.mean())

@@ -16,9 +16,10 @@ from brakeline.deploy.run.run_keys import check_adaptable, check_signer
 from brakeline.errors import BadModel, BadStep, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import MODEL
+from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
-from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig
+from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig, ModelSet
 from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
 from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
@@ -109,14 +110,20 @@ def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(ki
 def test_a_set_that_predicts_plans_only_is_compared_on_plans_with_the_first_driven_inputs():
     data = Dataset(ROBOT, driven(2, 7, slip=-0.15))
     free, stops = certify(record(1, 6), ModelConfig(mode=DIRECT, windows=FREE))[0], plan_regressor_map(ROBOT)
-    plans = replace(
-        free, steps=tuple(step.through(stops) for step in free.steps), model_config=ModelConfig(mode=DIRECT)
+    steps, *more = (part.through(stops) for part in free.steps), free.chord_deviations, free.stopping_distance
+    chords, stopping = (part.through(stops) for part in more)
+    plans = ModelSet(
+        ROBOT, ModelConfig(mode=DIRECT), tuple(steps), chords, stopping, free.domain, np.eye(stops.shape[1]), free.about
     )
     begun = windows(data, ROBOT.horizon, FREE).z[:, : stops.shape[1]]
     expected = free.steps[-1].half_widths(begun @ stops.T)[:, :2].mean()
     assert adaptation._mean_half_width(plans, data) == pytest.approx(expected)
-    assert adaptation._looser(in_use(), plans, 8.0, data) == ""
-    assert "times as wide as those in use" in adaptation._looser(in_use(), plans, 0.01, data)
+    new = replace(in_use(), steps=tuple(_wider(step, 4.0) for step in in_use().steps))
+    growth = Filter(plans).constraints.growth
+    even = adaptation._mean_half_width(new, data) / (adaptation.TIGHTER * expected * growth)
+    assert growth > 1.1 and even > 1.0, "sets of plans widen by more than a request asks for"
+    assert adaptation._looser(new, plans, 1.01 * even, data) == ""
+    assert "times as wide as those in use" in adaptation._looser(new, plans, 0.99 * even, data)
     check_adaptable(plans)
 
 
@@ -197,13 +204,13 @@ def test_a_version_that_is_not_known_is_not_replaced():
 
 @pytest.mark.long
 def test_without_a_change_a_set_is_replaced_by_a_tighter_one_after_a_quarter_of_an_hour():
-    wide = replace(in_use(), steps=tuple(_wider(step) for step in in_use().steps))
+    wide = replace(in_use(), steps=tuple(_wider(step, 2.0) for step in in_use().steps))
     attempts = drive(Adaptation(ROBOT, lambda version: wide, ACCEPTED), driven(6, 23))
     assert len(attempts) == 1 and attempts[0].model is not None and "15.0 minutes without" in attempts[0].text
 
 
-def _wider(bound: ErrorBound) -> ErrorBound:
-    return replace(bound, kappa=2.0 * bound.kappa, w=2.0 * bound.w)
+def _wider(bound: ErrorBound, by: float) -> ErrorBound:
+    return replace(bound, kappa=by * bound.kappa, w=by * bound.w)
 
 
 def test_the_memory_is_bounded_and_steps_of_the_wrong_size_are_rejected(kind):
