@@ -22,6 +22,7 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
 from brakeline.safety.model.windows import FREE, PLAN, windows
 
@@ -32,7 +33,7 @@ MEMORY = 20.0  # minutes of driving, of all robots of the kind together
 PAUSE = 1.0  # minutes of driving from one attempt to the next
 SPARE = 1.2  # factor on the driving that the accepted bound needs: windows must not cross the ends of trajectories
 TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
-DOMAIN = 0.6  # least ratio of the recorded range of a speed or an input to that of the model set in use
+DOMAIN = 0.75  # least ratio of the recorded range of a speed or an input to that of the model set in use
 MOST_ROBOTS = 10_000
 SILENT = 30.0  # s after which a robot counts as gone
 
@@ -236,12 +237,9 @@ def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -
 
 
 def _mean_half_width(model: ModelSet, data: Dataset) -> float:
-    """Return the mean half-width of the position at the end of the windows in the data [m].
-
-    For a model set that predicts plans only, these are the plans with the first inputs of the windows.
-    """
+    """Return the mean half-width of the position at the end of plans that begin as the windows in the data do [m]."""
     robot = data.robot
-    z = windows(data, robot.horizon, FREE).z
+    z = plans_from(robot, windows(data, robot.horizon, FREE).z)
     if model.model_config.windows == PLAN:
         z = z[:, : robot.regressor_dim + robot.free_steps * robot.action_dim]
     half_widths = model.steps[-1].half_widths(z)[:, : robot.position_dim].mean(axis=1)

@@ -20,6 +20,7 @@ from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig, ModelSet
+from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
 from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
@@ -107,7 +108,7 @@ def test_a_changed_robot_gets_a_tighter_set_of_what_it_drove_since_the_change(ki
     assert 0.5 < ratio[0] / ratio[1] < 2.0, "as if the changed robot had been recorded"
 
 
-def test_a_set_that_predicts_plans_only_is_compared_on_plans_with_the_first_driven_inputs():
+def test_a_set_that_predicts_plans_only_is_compared_on_plans_as_they_are_widened():
     data = Dataset(ROBOT, driven(2, 7, slip=-0.15))
     free, stops = certify(record(1, 6), ModelConfig(mode=DIRECT, windows=FREE))[0], plan_regressor_map(ROBOT)
     steps, *more = (part.through(stops) for part in free.steps), free.chord_deviations, free.stopping_distance
@@ -115,8 +116,8 @@ def test_a_set_that_predicts_plans_only_is_compared_on_plans_with_the_first_driv
     plans = ModelSet(
         ROBOT, ModelConfig(mode=DIRECT), tuple(steps), chords, stopping, free.domain, np.eye(stops.shape[1]), free.about
     )
-    begun = windows(data, ROBOT.horizon, FREE).z[:, : stops.shape[1]]
-    expected = free.steps[-1].half_widths(begun @ stops.T)[:, :2].mean()
+    begun = plans_from(ROBOT, windows(data, ROBOT.horizon, FREE).z)
+    expected = free.steps[-1].half_widths(begun)[:, :2].mean()
     assert adaptation._mean_half_width(plans, data) == pytest.approx(expected)
     new = replace(in_use(), steps=tuple(_wider(step, 4.0) for step in in_use().steps))
     growth = Filter(plans).constraints.growth
