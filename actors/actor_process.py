@@ -31,9 +31,9 @@ from brakeline.actors.proposers import FixedPolicy, LearnedPolicy, PolicyFactory
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
-from brakeline.safety.filter.backup_plan import Array
 from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.service.client import query_service
 

@@ -8,8 +8,8 @@ from time import perf_counter_ns
 
 from brakeline.errors import BusError, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.backup_plan import Array, BackupPlan
+from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import read_reply
 from brakeline.safety.service.filter_client import Answer, accept
 

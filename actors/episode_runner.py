@@ -19,8 +19,9 @@ from brakeline.actors.decision_guard import Ask, DecisionOutcome, at_rest, next_
 from brakeline.actors.slow_down import SlowDown
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle_messages import obstacle_messages
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.backup_plan import Array, BackupPlan, correction_penalty
+from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KIND_NUMBERS

@@ -40,9 +40,9 @@ from brakeline.actors.mavlink.vehicle_messages import FlightRequest
 from brakeline.actors.proposers import PolicyFactory, Stop
 from brakeline.errors import BusError, Mismatch, TakeoffNotVerified
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
-from brakeline.safety.filter.backup_plan import Array, BackupPlan
+from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 from brakeline.safety.service.client import query_service, request_message
 from brakeline.sim.arena import Arena

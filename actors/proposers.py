@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.learner_client import LearnerClient
-from brakeline.safety.filter.backup_plan import Array
+from brakeline.messaging.robot import Array
 from brakeline.sim.scripted_policies import Policy, scripted
 
 Stop = Callable[[], bool]  # whether to end

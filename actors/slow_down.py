@@ -11,12 +11,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger("brakeline.actor")
 

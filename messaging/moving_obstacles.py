@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Obstacle, Shapes
-
-Array = NDArray[np.float64]
+from brakeline.messaging.obstacle import Array, Obstacle, Shapes
 
 
 @dataclass(frozen=True)

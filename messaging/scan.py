@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
-from brakeline.messaging.obstacle import FARTHEST
-
-Array = NDArray[np.float64]
+from brakeline.messaging.obstacle import FARTHEST, Array
 
 MAX_BEAMS = 1000
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]

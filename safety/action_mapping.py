@@ -8,12 +8,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brakeline.errors import Mismatch
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 SAME_BOUND = 1e-6  # of an input's range: rounding error of bounds in single precision
 

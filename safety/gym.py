@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import BusError
+from brakeline.messaging.robot import Array
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
@@ -29,7 +29,6 @@ from brakeline.safety.service.in_process import InProcess, request_observation
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
 
-Array = NDArray[np.float64]
 
 UNANSWERED = "unanswered"  # in place of a decision's kind: no service answered, so the backup plan continued
 

@@ -12,18 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask, DecisionOutcome, next_input, request_decisions
 from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.messaging.obstacle import BOX, Obstacle, Shapes
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.wire import KIND_NUMBERS
-
-Array = NDArray[np.float64]
 
 SCAN_DIFFERENCE = 0.035  # m by which two scans of one obstacle may differ, about
 MOST_SAMPLES = 10_000  # the latest delays and decision times that count

@@ -23,10 +23,8 @@ from numpy.typing import NDArray
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
-
-Array = NDArray[np.float64]
 
 EXTRA_SIGHT = 0.2  # m: hits count up to the robot's sight plus this, since it drives on until the next scan
 STRAIGHT = 0.02  # m: hits that are nearer to a line belong to one wall

@@ -6,9 +6,8 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array
 
 HISTORY = 2.0  # s
 EXTRAPOLATION = 0.1  # s after the newest odometry, for which the last speeds are assumed

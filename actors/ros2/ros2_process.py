@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
@@ -24,7 +23,7 @@ from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSetting
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, Mismatch
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
@@ -40,8 +39,6 @@ from brakeline.messaging.ros2.cdr_messages import (
 )
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.service.wire import KIND_NUMBERS
-
-Array = NDArray[np.float64]
 
 log = logging.getLogger("brakeline.ros2")
 

@@ -7,7 +7,6 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
 from brakeline.actors.ros2.odometry import OdometryHistory
@@ -15,10 +14,8 @@ from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, frame
 from brakeline.errors import BadScan, InputMissing
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.ros2.cdr_messages import LaserScan, Odometry, TFMessage, Twist, TwistStamped, seconds, yaw_of
-
-Array = NDArray[np.float64]
 
 LONGEST_FRAME = 100  # characters of a frame's name
 OTHER_CLOCK = 1e3  # s: a message of this age has the time of another clock

@@ -7,13 +7,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.filter.widening import PastWindow, Widening
-
-Array = NDArray[np.float64]
 
 SAME_SET = 1e-9  # m, rad, ...: rounding allowed in the comparison of a measurement with its predicted set
 UNVERIFIED = "unverified"  # in place of a version: no model set verified the committed plan

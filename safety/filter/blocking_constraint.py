@@ -5,19 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.perception.occluded_regions import OccludedRegions
 from brakeline.safety.perception.scan_free_space import OccupiedCells
 from brakeline.safety.perception.scan_free_space import half_spaces as unseen_half_spaces
-
-Array = NDArray[np.float64]
 
 UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 

@@ -20,8 +20,8 @@ from time import perf_counter_ns
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.constraints import TubeConstraints
@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
     from brakeline.safety.filter.batch.request_arrays import RequestArrays
 
-Array = NDArray[np.float64]
 
 WORTH_A_BATCH = 20  # requests for each period of a plan; fewer are decided sooner one by one
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"

@@ -10,11 +10,8 @@ within a period, and a plane for one end alone would exclude the other end.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Shapes
-
-Array = NDArray[np.float64]
+from brakeline.messaging.obstacle import Array, Shapes
 
 TOUCHING = 1e-6  # m; at a smaller distance the normal is undefined
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.kernels import shape_kernels
 from brakeline.safety.filter.recovery import escape_direction
@@ -18,8 +17,6 @@ from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.reservation import OtherReservations
 from brakeline.safety.perception.occluded_regions import OccludedRegions
 from brakeline.safety.perception.scan_free_space import OccupiedCells, occupied_cells
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,10 @@ filter takes the plane that leaves both ends the most room.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.halfspaces import TOUCHING
-
-Array = NDArray[np.float64]
 
 
 def swept_half_spaces(

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.compilation import compiled
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 
 @compiled("f8[::1](f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")

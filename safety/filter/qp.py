@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.kernels import halfspace_kernels
 from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 ROW_TIGHTENING = 1e-6  # m by which the QP's rows are tighter, so that a rounded answer passes the exact check

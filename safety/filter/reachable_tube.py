@@ -14,13 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.error_bounds import ErrorBound
 
 if TYPE_CHECKING:
     from brakeline.safety.model.one_step import OneStep, Predictor
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

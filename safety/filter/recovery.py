@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Shapes
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 SLOW = 0.3  # of the range of inputs that move the robot
 BETTER = 1e-4  # m; a smaller difference does not count

@@ -13,15 +13,13 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import FARTHEST, Shapes
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 from brakeline.safety.filter.widening import PastWindow
-
-Array = NDArray[np.float64]
 
 ALLOWED, ADJUSTED, FAILSAFE, RECOVERING = "allowed", "adjusted", "failsafe", "recovering"
 MOST_OBSERVED = 4096  # numbers in an observation

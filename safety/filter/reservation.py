@@ -21,13 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import Array, Shapes
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.qp import ConstraintRows
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

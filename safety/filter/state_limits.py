@@ -5,14 +5,11 @@ from __future__ import annotations
 from copy import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.qp import ConstraintRows
 from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.model.model_set import extra_coordinates
-
-Array = NDArray[np.float64]
 
 
 class StateLimits:

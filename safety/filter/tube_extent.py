@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
-
-Array = NDArray[np.float64]
 
 ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
 EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout

@@ -13,14 +13,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.plan_search import DecisionRecord, PlanCandidate, PlanSearch
 from brakeline.safety.filter.request import ADJUSTED
-
-Array = NDArray[np.float64]
 
 BLOCKED = 0.3  # of the proposed speed: a robot that may drive at least as fast is not blocked
 SLOWEST = 0.08  # of the speed's range: a robot that is proposed to drive slower means to stand

@@ -12,11 +12,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 WINDOWS = 600  # last windows whose scores count
 PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets

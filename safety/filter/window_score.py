@@ -5,13 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.model_set import ModelSet, scored_coordinates
 from brakeline.safety.model.one_step import OneStep
-
-Array = NDArray[np.float64]
 
 
 class WindowScore:

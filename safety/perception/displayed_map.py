@@ -10,19 +10,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle_messages import obstacle_of
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import measurement_in
 from brakeline.safety.perception.image_coverage import patch_free_ranges
 from brakeline.safety.perception.scan_coverage import gaps
-
-Array = NDArray[np.float64]
 
 OUTLINE = 120  # corners of a drawn outline, about
 SWEPT = 4  # periods at whose end the reach of a moving obstacle is drawn on pages

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.image_coverage import GridWindow, Single, by_mesh, patch_free_ranges
 from brakeline.safety.perception.visibility_memory import FanMemory, VisibilityMemory
-
-Array = NDArray[np.float64]
 
 CAPACITY = 4  # images
 SPACING = 0.5  # m: smallest motion between two stored images

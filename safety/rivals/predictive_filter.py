@@ -19,16 +19,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request
 from brakeline.safety.model.model_config import PSF as PSF
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle import UnicycleRival
-
-Array = NDArray[np.float64]
 
 SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
 SAMPLES = 4  # of a period

@@ -8,14 +8,12 @@ from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.backup_plan import NO_PREDICTION
 from brakeline.safety.filter.braking import brake, braking_plan
 from brakeline.safety.filter.request import FAILSAFE, NOT_FINITE, Decision, Request, check_for_rival
 from brakeline.safety.rivals.pretrained import Pretrained
-
-Array = NDArray[np.float64]
 
 
 class Rival(ABC):

@@ -16,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadModel
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.request import ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import SAILR as SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
-
-Array = NDArray[np.float64]
 
 
 def normalised_input(robot: Robot, action: Array) -> Array:

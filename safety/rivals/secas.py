@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadModel
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.messaging.robot import Robot, shipped_robots
+from brakeline.messaging.robot import Array, Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
@@ -28,8 +28,6 @@ from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import SECAS as SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
-
-Array = NDArray[np.float64]
 
 SECTOR = 0.55  # rad: width of a sector of rays, about
 LAG = 0.5  # periods until an input takes effect

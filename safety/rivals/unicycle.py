@@ -7,14 +7,12 @@ obstacles of a map, as the filter does.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, BadRequest
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.request import Request, check_for_filter
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
-
-Array = NDArray[np.float64]
 
 OUTSIDE = 1e-9  # m; nearer to an obstacle, no direction leads away from it
 

@@ -14,12 +14,13 @@ import math
 
 import numpy as np
 
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import CBF as CBF
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.unicycle import Array, UnicycleRival
+from brakeline.safety.rivals.unicycle import UnicycleRival
 
 TOLERANCE = 1e-6  # of a scaled row: violated by less, it is met
 SETTINGS = ("ahead", "rate", "margin")  # ℓ [m], α [1/s], margin around obstacles [m]

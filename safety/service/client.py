@@ -16,21 +16,19 @@ from typing import Self
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brakeline.errors import BadRequest, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
-from brakeline.messaging.robot import Robot, robot_named
+from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
 from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
-
-Array = NDArray[np.float64]
 
 DEADLINE = 0.1  # s
 NONCE = 16  # bytes

@@ -17,13 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import Decision
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

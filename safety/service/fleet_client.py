@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike
 
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import (
     DEADLINE,
-    Array,
     BusClient,
     bus_at,
     query_service,

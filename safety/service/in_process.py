@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import MOST_OBSERVED, Request
@@ -23,8 +23,6 @@ from brakeline.safety.service.filter_client import Answer, accept, known_free_in
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
-
-Array = NDArray[np.float64]
 
 
 class InProcess:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
@@ -26,7 +26,6 @@ from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Observations = NDArray[np.float32]
 

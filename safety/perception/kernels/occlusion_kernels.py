@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.compilation import compiled
-from brakeline.messaging.obstacle import FARTHEST
+from brakeline.messaging.obstacle import FARTHEST, Array
 from brakeline.safety.filter.halfspaces import TOUCHING
 from brakeline.safety.perception.kernels.shadow_kernels import (
     AXIS_X,
@@ -31,7 +31,6 @@ from brakeline.safety.perception.kernels.shadow_kernels import (
     rounding,
 )
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Planes: TypeAlias = tuple[Array, Array]
 Normal: TypeAlias = tuple[np.float32, np.float32, np.float32]
