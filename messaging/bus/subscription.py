@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -93,7 +91,7 @@ class Subscription(ReceiverThreads):
 
 
 class Listener(Subscription):
-    """A subscription that checks samples, and knows which publishers are silent."""
+    """A subscription that checks samples."""
 
     def __init__(
         self,
@@ -107,14 +105,8 @@ class Listener(Subscription):
         self.topic, self._cut, self._handler = topic, len(prefix) + 1, handler
         self._delivering = threading.Lock()  # samples come alone and in bundles, by two threads
         self._keys_of: Counter[str] = Counter()  # by identity
-        self._heard: dict[str, float] = {}  # time (time.monotonic) of the latest sample by key
+        self._known: set[str] = set()  # keys
         super().__init__(key, receiver, self._take, rejected)
-
-    def stale(self) -> frozenset[str]:
-        """Return the keys that had samples, but none in the last three periods of the topic's rate."""
-        limit = math.inf if self.topic.stale_after is None else self.topic.stale_after
-        now = time.monotonic()
-        return frozenset(key for key, moment in self._heard.copy().items() if now - moment > limit)
 
     def _take(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)[self._cut :]
@@ -125,9 +117,8 @@ class Listener(Subscription):
         """Check a message, and call the handler with it. Raises Malformed."""
         self._check_size(key, len(payload))
         with self._delivering:
-            if key not in self._heard:
+            if key not in self._known:
                 self._admit(key)
-            self._heard[key] = time.monotonic()
             self._handler(Sample(self.topic, key, payload, received))
 
     def _check_size(self, key: str, size: int) -> None:
@@ -138,9 +129,10 @@ class Listener(Subscription):
         """Check a new key. Raises Malformed."""
         if not all(NAME.fullmatch(part) for part in key.split("/")):
             raise Malformed(f"{key[:200]!r} is no key of {self.topic.name}")
-        if len(self._heard) >= MOST_KEYS:
+        if len(self._known) >= MOST_KEYS:
             raise Malformed(f"{key}: there are already {MOST_KEYS} keys")
         sender = sender_of(self.topic, key)
         if self._keys_of[sender] >= MOST_KEYS_OF_ONE:
             raise Malformed(f"{key[:200]}: {sender} publishes at {MOST_KEYS_OF_ONE} keys already")
         self._keys_of[sender] += 1
+        self._known.add(key)
