@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -133,21 +132,3 @@ class VectorSafetyWrapper(VectorWrapper):
         self._scans = [
             filled(memory, info, period) for memory, info in zip(self._memories, by_environment, strict=True)
         ]
-
-
-def view_each_environment(view: Callable[[Any, Any, dict[str, Any]], Any]) -> View:
-    """Return a view of a `SyncVectorEnv` from a view of one environment."""
-
-    def views(env: Any, observations: Any, infos: dict[str, Any]) -> list[Any]:
-        environments = env.unwrapped.envs
-        by_environment = {
-            name: values
-            for name, values in infos.items()
-            if isinstance(values, np.ndarray) and len(values) == len(environments)
-        }
-        return [
-            view(one, observations[i], {name: values[i] for name, values in by_environment.items()})
-            for i, one in enumerate(environments)
-        ]
-
-    return views

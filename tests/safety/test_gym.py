@@ -16,7 +16,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.gym import UNANSWERED, SafetyWrapper
-from brakeline.safety.gym_vector import VectorSafetyWrapper, view_each_environment
+from brakeline.safety.gym_vector import VectorSafetyWrapper
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
@@ -170,7 +170,11 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     count, policy = 3, np.random.default_rng(5)
     make_one = lambda: Toy(CAR, discs(), steps=12)  # noqa: E731
     vector = gymnasium.vector.SyncVectorEnv([make_one] * count, autoreset_mode=mode)
-    views = {"state": seen, "obstacles": view_each_environment(near), "actions": normalised(CAR)}
+    views = {
+        "state": seen,
+        "obstacles": lambda env, *_: [near(one, None, {}) for one in env.unwrapped.envs],
+        "actions": normalised(CAR),
+    }
     many = VectorSafetyWrapper(vector, ready, 0.5, accept_bound=1.0, **views)
     observations, _ = many.reset(seed=[0, 1, 2])
     alone = [BackupPlan(CAR) for _ in range(count)]
