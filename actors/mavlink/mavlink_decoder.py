@@ -18,6 +18,7 @@ from brakeline.actors.mavlink import telemetry
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
 from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, SOURCES, TRUTH, Array, GeoPosition
+from brakeline.sim.flight_estimator import Quaternion, Vector
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -61,11 +62,9 @@ class MavlinkDecoder:
         # ns, from TIMESYNC: our clock when we asked, the autopilot's then
         self.answers: deque[tuple[int, int]] = deque(maxlen=MOST_TEXTS)
         self.chosen: dict[str, str] = {}  # message by key of SOURCES
-        self.received = self.missed = 0  # frames, by their sequence numbers
-        self._sequence: int | None = None
         self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
-        self._attitude: telemetry.Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
-        self._forces: deque[telemetry.Triple] = deque([(0.0, 0.0, -telemetry.GRAVITY)], 1)
+        self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
+        self._forces: deque[Vector] = deque([(0.0, 0.0, -telemetry.GRAVITY)], 1)
         self._acks: dict[int, int] = {}
         self._parameters: dict[str, float] = {}
         self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
@@ -103,7 +102,6 @@ class MavlinkDecoder:
         for message in self._mav.parse_buffer(data) or ():
             if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
                 continue
-            self._count(message.get_seq())
             if self._tap is not None:
                 self._tap(CapturedFrame(False, bytes(message.get_msgbuf()), message))
             for what, place in SENDERS.get(message.get_type(), ()):
@@ -113,12 +111,6 @@ class MavlinkDecoder:
     def smooth(self, readings: int) -> None:
         """Average this many readings of the accelerometer from now on."""
         self._forces = deque(self._forces, readings)
-
-    def _count(self, sequence: int) -> None:
-        if self._sequence is not None:
-            self.missed += (sequence - self._sequence - 1) % 256
-        self._sequence = sequence
-        self.received += 1
 
     def _take(self, what: str, place: int, message: Any) -> None:
         """Take the quantity `what` from a message, unless a better message provides it."""

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
+from brakeline.sim.flight_estimator import Quaternion, Vector, rotate
 
 Array = NDArray[np.float64]
-Quaternion = tuple[float, float, float, float]  # w, x, y, z
-Triple = tuple[float, float, float]
 
 GRAVITY = 9.81  # m/s²
 MILLIGRAVITY = 9.80665e-3  # m/s², the unit of some accelerometers
@@ -83,21 +82,13 @@ def read_source(source: TelemetrySource, message: Message) -> Any:
     return value if finite else None
 
 
-def rotate(q: Quaternion, vector: Triple) -> Triple:
-    """Rotate a vector by a quaternion."""
-    w, x, y, z = q
-    a, b, c = vector
-    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
-
-
-def enu_of(ned: Triple) -> Array:
+def enu_of(ned: Vector) -> Array:
     """Convert a vector from NED to ENU."""
     north, east, down = ned
     return np.array([east, north, -down])
 
 
-def acceleration(attitude: Quaternion, force: Triple) -> Array:
+def acceleration(attitude: Quaternion, force: Vector) -> Array:
     """Return the acceleration (3,) [m/s², ENU] without gravity, from an accelerometer's specific force."""
     north, east, down = rotate(attitude, force)
     return np.array([east, north, -down - GRAVITY])
@@ -135,7 +126,7 @@ def _euler(m: Message) -> Quaternion:
     )
 
 
-def _milligravities(m: Message) -> Triple:
+def _milligravities(m: Message) -> Vector:
     return (MILLIGRAVITY * m.xacc, MILLIGRAVITY * m.yacc, MILLIGRAVITY * m.zacc)
 
 

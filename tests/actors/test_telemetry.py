@@ -211,16 +211,6 @@ def test_after_the_choice_other_messages_of_the_quantity_are_ignored() -> None:
     assert autopilot.client.message_counts[ATTITUDE] == count
 
 
-def test_missing_frames_are_counted() -> None:
-    autopilot = ScriptedAutopilot("px4", {})
-    autopilot.wait(lambda: False, 0.0)
-    for skipped in (0, 3):
-        autopilot._mav.seq = (autopilot._mav.seq + skipped) % 256
-        autopilot._mav.send(MESSAGES["ATTITUDE"])
-    autopilot.wait(lambda: False, 0.0)
-    assert (autopilot.client.received, autopilot.client.missed) == (3, 3)
-
-
 def test_parameters_below_the_robots_bounds_are_found() -> None:
     autopilot = ScriptedAutopilot("ardupilot", {}, {"WPNAV_ACCEL": 100.0, "WPNAV_SPEED": 800.0})
     autopilot.client.identify(autopilot.wait)
