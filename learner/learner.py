@@ -31,8 +31,8 @@ from brakeline.learner.transition_reader import LATEST, StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
 from brakeline.messaging.bus.identity import identity_of, speaks_for
-from brakeline.messaging.flow_limits import AHEAD
 from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.topics import AHEAD
 
 MOST_ACTORS = 2048
 MOST_ACTORS_OF_ONE = 256  # of one identity: so many robots of a process, or actors of a feeder's logs

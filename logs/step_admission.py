@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.flow_limits import AHEAD
+from brakeline.messaging.topics import AHEAD
 
 MOST_WAITING = 1000  # steps of each robot
 

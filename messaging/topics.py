@@ -68,6 +68,7 @@ class Topic:
 
 
 FILE = 2**26  # largest message with a file [bytes]
+AHEAD = 1000  # steps beyond its limit in FLOW that an actor may publish: an earlier learner may have permitted them
 BLOCK, DROP, QUERY = Delivery.BLOCK, Delivery.DROP, Delivery.QUERY
 # fmt: off
 DECIDE = Topic("decide", "safety/{robot}/decide/{source}", pb.RequestBatch, QUERY, None, ("actor", "client"),
