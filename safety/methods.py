@@ -1,12 +1,12 @@
 """THE table of the methods that a safety service can serve: the filter and its rivals, behind one interface.
 
-A robot without a filter (method `none`) uses no service. The filter and most rivals are imported when a model is made
+A robot without a filter (method `none`) uses no service. The filter and the rivals are imported when a model is made
 ready: with them come compiled kernels and a solver, which take a second to load. Who only reads a model needs neither.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
@@ -17,7 +17,6 @@ from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.tensor_file import has_entry
 from brakeline.safety.rivals.pretrained import ENTRY, Pretrained
-from brakeline.safety.rivals.sailr import Sailr
 
 Model = ModelSet | Pretrained
 
@@ -42,25 +41,13 @@ class Method(Protocol):
         """Return the decision. Raises BadRequest if a value of the request is not valid."""
 
 
-def _secas(model: Pretrained) -> Method:
-    from brakeline.safety.rivals.secas import Secas
-
-    return Secas(model)
-
-
-def _barrier(model: Pretrained) -> Method:
-    from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
-
-    return UnicycleBarrier(model)
-
-
-def _predictive(model: Pretrained) -> Method:
-    from brakeline.safety.rivals.predictive_filter import PredictiveFilter
-
-    return PredictiveFilter(model)
-
-
-RIVALS: dict[str, Callable[[Pretrained], Method]] = {SECAS: _secas, SAILR: Sailr, CBF: _barrier, PSF: _predictive}
+# The module and the class of each rival.
+RIVALS = {
+    SECAS: ("secas", "Secas"),
+    SAILR: ("sailr", "Sailr"),
+    CBF: ("unicycle_barrier", "UnicycleBarrier"),
+    PSF: ("predictive_filter", "PredictiveFilter"),
+}
 METHODS = (DDPC, *RIVALS)
 
 
@@ -76,7 +63,9 @@ def ready(model: Model) -> Method:
         return Filter(model)
     if model.method not in RIVALS:
         raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
-    return RIVALS[model.method](model)
+    module, name = RIVALS[model.method]
+    method: Method = getattr(import_module(f"brakeline.safety.rivals.{module}"), name)(model)
+    return method
 
 
 def decode(payload: bytes) -> Model:
