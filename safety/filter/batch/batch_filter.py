@@ -28,6 +28,7 @@ from brakeline.safety.filter.request import Decision
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
+    from brakeline.safety.methods import Method
 
 Array = Any  # of any namespace
 
@@ -60,23 +61,28 @@ class BatchFilter:
                 self._prepared[key] = LaneDecisions(self.safety, xp, device)
             with np.errstate(all="ignore"):  # lanes that overflow are left to the single path
                 decided = self._prepared[key].decide(requests, answers)
-        singly = {}
-        for row in np.flatnonzero(~on_host(decided)).tolist():
-            try:
-                singly[row] = self.safety.decide(requests.row(row))
-            except BadRequest as error:
-                raise BadRequest(error.field, f"row {row}: {error}") from error
-            write_decision(answers, row, singly[row], xp, device)
-        time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
-        return DecisionArrays(
-            **answers,
-            singly=singly,
-            obstacles=requests.obstacles,
-            model=self.safety.version,
-            bound=self.safety.bound,
-            judges=self.safety.model.one_step is not None,
-            time_ms=time_ms,
-        )
+        about = {"bound": self.safety.bound, "judges": self.safety.model.one_step is not None}
+        return completed(self.safety, requests, answers, ~on_host(decided), started, **about)
+
+
+def completed(
+    method: Method, requests: RequestArrays, answers: dict[str, Any], left: Array, started: int, **about: Any
+) -> DecisionArrays:
+    """Let a method decide the rows that are left (B,) one by one, and return all decisions.
+
+    started [ns]: time of the requests; about: `bound` and `judges` of `Decision`.
+    """
+    xp, device = array_api_compat.array_namespace(answers["plan"]), array_api_compat.device(answers["plan"])
+    singly = {}
+    for row in np.flatnonzero(left).tolist():
+        try:
+            singly[row] = method.decide(requests.row(row))
+        except BadRequest as error:
+            raise BadRequest(error.field, f"row {row}: {error}") from error
+        write_decision(answers, row, singly[row], xp, device)
+    time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
+    about |= {"model": method.version, "time_ms": time_ms}
+    return DecisionArrays(**answers, singly=singly, obstacles=requests.obstacles, **about)
 
 
 def _check_arrays(robot: Robot, requests: RequestArrays, xp: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from brakeline.safety.filter.batch.plane_batch import EndBatch, PlaneBatch, plan
 from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.constraints import TubeConstraints
 
+T = TypeVar("T")
 Array = Any  # of any namespace
 
 
@@ -37,14 +38,6 @@ class SceneBatch:
     reach: Array
     far: Array
     asked: Array
-
-    def take(self, xp: Any, lanes: Array) -> SceneBatch:
-        def picked(part: Array) -> Array:
-            return xp.take(part, lanes, axis=-1)
-
-        start, turn = [picked(axis) for axis in self.start], self.turn.take(xp, lanes)
-        rest = (picked(part) for part in (self.beyond, self.widening, self.reach, self.far, self.asked))
-        return SceneBatch(start, turn, self.near.take(xp, lanes), *rest)
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ class ConstraintBatch:
         self.tube = TubeBatch(tube, robot.state_dim, constant, xp)
         self.measured = constraints.measured.tolist()
         self.body, self.sight, self.widest = constraints.body, robot.sight, constraints.widest
-        self.base_reach, self.base_far = constraints.reach, constraints.far
+        self.base_far = constraints.far
         self.discs = []
         for disc in constraints.discs:
             at = disc.at.tolist() if disc.aside else None
@@ -192,12 +185,18 @@ class ConstraintBatch:
         return xp.where(near_ends, margin, xp.minimum(scene.beyond - plan.extent, most)), at_least
 
 
-def taken(xp: Any, part: Any, lanes: Array) -> Any:
-    """Return the lanes of a nested value whose arrays have the batch last; an array for all lanes stays as it is."""
+def taken(xp: Any, whole: T, lanes: Array) -> T:
+    """Return some lanes, at least one, of a nested value whose arrays have the batch last.
+
+    An array for all lanes, and None, stay as they are.
+    """
+    part: Any = whole
     if isinstance(part, list):
-        return [taken(xp, one, lanes) for one in part]
-    if isinstance(part, tuple):
-        return type(part)(*(taken(xp, one, lanes) for one in part))
-    if hasattr(part, "__dataclass_fields__"):
-        return type(part)(*(taken(xp, getattr(part, f.name), lanes) for f in fields(part)))
-    return part if part.shape[-1] == 1 else xp.take(part, lanes, axis=-1)
+        part = [taken(xp, one, lanes) for one in part]
+    elif isinstance(part, tuple):
+        part = type(part)(*(taken(xp, one, lanes) for one in part))
+    elif hasattr(part, "__dataclass_fields__"):
+        part = type(part)(*(taken(xp, getattr(part, f.name), lanes) for f in fields(part)))
+    elif part is not None and part.shape[-1] != 1:
+        part = xp.take(part, lanes, axis=-1)
+    return part  # type: ignore[no-any-return]

@@ -71,7 +71,7 @@ class LaneDecisions:
                 left.append(own[rest])
             open_ = xp.concat(left)
             if open_.shape[0]:
-                for part, own in self._sorted(lanes.take(xp, open_)):
+                for part, own in self._sorted(taken(xp, lanes, open_)):
                     to = xp.take(many, xp.take(open_, own, axis=0), axis=0)
                     decided[to[self._adjust(requests, part, to, answers)]] = True
         return decided
@@ -152,7 +152,7 @@ class LaneDecisions:
             most = int(xp.max(xp.take(count, own, axis=0)))
             own = own[: max(FEWEST, self._numbers // (rows * max(most, 1)))]
             first += own.shape[0]
-            yield lanes.take(xp, own).with_slots(most), own
+            yield taken(xp, lanes, own).with_slots(most), own
 
     def _allow(
         self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]
@@ -170,7 +170,7 @@ class LaneDecisions:
         done = xp.nonzero(proposed.allowed & ~single)[0]
         if done.shape[0]:
             part, margin = taken(xp, proposed.plan, done), xp.take(proposed.margin, done, axis=-1)
-            self._write(requests, lanes.scene.take(xp, done), part, margin, xp.take(rows, done, axis=0), answers)
+            self._write(requests, taken(xp, lanes.scene, done), part, margin, xp.take(rows, done, axis=0), answers)
         return done, xp.nonzero(~proposed.allowed & ~proposed.unsure & ~leave & ~single)[0]
 
     def _adjust(self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]) -> Array:
@@ -183,7 +183,7 @@ class LaneDecisions:
         done = xp.nonzero(found.allowed | adjusted | goes_on)[0]
         if not done.shape[0]:
             return done
-        to, scene = xp.take(rows, done, axis=0), lanes.scene.take(xp, done)
+        to, scene = xp.take(rows, done, axis=0), taken(xp, lanes.scene, done)
         margin = xp.take(proposed.margin, done, axis=-1)
         answers["proposal_margin"][to] = margin
         for name, value in self._blocking(taken(xp, proposed.plan, done), scene, margin).items():

@@ -93,10 +93,6 @@ class NearObstacles:
     slot: Array
     away: Array
 
-    def take(self, xp: Any, lanes: Array) -> NearObstacles:
-        """Return the obstacles of the lanes with these indices."""
-        return self._each(lambda part: xp.take(part, lanes, axis=-1))
-
     def first(self, most: int) -> NearObstacles:
         """Return the first `most` slots."""
         return self._each(lambda part: part[:most])

@@ -34,7 +34,7 @@ class QPBatch:
     """Builds and solves the QPs of many robots with the matrices of a `QPBuilder`."""
 
     def __init__(self, builder: QPBuilder, constraints: ConstraintBatch, constant: Any, xp: Any) -> None:
-        self._xp, self._constraints, self._constant = xp, constraints, constant
+        self._xp, self._constraints = xp, constraints
         self.free, self.known, self._m = builder.free, builder.known, builder.robot.action_dim
         self._atoms = len(builder.W_f)
         self._W_c, self._M_c = constant(builder.W_c), constant(builder.M_c)
@@ -57,7 +57,9 @@ class QPBatch:
         outputs = plan.path.outputs
         f = plan.z[self.known :]
         fixed = outputs - sum(slopes[:, :, j] * f[j] for j in range(self.free))  # at f = 0
-        constant = self._constant_sizes(z_0)
+        constant = (
+            self._M_c @ xp.abs(self._W_c @ z_0) + self._m_0
+        )  # of the magnitudes (L+N+1, B): no free input changes it
         gradients, spreads, bounds = [], [], []
         for (*_, first, ends), planes in zip(c.discs, plan.planes, strict=True):
             normals = [ends.at_ends(part) for part in planes.turned]  # (E, K, B)
@@ -84,10 +86,6 @@ class QPBatch:
         if len(bounds) == 1:
             return RowBatch(gradients[0], spreads[0], bounds[0])
         return RowBatch(xp.concat(gradients, axis=1), xp.concat(spreads, axis=1), xp.concat(bounds))
-
-    def _constant_sizes(self, z_0: Array) -> Array:
-        """Return the share (L+N+1, B) of the magnitudes that no free input changes."""
-        return self._M_c @ self._xp.abs(self._W_c @ z_0) + self._m_0
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Return center and half-widths (F, B) of the free inputs within bounds and slew after `before` (m, B)."""

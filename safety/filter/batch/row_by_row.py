@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from brakeline.errors import BadRequest
 from brakeline.messaging.robot import Robot
-from brakeline.safety.filter.batch.batch_filter import blank_answers, write_decision
+from brakeline.safety.filter.batch.batch_filter import blank_answers, completed
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 
@@ -52,21 +51,6 @@ class RowByRow:
         Raises:
             BadRequest: a value is missing, not finite, or has the wrong size.
         """
-        started, singly = perf_counter_ns(), {}
+        started, every = perf_counter_ns(), np.ones(len(requests), dtype=bool)
         answers = blank_answers(self.robot, requests, np, "cpu")
-        for row in range(len(requests)):
-            try:
-                singly[row] = self._method.decide(requests.row(row))
-            except BadRequest as error:
-                raise BadRequest(error.field, f"row {row}: {error}") from error
-            write_decision(answers, row, singly[row], np, "cpu")
-        time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
-        return DecisionArrays(
-            **answers,
-            singly=singly,
-            obstacles=requests.obstacles,
-            model=self.version,
-            bound=None,
-            judges=False,
-            time_ms=time_ms,
-        )
+        return completed(self._method, requests, answers, every, started, bound=None, judges=False)

@@ -36,10 +36,6 @@ class LaneBatch:
     proposal: Array
     committed: Array
 
-    def take(self, xp: Any, lanes: Array) -> LaneBatch:
-        parts = (xp.take(part, lanes, axis=-1) for part in (self.z_0, self.proposal, self.committed))
-        return LaneBatch(self.scene.take(xp, lanes), *parts)
-
     def with_slots(self, most: int) -> LaneBatch:
         """Return the lanes with the first `most` slots for near obstacles."""
         return replace(self, scene=replace(self.scene, near=self.scene.near.first(most)))
@@ -148,7 +144,7 @@ class SearchBatch:
             for number in range(1 if self.constraints.tube.linear else 3):
                 if open_.shape[0] < (1 if number == 0 and with_clearance else FEW):
                     return found
-                part, own = lanes.take(xp, open_), xp.take(stay, open_, axis=-1)
+                part, own = taken(xp, lanes, open_), xp.take(stay, open_, axis=-1)
                 start = self._starting_point(number, part, taken(xp, proposed.plan, open_))
                 z, least, solved, unsure, steps = self._solve(part, start, own, with_clearance)
                 found.steps[open_] = found.steps[open_] + steps
@@ -165,7 +161,7 @@ class SearchBatch:
         """Allow verified proposals that come no nearer where the clearance margin is lost; return the lanes left."""
         xp, open_ = self._xp, self._xp.ones_like(found.allowed)
         if verified.shape[0]:
-            part, own = lanes.take(xp, verified), taken(xp, plan, verified)
+            part, own = taken(xp, lanes, verified), taken(xp, plan, verified)
             rows = self._qp.rows(part.scene, own, part.z_0)
             tight, inside, unsure = self._tightened(part, own, rows, xp.take(stay, verified, axis=-1))
             keeps = self._keeps(part, own, tight, inside)
@@ -247,11 +243,11 @@ class SearchBatch:
             go = xp.nonzero(solved & ~unsure[index])[0]
             if not go.shape[0]:
                 break
-            index, lanes, stay = index[go], lanes.take(xp, go), xp.take(stay, go, axis=-1)
+            index, lanes, stay = index[go], taken(xp, lanes, go), xp.take(stay, go, axis=-1)
             free = self._within(lanes.z_0, xp.take(f, go, axis=-1))
             if c.tube.linear:
                 plan = c.moved_to(lanes.scene, taken(xp, plan, go), free)
-                tight = RowBatch(*(xp.take(part, go, axis=-1) for part in rows))
+                tight = taken(xp, rows, go)
                 inside = None if inside is None else xp.take(inside, go, axis=-1)
             else:
                 plan = c.around(lanes.scene, free)
@@ -271,6 +267,6 @@ class SearchBatch:
             if again.shape[0] < FEW:
                 unsure[index[again]] = True
                 break
-            index, lanes, stay = index[again], lanes.take(xp, again), xp.take(stay, again, axis=-1)
+            index, lanes, stay = index[again], taken(xp, lanes, again), xp.take(stay, again, axis=-1)
             plan = taken(xp, plan, again)
         return z, margins, verified, unsure, steps

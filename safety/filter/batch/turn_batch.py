@@ -26,9 +26,3 @@ class TurnBatch(NamedTuple):
         if self.cos is None:
             return world
         return [self.cos * world[0] + self.sin * world[1], self.cos * world[1] - self.sin * world[0], *world[2:]]
-
-    def take(self, xp: Any, lanes: Array) -> TurnBatch:
-        """Return the rotations of the lanes with these indices."""
-        if self.cos is None:
-            return self
-        return TurnBatch(xp.take(self.cos, lanes, axis=-1), xp.take(self.sin, lanes, axis=-1))
