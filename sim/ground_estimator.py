@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from brakeline.messaging.obstacle import Array
 from brakeline.sim.sim_conditions import NoiseLevels as NoiseLevels
+
+Angle = TypeVar("Angle", float, Array)
 
 CUT = 2.0  # standard deviations at which every sensor error is cut off
 
@@ -22,8 +25,8 @@ def cut_normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -
     return np.asarray(sigma * draw)
 
 
-def wrap(angle: float) -> float:
-    """Return the same angle in [-π, π), rad."""
+def wrap(angle: Angle) -> Angle:
+    """Return the same angle, or angles, in [-π, π), rad."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 

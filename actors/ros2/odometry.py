@@ -8,6 +8,7 @@ from collections import deque
 import numpy as np
 
 from brakeline.messaging.robot import Array
+from brakeline.sim.ground_estimator import wrap
 
 HISTORY = 2.0  # s
 EXTRAPOLATION = 0.1  # s after the newest odometry, for which the last speeds are assumed
@@ -15,11 +16,6 @@ LONGEST_GAP = 0.15  # s between two odometries, between which states are interpo
 SAME_TIME = 1e-4  # s: odometry that is not newer by more is dropped
 SPEED_WINDOW = 0.1  # s over which speeds are computed from poses without speeds
 TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [rad/s] follow
-
-
-def wrapped(angle: float) -> float:
-    """Return an angle [rad] in [-π, π)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class OdometryHistory:
@@ -50,7 +46,7 @@ class OdometryHistory:
         past = next((row for row in reversed(self._rows) if row[TIME] <= time - SPEED_WINDOW), None)
         if past is None or time < self.newest or time - past[TIME] > SPEED_WINDOW + self._gap:
             return self._add(time, x, y, heading, math.nan, math.nan)
-        duration, turn = time - past[TIME], wrapped(heading - past[HEADING])
+        duration, turn = time - past[TIME], wrap(heading - past[HEADING])
         middle = past[HEADING] + 0.5 * turn
         distance = math.cos(middle) * (x - past[X]) + math.sin(middle) * (y - past[Y])
         return self.add(time, x, y, heading, distance / duration, turn / duration)
@@ -79,7 +75,7 @@ class OdometryHistory:
         if states is None:
             return None
         state = np.asarray(states[0])
-        state[2] = wrapped(state[2])
+        state[2] = wrap(state[2])
         return state
 
     def _add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
@@ -92,7 +88,7 @@ class OdometryHistory:
             return False
         if self._rows:  # interpolation needs headings without jumps
             before = self._rows[-1][HEADING]
-            heading = before + wrapped(heading - before)
+            heading = before + wrap(heading - before)
         self._rows.append((time, x, y, heading, speed, turn_rate))
         while self._rows[0][TIME] < time - HISTORY:
             self._rows.popleft()

@@ -20,11 +20,11 @@ from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import arena_kind, draw_arena
 from brakeline.sim.batch.ground_batch import GroundBatch
-from brakeline.sim.batch.ground_estimator_batch import wrapped
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.observation_batch import GroundObservationBatch, ObservationBatch, QuadrotorObservationBatch
 from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
+from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.ground_robot import GROUND
 from brakeline.sim.navigation_env import OBSERVED_LIMIT
 from brakeline.sim.quadrotor import QUADROTOR
@@ -250,7 +250,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         """Return whether each measurement error exceeds the bound of the robot's description."""
         error = period.measured - period.true
         if (heading := self.robot.heading) is not None:
-            error[:, heading] = wrapped(error[:, heading])
+            error[:, heading] = wrap(error[:, heading])
         return np.asarray((np.abs(error) > self._bound).any(axis=1))
 
     def _infos(self, rows: NDArray[np.intp], period: PeriodBatch) -> Infos:

@@ -20,8 +20,7 @@ from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
-from brakeline.sim.batch.obstacle_batch import ObstacleBatch
-from brakeline.sim.batch.vehicle_batch import PeriodBatch, resting_period
+from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_robot import (
@@ -64,14 +63,8 @@ class MotionBatch:
     clearance: Array
 
 
-class GroundBatch:
-    """N ground robots.
-
-    Attributes:
-        true, measured: (N, 5) states; see `TurtleBot`.
-        input: (N, 2) inputs executed last.
-        obstacles: those of each robot's arena.
-    """
+class GroundBatch(VehicleBatch):
+    """N ground robots; see `TurtleBot` for their states and inputs."""
 
     robot, samples = GROUND, SAMPLES
 
@@ -85,6 +78,7 @@ class GroundBatch:
             threads: number of threads for the physics; 0: the calling thread.
             streams: the source of all sensor errors.
         """
+        super().__init__(size, kind)
         self._conditions = conditions
         self._physics = self._floor_physics(BARE)
         model = self._physics.model
@@ -92,16 +86,12 @@ class GroundBatch:
         self._data = [mujoco.MjData(model) for _ in range(max(1, threads))]
         self._steps = round(SAMPLE_TIME / model.opt.timestep)
         self._state, self._warmstart = np.zeros((size, mujoco.mj_stateSize(model, STATE))), np.zeros((size, SPEEDS))
-        self._clearance = np.zeros(size)
         self._arenas: list[Arena] = [BARE] * size
         self._near: dict[int, FloorPhysics] = {}
         self._base = model.body("base").id
         self._draws = NormalStreams(size)
         self._disturbances = DrivingDisturbances(conditions.process_noise, size, SAMPLE_TIME)
         self._estimator = GroundEstimatorBatch(size, conditions.noise, streams, WHEEL_RADIUS, SAMPLE_TIME)
-        self.obstacles = ObstacleBatch(size, kind)
-        self.true, self.measured = np.zeros((size, GROUND.state_dim)), np.zeros((size, GROUND.state_dim))
-        self.input = np.zeros((size, GROUND.action_dim))
 
     def close(self) -> None:
         self._rollout.close()
@@ -131,9 +121,6 @@ class GroundBatch:
         self.true[rows] = self._true_states(rows)
         self._estimator.begin(rows, self.true[rows, :3], motion.coordinates[:, -1, WHEELS])
         self.measured[rows] = np.column_stack([self._estimator.pose[rows], np.zeros((len(rows), 2))])
-
-    def initial_period(self, rows: Rows) -> PeriodBatch:
-        return resting_period(self.measured[rows], self.true[rows], self._clearance[rows], SAMPLES, 2)
 
     def set_input(self, rows: Rows, inputs: Array) -> None:
         self.input[rows] = np.clip(inputs, GROUND.low(), GROUND.high())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array
 from brakeline.sim.batch.normal_streams import NormalStreams
-from brakeline.sim.ground_estimator import Estimator, steady_gain
+from brakeline.sim.ground_estimator import Estimator, steady_gain, wrap
 from brakeline.sim.sim_conditions import NoiseLevels
 
 Rows = NDArray[np.intp]
@@ -80,18 +80,13 @@ class GroundEstimatorBatch:
         ahead, aside = moved.T
         prediction = np.column_stack([x + cos * ahead - sin * aside, y + sin * ahead + cos * aside, heading + turned])
         error = self._fix(rows, pose) - prediction
-        error[:, 2] = wrapped(error[:, 2])
+        error[:, 2] = wrap(error[:, 2])
         estimate = prediction + self._gain * error
-        estimate[:, 2] = wrapped(estimate[:, 2])
+        estimate[:, 2] = wrap(estimate[:, 2])
         self.pose[rows] = estimate
 
     def _fix(self, rows: Rows, pose: Array) -> Array:
         """Return fixes (rows, 3) of true poses (rows, 3)."""
         fix = pose + self._streams.cut_normal(rows, self._noise.scale, 3) * self._fix_sigma
-        fix[:, 2] = wrapped(fix[:, 2])
+        fix[:, 2] = wrap(fix[:, 2])
         return np.asarray(fix)
-
-
-def wrapped(angles: Array) -> Array:
-    """Return the same angles in [-π, π), rad."""
-    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)

@@ -19,8 +19,7 @@ from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.flight_estimator_batch import FlightEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
-from brakeline.sim.batch.obstacle_batch import ObstacleBatch
-from brakeline.sim.batch.vehicle_batch import PeriodBatch, resting_period
+from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.flight_controller import Controllers, controllers_at_rest
 from brakeline.sim.kernels.flight_kernels import (
     AIRFRAME,
@@ -61,14 +60,10 @@ class FlightBatch:
     clearance: Array
 
 
-class QuadrotorBatch:
-    """N quadrotors.
+class QuadrotorBatch(VehicleBatch):
+    """N quadrotors; see `Quadrotor` for their states and inputs."""
 
-    Attributes:
-        true, measured: (N, 9) states; see `Quadrotor`.
-        input: (N, 3) velocity setpoints executed last.
-        obstacles: those of each quadrotor's arena.
-    """
+    robot, samples = QUADROTOR, SAMPLES
 
     def __init__(self, size: int, kind: ArenaKind, conditions: Conditions, streams: NormalStreams) -> None:
         """Prepare for `size` quadrotors.
@@ -77,18 +72,12 @@ class QuadrotorBatch:
             kind: of the arenas.
             streams: the source of all sensor errors.
         """
+        super().__init__(size, kind)
         self._controllers = controllers_at_rest(size)
         self._coordinates = np.zeros((size, COORDINATES))
         self._estimator = FlightEstimatorBatch(size, conditions.flight_noise, streams)
         self._arenas: list[Arena | None] = [None] * size
         self._near: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
-        self._clearance = np.zeros(size)
-        self.obstacles = ObstacleBatch(size, kind)
-        self.true, self.measured = np.zeros((size, QUADROTOR.state_dim)), np.zeros((size, QUADROTOR.state_dim))
-        self.input = np.zeros((size, QUADROTOR.action_dim))
-
-    def close(self) -> None:
-        """Do nothing: there are no threads."""
 
     def begin(self, rows: Rows, arenas: list[Arena], generators: list[np.random.Generator]) -> None:
         """Let quadrotors hover at the starts of their arenas for a while, as a single one does."""
@@ -108,9 +97,6 @@ class QuadrotorBatch:
             motion = self.advance(rows)
         self._estimator.read(rows, self._coordinates[rows], motion.accelerations)  # before the first message
         self._measure(rows, motion)
-
-    def initial_period(self, rows: Rows) -> PeriodBatch:
-        return resting_period(self.measured[rows], self.true[rows], self._clearance[rows], SAMPLES, 3)
 
     def set_input(self, rows: Rows, inputs: Array) -> None:
         before, slew = self.input[rows], QUADROTOR.slew
