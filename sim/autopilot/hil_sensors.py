@@ -105,7 +105,7 @@ class HilSensors:
     ) -> mavlink.MAVLink_hil_gps_message:
         where, fast = self.noise.gps_position, self.noise.gps_velocity
         x, y, z = position
-        place = ned_frames.globe_integers((x + where * draw[0], y + where * draw[1], z + where * draw[2]))
+        place = ned_frames.globe((x + where * draw[0], y + where * draw[1], z + where * draw[2]))
         vx, vy, vz = truth.velocity
         vn, ve, vd = ned_frames.world((vx + fast * draw[3], vy + fast * draw[4], vz + fast * draw[5]))
         accuracy = max(round(100.0 * self.noise.scale * where), 1)

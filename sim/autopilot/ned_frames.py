@@ -50,13 +50,8 @@ def into_body(q: Quaternion, vector: Vector) -> Vector:
     return rotate((w, -x, -y, -z), vector)
 
 
-def globe(position: Vector) -> tuple[float, float, float]:
-    """Return latitude [deg], longitude [deg] and altitude [m] of an ENU position [m]."""
+def globe(position: Vector) -> tuple[int, int, int]:
+    """Return latitude and longitude [deg·1e7] and altitude [mm] of an ENU position [m], as messages carry them."""
     east, north, up = position
-    return (LATITUDE + north * DEGREES, LONGITUDE + east * DEGREES / math.cos(math.radians(LATITUDE)), ALTITUDE + up)
-
-
-def globe_integers(position: Vector) -> tuple[int, int, int]:
-    """Return `globe` as messages carry it: latitude and longitude [deg·1e7], altitude [mm]."""
-    latitude, longitude, altitude = globe(position)
-    return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * altitude)
+    latitude, longitude = LATITUDE + north * DEGREES, LONGITUDE + east * DEGREES / math.cos(math.radians(LATITUDE))
+    return round(1e7 * latitude), round(1e7 * longitude), round(1e3 * (ALTITUDE + up))

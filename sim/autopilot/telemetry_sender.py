@@ -70,7 +70,7 @@ class TelemetryBuilder:
 
     def _globe(self) -> tuple[int, int, int]:
         """Return the estimated latitude and longitude [deg·1e7] and altitude [mm]."""
-        return ned_frames.globe_integers(self._flight.vehicle.position_and_velocity()[0])
+        return ned_frames.globe(self._flight.vehicle.position_and_velocity()[0])
 
     def _imu(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the specific force [m/s²] and the turn rates [rad/s], forward-right-down."""
@@ -142,7 +142,7 @@ class TelemetryBuilder:
     def home_position(self) -> Message:
         home = self._flight.home
         return mavlink.MAVLink_home_position_message(
-            *ned_frames.globe_integers(home), *ned_frames.world(home), [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
+            *ned_frames.globe(home), *ned_frames.world(home), [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
         )
 
     def autopilot_version(self) -> Message:
