@@ -10,6 +10,7 @@ within a period, and a plane for one end alone would exclude the other end.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array, Shapes
 
@@ -19,6 +20,33 @@ TOUCHING = 1e-6  # m; at a smaller distance the normal is undefined
 def rows_per_obstacle(horizon: int) -> int:
     """Return the number of rows (3) for an obstacle: N starts of periods, N ends, and the last end after the stop."""
     return 2 * horizon + 1
+
+
+def viewpoints(start: Array, nominal: Array) -> tuple[Array, Array]:
+    """Return the ends of the periods (N+1, d) of a nominal plan, relative to its start; and with their midpoints."""
+    ends = np.concatenate([np.zeros((1, len(start))), nominal - start])
+    places = np.empty((2 * len(nominal) + 1, len(start)))
+    places[::2] = ends
+    places[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    return ends, places
+
+
+def roomiest(room: Array) -> NDArray[np.intp]:
+    """Return which plane (n, N) leaves both ends of a period the most room, of those seen from up to its end.
+
+    From the first period on in which no plane keeps apart, the nominal plan meets the obstacle: the plane before stays.
+
+    Args:
+        room: (n, N, 2N+1) [m], of the planes that are seen from the `viewpoints`.
+    """
+    n, N, seen = room.shape
+    room = np.where(np.arange(seen) <= 2 * np.arange(1, N + 1)[:, None], room, -np.inf)
+    room[np.isnan(room)] = -np.inf
+    choice = room.argmax(axis=2)
+    met = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
+    before = (~met).sum(axis=1)
+    last = np.where(before > 0, choice[np.arange(n), before - 1], 0)
+    return np.where(met, last[:, None], choice)
 
 
 def half_spaces(near: Shapes, start: Array, nominal: Array, keep_off: float, measured: Array) -> tuple[Array, Array]:

@@ -16,20 +16,17 @@ import numpy as np
 
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.robot import Array
-from brakeline.safety.filter.halfspaces import TOUCHING
+from brakeline.safety.filter.halfspaces import TOUCHING, roomiest, viewpoints
 
 
 def swept_half_spaces(
     near: MovingObstacles, start: Array, nominal: Array, keep_off: float, measured: Array, period: float
 ) -> tuple[Array, Array]:
     """Return half-spaces as `half_spaces` does, for moving obstacles. period [s]: between two nominal positions."""
-    n, (N, d) = len(near), nominal.shape
-    ends = np.concatenate([np.zeros((1, d)), nominal - start])
-    places = np.empty((2 * N + 1, d))  # relative to the start
-    places[::2] = ends
-    places[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    n, N = len(near), nominal.shape[0]
+    ends, places = viewpoints(start, nominal)
     seen_from = places - near.moved(0.5 * period * np.arange(2 * N + 1))  # (n, q, d), as if the obstacle stood
-    each = np.arange(n)
+    each = np.arange(n)[:, None]
     towards = near.shapes.towards_from_own_points(start + seen_from)
     gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
@@ -40,15 +37,8 @@ def swept_half_spaces(
     bound = level[:, :, None] + np.minimum(along[:, :, :-1], along[:, :, 1:]) - near.radius(times[1:])[:, None]
     room = unit @ ends.T
     room = bound - np.maximum(room[:, :, :-1], room[:, :, 1:])  # (n, q, N)
-    room = np.where(np.arange(2 * N + 1)[:, None] <= 2 * np.arange(1, N + 1), room, -np.inf)
-    room[np.isnan(room)] = -np.inf
-    choice = room.argmax(axis=1)  # (n, N)
-    # From the first period on that no plane keeps apart from it, the nominal plan meets it: the plane before stays.
-    met = np.logical_or.accumulate(~(room.max(axis=1) > 0.0), axis=1)
-    before = (~met).sum(axis=1)
-    last = np.where(before > 0, choice[each, before - 1], 0)
-    choice = np.where(met, last[:, None], choice)
-    normal = unit[each[:, None], choice]
-    offset = bound[each[:, None], choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
+    choice = roomiest(room.swapaxes(1, 2))
+    normal = unit[each, choice]
+    offset = bound[each, choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
     offset -= np.abs(normal) @ measured
     return normal, np.where(np.isnan(offset), -np.inf, offset)

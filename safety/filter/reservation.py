@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array, Shapes
-from brakeline.safety.filter.halfspaces import TOUCHING
+from brakeline.safety.filter.halfspaces import TOUCHING, roomiest, viewpoints
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.qp import ConstraintRows
@@ -97,10 +97,7 @@ def reservation_half_spaces(
     the most room is taken.
     """
     n, (N, d) = len(near), nominal.shape
-    ends = np.concatenate([np.zeros((1, d)), nominal - start])
-    places = np.empty((2 * N + 1, d))  # relative to the start
-    places[::2] = ends
-    places[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    ends, places = viewpoints(start, nominal)
     towards = near.shapes.towards(start + places).reshape(n, N, 2 * N + 1, d)
     gap = np.sqrt(np.einsum("nkqd,nkqd->nkq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
@@ -110,16 +107,7 @@ def reservation_half_spaces(
         np.einsum("nkqd,kd->nkq", unit, ends[:-1]),
         np.einsum("nkqd,kd->nkq", unit, ends[1:]),
     )
-    room = np.where(np.arange(2 * N + 1) <= 2 * np.arange(1, N + 1)[:, None], level - along, -np.inf)
-    room[np.isnan(room)] = -np.inf
-    choice = room.argmax(axis=2)  # (n, N)
-    # From the first period on in which no plane keeps apart, the nominal plan meets it: the place seen from stays.
-    met = np.logical_or.accumulate(~(room.max(axis=2) > 0.0), axis=1)
-    before = (~met).sum(axis=1)
-    each = np.arange(n)
-    last = np.where(before > 0, choice[each, before - 1], 0)
-    choice = np.where(met, last[:, None], choice)
-    at = each[:, None], np.arange(N), choice
+    at = np.arange(n)[:, None], np.arange(N), roomiest(level - along)
     margin = near.shapes.margin.reshape(n, N)
     return unit[at], level[at] - np.maximum(keep_off + margin, 0.0) - np.abs(unit[at]) @ measured
 

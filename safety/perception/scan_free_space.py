@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.scan import Scan
-from brakeline.safety.filter.halfspaces import TOUCHING
+from brakeline.safety.filter.halfspaces import TOUCHING, viewpoints
 from brakeline.safety.perception.occlusion_exits import occlusion_exits
 from brakeline.safety.perception.scan_coverage import gaps, gaps_and_motions
 
@@ -149,15 +149,12 @@ def half_spaces(
     """
     from brakeline.safety.filter.kernels import shape_kernels
 
-    ends = np.concatenate([np.zeros((1, 2)), nominal - start])
-    viewpoints = np.empty((2 * len(nominal) + 1, 2))  # the ends and the midpoints of all periods
-    viewpoints[::2] = ends
-    viewpoints[1::2] = 0.5 * (ends[1:] + ends[:-1])
+    ends, places = viewpoints(start, nominal)
     corners = near.corners - start
     square = np.einsum("nvd,nvd->nv", corners, corners)
-    # |corner - viewpoint|² without the term |viewpoint|², which is the same for all corners
-    closest = (square[..., None] - 2.0 * (corners @ viewpoints.T)).argmin(axis=1)
-    towards = corners[np.arange(len(corners))[:, None], closest] - viewpoints  # (n, 2N+1, 2)
+    # |corner - place|² without the term |place|², which is the same for all corners
+    closest = (square[..., None] - 2.0 * (corners @ places.T)).argmin(axis=1)
+    towards = corners[np.arange(len(corners))[:, None], closest] - places  # (n, 2N+1, 2)
     gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
     level = (unit @ corners.transpose(0, 2, 1) - near.error[:, None]).min(axis=2)
