@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,17 @@ HEAD = ("robot", "policy", "filter", *FIGURES)
 
 
 def main(*paths: str) -> None:
-    lines = [json.loads(line) for path in paths for line in Path(path).read_text().splitlines()]
-    groups: dict[tuple[str, str, bool], dict[int, dict[str, Any]]] = {}
-    for line in lines:
-        groups.setdefault((line["robot"], line["policy"], line["filter"]), {})[line["seed"]] = line
     print(row(HEAD), row(["---"] * len(HEAD)), sep="\n")
-    for (robot, policy, filtered), episodes in sorted(groups.items()):
-        print(row([robot, policy, "yes" if filtered else "no", *figures(list(episodes.values()))]))
+    for (robot, policy, filtered), episodes in groups_of(paths, ("robot", "policy", "filter")):
+        print(row([robot, policy, "yes" if filtered else "no", *figures(episodes)]))
+
+
+def groups_of(paths: Sequence[str], keys: Sequence[str]) -> list[tuple[tuple[Any, ...], list[dict[str, Any]]]]:
+    """Return the lines of files, one for each seed, in groups with the same values of `keys`, and these values."""
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    for line in (json.loads(line) for path in paths for line in Path(path).read_text().splitlines()):
+        groups.setdefault(tuple(line[key] for key in keys), {})[line["seed"]] = line
+    return [(key, list(episodes.values())) for key, episodes in sorted(groups.items())]
 
 
 def figures(episodes: list[dict[str, Any]]) -> list[object]:

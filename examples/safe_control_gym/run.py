@@ -8,7 +8,6 @@ The script writes a line of JSON for each episode. `python table.py lines.jsonl`
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from examples.foreign.run import report
 from examples.safe_control_gym.adapter import SampledCartPole, make
 from examples.safe_control_gym.filters import FILTERS, Unfiltered
 from examples.safe_control_gym.policies import POLICIES, Policy
@@ -40,11 +40,7 @@ def main() -> None:
     about = {name: getattr(options, name) for name in ("policy", "filter", "amplitude", "disturbed")}
     for seed in range(*options.seeds):
         policy = POLICIES[options.policy](env, np.random.default_rng(seed))
-        line = json.dumps(about | {"seed": seed} | episode(env, policy, safety, seed))
-        print(line, flush=True)
-        if options.out is not None:
-            with options.out.open("a") as file:
-                file.write(line + "\n")
+        report(about | {"seed": seed} | episode(env, policy, safety, seed), options.out)
 
 
 def episode(env: SampledCartPole, policy: Policy, safety: Unfiltered, seed: int) -> dict[str, Any]:

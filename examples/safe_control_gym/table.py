@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
-KEYS = ("disturbed", "policy", "filter")
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from examples.foreign.table import groups_of, row
+
 HEAD = (
     *("pushed", "policy", "filter", "episodes", "with a violation", "steps in violation", "fell", "corrected steps"),
     *("error [m]", "return", "outside the prediction", "decision, processor time [ms]", "decisions"),
@@ -20,13 +21,9 @@ HEAD = (
 
 
 def main(*paths: str) -> None:
-    lines = [json.loads(line) for path in paths for line in Path(path).read_text().splitlines()]
-    groups: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
-    for line in lines:
-        groups.setdefault(tuple(line[key] for key in KEYS), {})[line["seed"]] = line
     print(row(HEAD), row(["---"] * len(HEAD)), sep="\n")
-    for (disturbed, policy, name), episodes in sorted(groups.items()):
-        print(row(["yes" if disturbed else "no", policy, name, *cells(list(episodes.values()), name)]))
+    for (disturbed, policy, name), episodes in groups_of(paths, ("disturbed", "policy", "filter")):
+        print(row(["yes" if disturbed else "no", policy, name, *cells(episodes, name)]))
 
 
 def cells(episodes: list[dict[str, Any]], name: str) -> list[object]:
@@ -47,10 +44,6 @@ def cells(episodes: list[dict[str, Any]], name: str) -> list[object]:
         "–" if name == "none" else f"{np.median([e['cpu_ms'] for e in episodes]):.1f}",
         ", ".join(f"{number} {kind}" for kind, number in kinds.most_common()) or "–",
     ]
-
-
-def row(cells: Iterable[object]) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |"
 
 
 if __name__ == "__main__":
