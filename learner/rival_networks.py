@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brakeline.errors import BadData
-from brakeline.learner.adam import Adam
-from brakeline.learner.networks import Network
+from brakeline.learner.networks import Adam, Network
 from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask

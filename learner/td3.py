@@ -20,10 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brakeline.learner.adam import Adam
 from brakeline.learner.checkpoint_state import PartState
 from brakeline.learner.learner_config import TD3Config
-from brakeline.learner.networks import Network
+from brakeline.learner.networks import Adam, Network
 from brakeline.learner.replay import Batch
 
 

@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch.nn.functional import linear, relu
 
-from brakeline.learner.adam import Adam
 from brakeline.learner.learner_config import TD3Config
-from brakeline.learner.networks import Network
+from brakeline.learner.networks import Adam, Network
 from brakeline.learner.replay import Batch
 from brakeline.learner.td3 import TD3
 
