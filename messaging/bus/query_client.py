@@ -97,18 +97,16 @@ class QueryClient:
     def _querier(self, key: str, timeout: float) -> zenoh.Querier:
         with self._lock:
             if (key, timeout) not in self._queriers:
+                # At a short deadline, drop, so that the caller never stalls; at a long one, wait: nothing is lost.
+                block = timeout >= PATIENT
                 self._queriers[key, timeout] = self._session.declare_querier(
                     key,
                     target=zenoh.QueryTarget.ALL,
                     consolidation=zenoh.ConsolidationMode.NONE,  # the first answer counts
                     timeout=timeout,
                     priority=zenoh.Priority.REAL_TIME,
-                    congestion_control=_congestion(timeout),  # of the answer too
+                    # of the answer too
+                    congestion_control=zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP,
                     express=True,
                 )
             return self._queriers[key, timeout]
-
-
-def _congestion(timeout: float) -> zenoh.CongestionControl:
-    """Drop at a short deadline, so that the caller never stalls; wait at a long one, so that nothing is lost."""
-    return zenoh.CongestionControl.BLOCK if timeout >= PATIENT else zenoh.CongestionControl.DROP

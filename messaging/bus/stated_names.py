@@ -26,7 +26,7 @@ def check_names(names: Mapping[str, str], message: Any) -> None:
     Raises:
         Implausible: the message speaks for another robot, or for another process.
     """
-    fields = _name_fields(message.DESCRIPTOR)
+    fields = _NameFields(message.DESCRIPTOR)
     if (robot := names.get("robot")) is not None:
         for stated in fields.robots(message):
             if stated not in ("", robot):
@@ -57,6 +57,7 @@ def _publishes(source: str, key: str) -> bool:
         return True
 
 
+@cache
 class _NameFields:
     """The fields of a message type, and of the request in it, that hold names."""
 
@@ -73,11 +74,6 @@ class _NameFields:
     def sources(self, message: Any) -> list[str]:
         stated = _stated(message, self._sources, self._sources_within)
         return [message.header.source, *stated] if self._header else stated
-
-
-@cache
-def _name_fields(kind: Descriptor) -> _NameFields:
-    return _NameFields(kind)
 
 
 def _names_in(kind: Descriptor | None, *names: str) -> tuple[str, ...]:

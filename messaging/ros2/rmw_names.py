@@ -1,16 +1,21 @@
-"""The names in rmw_zenoh: keys of topics, and the liveliness tokens that show nodes in the ROS graph.
+"""The names in rmw_zenoh: keys of topics, and the liveliness tokens that show nodes in the ROS graph; and attachments.
 
 topic   <domain>/<name without outer slashes>/<pkg>::msg::dds_::<Type>_/RIHS01_<hash>
 token   @ros2_lv/<domain>/<session>/<node id>/<id>/<kind>/<enclave>/<namespace>/<node>
         for a publisher or subscription followed by /<topic>/<type>/<hash>/<qos>; a `/` inside a part becomes `%`
+
+rmw_zenoh sends an attachment with each message: sequence number, time and sender.
 """
 
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass
 
-from brakeline.errors import BadRosName
+import xxhash
+
+from brakeline.errors import BadRosName, Malformed
 
 NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"
 SPACE = "@ros2_lv"
@@ -18,6 +23,8 @@ ANY_HASH = "*"  # a subscriber accepts any hash of its type: Humble has none, an
 DEFAULT_DEPTH = 42  # of rmw_zenoh's history; a token leaves it out
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 RELIABLE, BEST_EFFORT, TRANSIENT_LOCAL, VOLATILE = 1, 2, 1, 2  # numbers of rmw
+ATTACHMENT = struct.Struct("<qqB16s")
+GID = 16  # bytes
 
 
 @dataclass(frozen=True)
@@ -124,6 +131,41 @@ class GraphEntity:
             return GraphEntity(*where, _plain(name), ros_type(type_), digest, qos)
         except ValueError as error:
             raise BadRosName(f"not a token: {token!r}") from error
+
+
+def gid_of(token: str) -> bytes:
+    """Return a publisher's global id: XXH3-128 of its liveliness token, low half first, each half little-endian."""
+    return xxhash.xxh3_128_digest(token.encode())[::-1]
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """The attachment of a message.
+
+    Attributes:
+        sequence: number of the message, from 1 on for each publisher.
+        time: ns since the Unix epoch.
+        gid: the publisher's global id.
+    """
+
+    sequence: int
+    time: int
+    gid: bytes
+
+    def encode(self) -> bytes:
+        """Encode the attachment."""
+        return ATTACHMENT.pack(self.sequence, self.time, GID, self.gid)
+
+    @staticmethod
+    def decode(payload: bytes) -> Attachment:
+        """Decode an attachment. Raises Malformed."""
+        try:
+            sequence, time, length, gid = ATTACHMENT.unpack(payload)
+        except struct.error as error:
+            raise Malformed(f"not an attachment: {error}") from error
+        if length != GID:
+            raise Malformed(f"not an attachment: a global id of {length} bytes")
+        return Attachment(sequence, time, gid)
 
 
 def _mangled(name: str) -> str:

@@ -30,15 +30,16 @@ from brakeline.messaging.bus.subscription import Subscription
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error, close_sessions, zenoh_config
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.ros2.cdr_messages import decode, digest_of, encode, type_of
-from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
 from brakeline.messaging.ros2.rmw_names import (
     NODE,
     PUBLISHER,
     SPACE,
     SUBSCRIPTION,
+    Attachment,
     GraphEntity,
     Qos,
     full_name,
+    gid_of,
     topic_key,
 )
 from brakeline.messaging.steady_clock import steady_time_ns

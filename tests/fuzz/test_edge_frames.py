@@ -18,7 +18,7 @@ from brakeline.errors import Malformed
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.ros2 import cdr_messages as cdr
-from brakeline.messaging.ros2.rmw_attachment import Attachment
+from brakeline.messaging.ros2.rmw_names import Attachment
 from brakeline.messaging.topics import FRAMES
 
 OWN = ("COMMAND_ACK", "STATUSTEXT", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "SYS_STATUS", "FENCE_STATUS", "TIMESYNC")

@@ -16,8 +16,16 @@ from brakeline.errors import BadRosName, Malformed, Unreachable
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.ros2 import LATCHED, SENSOR, GraphEntity, Qos, RosNode, RosSettings
 from brakeline.messaging.ros2 import cdr_messages as cdr
-from brakeline.messaging.ros2.rmw_attachment import Attachment, gid_of
-from brakeline.messaging.ros2.rmw_names import NODE, PUBLISHER, SUBSCRIPTION, full_name, ros_type, topic_key
+from brakeline.messaging.ros2.rmw_names import (
+    NODE,
+    PUBLISHER,
+    SUBSCRIPTION,
+    Attachment,
+    full_name,
+    gid_of,
+    ros_type,
+    topic_key,
+)
 from tests.waiting import until
 
 KINDS = (
