@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,6 @@ Stop = Callable[[], bool]  # whether to end
 PolicyFactory = Callable[[int], Policy]  # makes a policy from a seed
 
 
-class Proposer(Protocol):
-    """The source of a robot's proposals."""
-
-    @property
-    def version(self) -> int:
-        """The version of the weights that propose; 0: a policy without versions."""
-
-    def join(self, index: int, episode: int, stop: Stop) -> int | None:
-        """Wait until there are proposals, see `LearnerClient.join`."""
-
-    def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Wait for permission for step number `index`. Return False at the end of the run."""
-
-    def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode with this random generator."""
-
-    def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        """Return a proposal (m,); the caller checks it."""
-
-
 class LearnedPolicy(LearnerClient):
     """Explores with a learner's newest weights, and takes no more steps than the learner permits."""
 
@@ -49,7 +29,7 @@ class LearnedPolicy(LearnerClient):
         return 0 if self.policy is None else self.policy.version
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Wait for the learner's permission."""
+        """Wait for the learner's permission for step number `index`. Return False at the end of the run."""
         return self.wait(index, episode, stop)
 
     def begin(self, rng: np.random.Generator) -> None:
@@ -79,7 +59,7 @@ class RealTimePolicy(LearnedPolicy):
 class FixedPolicy:
     """A policy that does not learn, for a number of steps (0: without end)."""
 
-    version = 0
+    version = 0  # it has none
 
     def __init__(self, make: PolicyFactory, seed: int, steps: int = 0) -> None:
         self.policy, self._steps = make(seed), steps
@@ -98,3 +78,6 @@ class FixedPolicy:
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
         """Return the policy's action."""
         return np.asarray(self.policy(observation, info), dtype=float)
+
+
+Proposer = LearnedPolicy | FixedPolicy

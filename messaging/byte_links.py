@@ -4,6 +4,9 @@ udpin:HOST:PORT    listen; send to all peers that sent something in the last `FO
 udpout:HOST:PORT   send to this address
 tcp:HOST:PORT      connect
 tcpin:HOST:PORT    listen; any number of connections
+
+A link may lose bytes. `send` never waits, and a peer that is gone is no error. `receive` returns the bytes that arrived
+since the last call.
 """
 
 from __future__ import annotations
@@ -11,24 +14,11 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from typing import Protocol
 
 from brakeline.errors import BadLink
 
 FORGET = 10.0  # time after which a silent UDP peer gets nothing more [s]
 LARGEST = 65536  # largest number of bytes in one read
-
-
-class Link(Protocol):
-    """A link that may lose bytes."""
-
-    def send(self, data: bytes) -> None:
-        """Send bytes without waiting. A peer that is gone is no error."""
-
-    def receive(self) -> bytes:
-        """Return the bytes that arrived since the last call."""
-
-    def close(self) -> None: ...
 
 
 class Udp:
@@ -135,7 +125,10 @@ class TcpServer:
         self._socket.close()
 
 
-def open_link(url: str) -> Udp | Tcp | TcpServer:
+Link = Udp | Tcp | TcpServer
+
+
+def open_link(url: str) -> Link:
     """Open the link at a URL.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,17 +16,8 @@ from brakeline.messaging.robot import Robot
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
 from brakeline.sim.vehicle import Period
 
-
-class Endpoint(Protocol):
-    """A simulated autopilot in memory, such as `brakeline.sim.autopilot.endpoint.Autopilot`."""
-
-    vehicle: Quadrotor
-
-    def receive(self, data: bytes) -> None: ...
-
-    def take(self) -> bytes: ...
-
-    def advance(self, seconds: float) -> None: ...
+if TYPE_CHECKING:
+    from brakeline.sim.autopilot.endpoint import Autopilot
 
 
 class LockstepVehicle(ABC):
@@ -74,7 +65,7 @@ class LockstepQuadrotor(LockstepVehicle):
     The autopilot changes its mode before time begins.
     """
 
-    def __init__(self, endpoint: Endpoint, robot: Robot, tap: FrameTap | None = None) -> None:
+    def __init__(self, endpoint: Autopilot, robot: Robot, tap: FrameTap | None = None) -> None:
         """tap: called with every MAVLink frame. Raises MavlinkError: the autopilot refuses something."""
         super().__init__(robot, endpoint.vehicle)
         self._endpoint, self._client = endpoint, AutopilotClient(endpoint.receive, tap=tap)

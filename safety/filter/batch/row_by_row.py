@@ -3,35 +3,21 @@
 from __future__ import annotations
 
 from time import perf_counter_ns
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.batch.batch_filter import blank_answers, completed
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 
 if TYPE_CHECKING:
+    from brakeline.safety.filter.filter import Filter
     from brakeline.safety.methods import Method
 
 
-class BatchMethod(Protocol):
-    """Turns requests of many robots into decisions, as `Filter` does."""
-
-    @property
-    def robot(self) -> Robot: ...
-
-    @property
-    def version(self) -> str:
-        """The hash of the model."""
-
-    def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
-        """Return the decisions. Raises BadRequest if a value of the requests is not valid."""
-
-
 class RowByRow:
-    """A method as a `BatchMethod`: one decision after the other.
+    """A method that decides on many robots as `Filter` does: one decision after the other.
 
     >>> from brakeline import Filter, Request, RequestArrays, Shapes
     >>> stand = np.zeros((3, 2))
@@ -54,3 +40,6 @@ class RowByRow:
         started, every = perf_counter_ns(), np.ones(len(requests), dtype=bool)
         answers = blank_answers(self.robot, requests, np, "cpu")
         return completed(self._method, requests, answers, every, started, bound=None, judges=False)
+
+
+BatchMethod: TypeAlias = "Filter | RowByRow"  # what `BackupPlanBatch` asks
