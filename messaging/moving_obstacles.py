@@ -13,21 +13,13 @@ from brakeline.messaging.obstacle import Array, Obstacle, Shapes
 
 @dataclass(frozen=True)
 class MovingObstacles:
-    """n moving obstacles; `brakeline.messaging.obstacle_motion` has the equations.
+    """n moving obstacles; `brakeline.messaging.obstacle_motion` has the equations."""
 
-    Attributes:
-        shapes: as measured.
-        drift: c (n, d) [m/s].
-        growth: (n, 3), r(t) = growth · (1, t, t²) [m].
-        age: time since the measurement (n,) [s].
-        consistent: (n,), whether each measurement lies within the bounds of the previous one.
-    """
-
-    shapes: Shapes
-    drift: Array
-    growth: Array
-    age: Array
-    consistent: NDArray[np.bool_]
+    shapes: Shapes  # as measured
+    drift: Array  # c (n, d) [m/s]
+    growth: Array  # (n, 3), r(t) = growth · (1, t, t²) [m]
+    age: Array  # time since the measurement (n,) [s]
+    consistent: NDArray[np.bool_]  # (n,), whether each measurement lies within the bounds of the previous one
 
     def __len__(self) -> int:
         return len(self.age)

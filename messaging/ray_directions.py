@@ -13,15 +13,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LidarRays:
-    """The rays of a lidar.
+    """The rays of a lidar."""
 
-    Attributes:
-        directions: unit vectors (rays, d) in the robot's frame.
-        range: distance that is observed as 1 [m].
-    """
-
-    directions: Array
-    range: float
+    directions: Array  # unit vectors (rays, d) in the robot's frame
+    range: float  # distance that is observed as 1 [m]
 
 
 def planar_rays(count: int, degrees: float, range: float) -> LidarRays:

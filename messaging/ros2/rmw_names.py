@@ -29,17 +29,11 @@ GID = 16  # bytes
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service of a publisher or a subscription.
+    """Quality of service of a publisher or a subscription."""
 
-    Attributes:
-        depth: messages in the history.
-        reliable: whether lost messages are sent again.
-        latched: whether later subscribers get the last `depth` messages.
-    """
-
-    depth: int = 10
-    reliable: bool = True
-    latched: bool = False
+    depth: int = 10  # messages in the history
+    reliable: bool = True  # whether lost messages are sent again
+    latched: bool = False  # whether later subscribers get the last `depth` messages
 
     def token(self) -> str:
         """Return the last part of a token, which leaves out the defaults of rmw_zenoh."""
@@ -140,17 +134,11 @@ def gid_of(token: str) -> bytes:
 
 @dataclass(frozen=True)
 class Attachment:
-    """The attachment of a message.
+    """The attachment of a message."""
 
-    Attributes:
-        sequence: number of the message, from 1 on for each publisher.
-        time: ns since the Unix epoch.
-        gid: the publisher's global id.
-    """
-
-    sequence: int
-    time: int
-    gid: bytes
+    sequence: int  # number of the message, from 1 on for each publisher
+    time: int  # ns since the Unix epoch
+    gid: bytes  # the publisher's global id
 
     def encode(self) -> bytes:
         """Encode the attachment."""

@@ -21,22 +21,16 @@ UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 @dataclass(frozen=True)
 class BlockingConstraint:
-    """The constraint that a proposal violated, or came nearest to.
+    """The constraint that a proposal violated, or came nearest to."""
 
-    Attributes:
-        by: `cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves; `unseen`; `robot` (another
-            robot's reservation); `sight` (the tube leaves the visible space); or the name of a limit.
-        room: distance from the tube to the half-space [m], or in the limit's own unit. Negative if the tube crosses it.
-        after: time from now [s].
-        normal (d,): normal of the half-space, away from the free side, world. Empty if there is no half-space.
-        at (d,): the obstacle's nearest point [m], on the half-space, world. Empty if there is no half-space.
-    """
-
+    # `cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves; `unseen`; `robot` (another robot's
+    # reservation); `sight` (the tube leaves the visible space); or the name of a limit
     by: str
+    # distance from the tube to the half-space [m], or in the limit's own unit. Negative if the tube crosses it.
     room: float
-    after: float
-    normal: Array
-    at: Array
+    after: float  # time from now [s]
+    normal: Array  # (d,): normal of the half-space, away from the free side, world. Empty if there is no half-space.
+    at: Array  # (d,): the obstacle's nearest point [m], on the half-space, world. Empty if there is no half-space.
 
     @staticmethod
     def nowhere(by: str, room: float, after: float) -> BlockingConstraint:
@@ -60,23 +54,14 @@ class ConstraintSources:
 
 @dataclass(frozen=True)
 class Planes:
-    """Half-spaces for one disc of the body, in the order of `ConstraintSources`.
+    """Half-spaces for one disc of the body, in the order of `ConstraintSources`."""
 
-    Attributes:
-        start (d,): start of the nominal path of the disc's centre, world [m].
-        ends (N, d): its positions at the ends of the periods, world [m].
-        normals (n, N, d): normals of the half-spaces.
-        offsets (n, N): offsets about `start` [m], already reduced by `keep_off` and `measured`.
-        keep_off: distance to the obstacles [m].
-        measured (d,): bound of the position's measurement error [m].
-    """
-
-    start: Array
-    ends: Array
-    normals: Array
-    offsets: Array
-    keep_off: float
-    measured: Array
+    start: Array  # (d,): start of the nominal path of the disc's centre, world [m]
+    ends: Array  # (N, d): its positions at the ends of the periods, world [m]
+    normals: Array  # (n, N, d): normals of the half-spaces
+    offsets: Array  # (n, N): offsets about `start` [m], already reduced by `keep_off` and `measured`
+    keep_off: float  # distance to the obstacles [m]
+    measured: Array  # (d,): bound of the position's measurement error [m]
 
     def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
         """Return the half-space (d,), () at the surface of an obstacle with that margin, without the body's radius."""

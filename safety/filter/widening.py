@@ -23,17 +23,12 @@ RESERVE = 1.1  # factor on the largest score
 
 @dataclass(frozen=True)
 class PastWindow:
-    """The last periods of a plan's length, up to the state in the request.
+    """The last periods of a plan's length, up to the state in the request."""
 
-    Attributes:
-        states (N, n): measured states at the periods' starts.
-        inputs (N + 1, m): the input in force before the first period, then the executed inputs.
-        from_start: it began within a plan's length of an episode's start, or of a gap in the measurements. No request
-            held a window then.
-    """
-
-    states: Array
-    inputs: Array
+    states: Array  # (N, n): measured states at the periods' starts
+    inputs: Array  # (N + 1, m): the input in force before the first period, then the executed inputs
+    # it began within a plan's length of an episode's start, or of a gap in the measurements. No request held a window
+    # then.
     from_start: bool = False
 
 

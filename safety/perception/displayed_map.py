@@ -28,20 +28,14 @@ SLICE = 0.5  # m: hits this far above or below the sensor are drawn from above
 
 @dataclass(frozen=True)
 class DisplayedMap:
-    """The local map of one request, in the world's frame.
+    """The local map of one request, in the world's frame."""
 
-    Attributes:
-        hits: (k, d) ends of the beams that hit something [m]; empty without a scan.
-        free: (c, d) outline of the space that the scan showed to be free [m], as the filter takes it. In space, it is
-            the outline at the sensor's height. Empty without a scan.
-        movers: (n, d+1) measured center, and radius of a disc or ball around each moving obstacle [m].
-        swept: (n, N, d+1) the same at the end of each period of a plan, with room for wherever the obstacle may be.
-    """
-
-    hits: Array
+    hits: Array  # (k, d) ends of the beams that hit something [m]; empty without a scan
+    # (c, d) outline of the space that the scan showed to be free [m], as the filter takes it. In space, it is the
+    # outline at the sensor's height. Empty without a scan.
     free: Array
-    movers: Array
-    swept: Array
+    movers: Array  # (n, d+1) measured center, and radius of a disc or ball around each moving obstacle [m]
+    swept: Array  # (n, N, d+1) the same at the end of each period of a plan, with room for wherever the obstacle may be
 
     def flat(self, hits: int = OUTLINE) -> dict[str, list[Any]]:
         """Return the map as values for JSON, rounded to 1 mm: points (d numbers), and discs or balls (d + 1 numbers).

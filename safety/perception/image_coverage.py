@@ -38,15 +38,10 @@ CORNER = math.sqrt(0.75)  # from a cube's corner to its center, per metre of edg
 
 @dataclass(frozen=True)
 class SphereCover:
-    """Beams that no direction on the sphere is farther from than an angle δ.
+    """Beams that no direction on the sphere is farther from than an angle δ."""
 
-    Attributes:
-        kappa: κ, the edge of the cube that a beam cannot miss, per metre of distance.
-        within: angle [rad] around a patch's beam within which the beams bound the patch's free range.
-    """
-
-    kappa: float
-    within: float
+    kappa: float  # κ, the edge of the cube that a beam cannot miss, per metre of distance
+    within: float  # angle [rad] around a patch's beam within which the beams bound the patch's free range
 
     @staticmethod
     def of(delta: float, patch: float) -> SphereCover:
@@ -108,15 +103,10 @@ def by_mesh(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class GridWindow:
-    """Neighbours of each beam in a grid.
+    """Neighbours of each beam in a grid."""
 
-    Attributes:
-        rows: rings above and below the beam.
-        beside: (E,) columns to the left and to the right of the beam, by its ring.
-    """
-
-    rows: int
-    beside: NDArray[np.int64]
+    rows: int  # rings above and below the beam
+    beside: NDArray[np.int64]  # (E,) columns to the left and to the right of the beam, by its ring
 
     @staticmethod
     def of(columns: int, elevations: Array, step: float, within: float) -> GridWindow:

@@ -27,34 +27,21 @@ DIRECTION_ERROR = 1e-6  # rad: largest error of a direction in single precision
 
 @dataclass(frozen=True)
 class PlanBoxes:
-    """Boxes that hold every plan's position at the ends of the periods, in the world's frame.
+    """Boxes that hold every plan's position at the ends of the periods, in the world's frame."""
 
-    Attributes:
-        boxes: (2, N+1, 3) lowest and highest corners [m], the first for now; or (2, 1, 3), one box for all ends.
-        last: time of the last end [s from now].
-    """
-
-    boxes: Array
-    last: float
+    boxes: Array  # (2, N+1, 3) lowest and highest corners [m], the first for now; or (2, 1, 3), one box for all ends
+    last: float  # time of the last end [s from now]
 
 
 @dataclass(frozen=True)
 class OccludedRegions:
-    """The n shadows of a range image that come into the boxes of a plan.
+    """The n shadows of a range image that come into the boxes of a plan."""
 
-    Attributes:
-        capsules: (ROWS, n) hulls of the shadows, relative to the origin (`kernels/shadow_kernels.py`).
-        origin: (3,) [m], world.
-        room: the boxes.
-        speed: largest speed of anything in a shadow [m/s].
-        age: time since the image was taken [s].
-    """
-
-    capsules: Single
-    origin: Array
-    room: PlanBoxes
-    speed: float
-    age: float
+    capsules: Single  # (ROWS, n) hulls of the shadows, relative to the origin (`kernels/shadow_kernels.py`)
+    origin: Array  # (3,) [m], world
+    room: PlanBoxes  # the boxes
+    speed: float  # largest speed of anything in a shadow [m/s]
+    age: float  # time since the image was taken [s]
 
 
 def prepare() -> None:

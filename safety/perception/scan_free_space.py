@@ -28,21 +28,13 @@ VELOCITY, ERROR, ACCELERATION = slice(0, 2), slice(2, 3), slice(3, 4)  # columns
 
 @dataclass(frozen=True)
 class OccupiedCells:
-    """n convex cells that may be occupied.
+    """n convex cells that may be occupied."""
 
-    Attributes:
-        corners: (n, V, 2) [m], world; the last corner is repeated in cells with fewer.
-        error: (n, V) largest position error of each corner [m].
-        motions: (n, 4) motion of the cell's contents since the scan, as a row of `BeamTracks.motions`.
-        speed: largest speed of anything [m/s].
-        age: time since the scan [s].
-    """
-
-    corners: Array
-    error: Array
-    motions: Array
-    speed: float = 0.0
-    age: float = 0.0
+    corners: Array  # (n, V, 2) [m], world; the last corner is repeated in cells with fewer
+    error: Array  # (n, V) largest position error of each corner [m]
+    motions: Array  # (n, 4) motion of the cell's contents since the scan, as a row of `BeamTracks.motions`
+    speed: float = 0.0  # largest speed of anything [m/s]
+    age: float = 0.0  # time since the scan [s]
 
     def __len__(self) -> int:
         return len(self.corners)

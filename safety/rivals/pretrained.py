@@ -29,22 +29,14 @@ RAYS = "rays"  # the tensor with the directions
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A rival's model.
+    """A rival's model."""
 
-    Attributes:
-        robot: that the model is for.
-        method: that uses the model.
-        networks: by name.
-        settings: the numbers that a decision depends on.
-        about: notes on the training.
-        rays: of the lidar whose ranges come first in an observation; None if the method does not read them.
-    """
-
-    robot: Robot
-    method: str
-    networks: Mapping[str, Perceptrons]
-    settings: Mapping[str, float]
-    about: dict[str, str] = field(default_factory=dict)
+    robot: Robot  # that the model is for
+    method: str  # that uses the model
+    networks: Mapping[str, Perceptrons]  # by name
+    settings: Mapping[str, float]  # the numbers that a decision depends on
+    about: dict[str, str] = field(default_factory=dict)  # notes on the training
+    # of the lidar whose ranges come first in an observation; None if the method does not read them
     rays: LidarRays | None = None
 
     @property

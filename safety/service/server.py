@@ -170,17 +170,12 @@ class Receipt:
 
 @dataclass(frozen=True)
 class BatchHandler:
-    """The service's core: a function from the bytes of a RequestBatch to the bytes of a ReplyBatch.
+    """The service's core: a function from the bytes of a RequestBatch to the bytes of a ReplyBatch."""
 
-    Attributes:
-        models: the methods in use.
-        counts: to count in.
-        authenticator: checks the plan tokens. Without one (in process, or when a log is replayed), every plan counts as
-            verified by the model that the request names.
-    """
-
-    models: ModelRegistry
-    counts: ServiceCounts
+    models: ModelRegistry  # the methods in use
+    counts: ServiceCounts  # to count in
+    # checks the plan tokens. Without one (in process, or when a log is replayed), every plan counts as verified by the
+    # model that the request names.
     authenticator: PlanAuthenticator | None = None
 
     def __call__(self, payload: bytes, asker: str = "") -> bytes:

@@ -50,17 +50,11 @@ SAFE_GAP = 0.01  # m; the wheels turn too slowly to cover it between two samples
 
 @dataclass(frozen=True)
 class MotionBatch:
-    """The true motion of robots in one period.
+    """The true motion of robots in one period."""
 
-    Attributes:
-        coordinates (rows, S, 9): MuJoCo's, at the samples.
-        collision (rows,): whether the robot touched an obstacle in some physics step.
-        clearance (rows, S): m, from the body to the nearest obstacle.
-    """
-
-    coordinates: Array
-    collision: NDArray[np.bool_]
-    clearance: Array
+    coordinates: Array  # (rows, S, 9): MuJoCo's, at the samples
+    collision: NDArray[np.bool_]  # (rows,): whether the robot touched an obstacle in some physics step
+    clearance: Array  # (rows, S): m, from the body to the nearest obstacle
 
 
 class GroundBatch(VehicleBatch):

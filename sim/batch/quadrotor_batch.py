@@ -45,19 +45,12 @@ DOUBT = 0.02  # m; less than that, between two ticks, an acceleration of 30 m/s�
 
 @dataclass(frozen=True)
 class FlightBatch:
-    """The true motion of quadrotors in one period.
+    """The true motion of quadrotors in one period."""
 
-    Attributes:
-        path (rows, T, 3): positions at the ticks [m].
-        accelerations (rows, 3): at the end, means over the last physics step [m/s²].
-        collision (rows,): whether the quadrotor touched an obstacle in some physics step.
-        clearance (rows,): m, from the body to the nearest obstacle at the end.
-    """
-
-    path: Array
-    accelerations: Array
-    collision: NDArray[np.bool_]
-    clearance: Array
+    path: Array  # (rows, T, 3): positions at the ticks [m]
+    accelerations: Array  # (rows, 3): at the end, means over the last physics step [m/s²]
+    collision: NDArray[np.bool_]  # (rows,): whether the quadrotor touched an obstacle in some physics step
+    clearance: Array  # (rows,): m, from the body to the nearest obstacle at the end
 
 
 class QuadrotorBatch(VehicleBatch):

@@ -28,19 +28,12 @@ LEFT = 0.7  # share of running lanes, below which the others are dropped from th
 
 @dataclass(frozen=True)
 class BatchSolution:
-    """Solutions of a batch of QPs.
+    """Solutions of a batch of QPs."""
 
-    Attributes:
-        x (n, B): solutions; meaningless in a lane that is not solved.
-        solved (B,): the lane meets the optimality conditions.
-        infeasible (B,): the method found that no x meets all rows.
-        steps (B,): steps of the method.
-    """
-
-    x: Array
-    solved: Array
-    infeasible: Array
-    steps: Array
+    x: Array  # (n, B): solutions; meaningless in a lane that is not solved
+    solved: Array  # (B,): the lane meets the optimality conditions
+    infeasible: Array  # (B,): the method found that no x meets all rows
+    steps: Array  # (B,): steps of the method
 
 
 @dataclass
