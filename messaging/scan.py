@@ -53,16 +53,13 @@ def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[floa
 
 @dataclass(frozen=True, eq=False)
 class BeamTracks:
-    """The tracked motion of the surfaces that a scan hit (`safety/perception/scan_tracking.py`).
+    """The tracked motion of the surfaces that a scan hit (`safety/perception/scan_tracking.py`)."""
 
-    Attributes:
-        track_index: (R,) for each beam, the row in `motions` of the surface that it hit, counted from 1. 0: the surface
-            is not tracked and may move in any direction at the scan's speed.
-        motions: (K, 4) velocity x, y in the world [m/s], its error [m/s], and the largest acceleration [m/s²]. t
-            seconds after the scan the displacement is velocity·t, within error·t + acceleration·t²/2.
-    """
-
+    # (R,) for each beam, the row in `motions` of the surface that it hit, counted from 1. 0: the surface is not tracked
+    # and may move in any direction at the scan's speed.
     track_index: NDArray[np.uint8]
+    # (K, 4) velocity x, y in the world [m/s], its error [m/s], and the largest acceleration [m/s²]. t seconds after the
+    # scan the displacement is velocity·t, within error·t + acceleration·t²/2.
     motions: Array
 
     def problem(self, beams: int) -> str:

@@ -28,17 +28,13 @@ EXTRA = 3.0  # extra costs of a cell that touches an obstacle, in cells
 
 @dataclass(frozen=True)
 class Arena:
-    """Cylinders in a square, and where a robot starts and has to go.
+    """Cylinders in a square, and where a robot starts and has to go."""
 
-    Attributes:
-        centers (10, 2), radii (10,): the cylinders [m].
-        start (3,): pose. goal (2,): position.
-    """
-
+    # centers (10, 2), radii (10,): the cylinders [m]
     centers: Array
     radii: Array
-    start: Array
-    goal: Array
+    start: Array  # (3,): pose
+    goal: Array  # (2,): position
 
     @staticmethod
     def random(generator: np.random.Generator, room: float) -> Arena:

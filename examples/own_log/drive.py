@@ -27,28 +27,19 @@ OTHER_COLUMNS = ("time", "run")
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A simulated robot in the plane.
+    """A simulated robot in the plane."""
 
-    Attributes:
-        period: time between two inputs [s].
-        state: names of the coordinates. The first three are x, y and heading.
-        errors: largest sensor error of each coordinate.
-        inputs, low, high: names and bounds of the inputs.
-        delays: time from an input to its first effect [s].
-        rest: time in which the robot comes to a stand [s].
-        body: discs (ahead, radius) that hold the body [m].
-        rates: derivatives of the true coordinates, from these coordinates and the delayed inputs, each (count,).
-    """
-
-    period: float
-    state: tuple[str, ...]
-    errors: tuple[float, ...]
+    period: float  # time between two inputs [s]
+    state: tuple[str, ...]  # names of the coordinates. The first three are x, y and heading.
+    errors: tuple[float, ...]  # largest sensor error of each coordinate
+    # inputs, low, high: names and bounds of the inputs
     inputs: tuple[str, str]
     low: tuple[float, float]
     high: tuple[float, float]
-    delays: tuple[float, float]
-    rest: float
-    body: tuple[tuple[float, float], ...]
+    delays: tuple[float, float]  # time from an input to its first effect [s]
+    rest: float  # time in which the robot comes to a stand [s]
+    body: tuple[tuple[float, float], ...]  # discs (ahead, radius) that hold the body [m]
+    # derivatives of the true coordinates, from these coordinates and the delayed inputs, each (count,)
     rates: Callable[[Array, Array, Array], tuple[Array, ...]]
 
 

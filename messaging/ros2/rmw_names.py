@@ -81,21 +81,17 @@ def topic_key(domain: int, topic: str, kind: str, digest: str = ANY_HASH) -> str
 
 @dataclass(frozen=True)
 class GraphEntity:
-    """A node, a publisher or a subscription in the graph.
-
-    Attributes:
-        session: its Zenoh id.
-        node_id, id: ids of the node and of the entity in the session.
-        topic, type, digest, qos: empty for a node.
-    """
+    """A node, a publisher or a subscription in the graph."""
 
     domain: int
-    session: str
+    session: str  # its Zenoh id
+    # node_id, id: ids of the node and of the entity in the session
     node_id: int
     id: int
     kind: str
     namespace: str
     node: str
+    # topic, type, digest, qos: empty for a node
     topic: str = ""
     type: str = ""
     digest: str = ""

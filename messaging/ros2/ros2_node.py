@@ -62,19 +62,14 @@ class RosSettings:
     """How to reach a ROS graph.
 
     The node is a peer like those of rmw_zenoh: it connects to the router, and to the nodes that the router knows.
-
-    Attributes:
-        connect: Zenoh endpoints of the router.
-        listen: Zenoh endpoints on which the node is a router itself; empty: it is not.
-        domain, namespace: of the node.
-        patience: s to wait for a router at the start.
     """
 
-    connect: tuple[str, ...] = (ROUTER,)
-    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = (ROUTER,)  # Zenoh endpoints of the router
+    listen: tuple[str, ...] = ()  # Zenoh endpoints on which the node is a router itself; empty: it is not
+    # domain, namespace: of the node
     domain: int = 0
     namespace: str = "/"
-    patience: float = 10.0
+    patience: float = 10.0  # s to wait for a router at the start
 
     def configuration(self) -> zenoh.Config:
         """Return the configuration of the Zenoh session."""

@@ -21,27 +21,19 @@ from brakeline.safety.perception.scan_free_space import OccupiedCells, occupied_
 
 @dataclass(frozen=True)
 class LocalMap:
-    """What a request says about the space within reach of a robot, in the world.
+    """What a request says about the space within reach of a robot, in the world."""
 
-    Attributes:
-        start (d,), heading [rad]: measured pose. turn (d, d): rotation from the robot's frame to the world.
-        near: obstacles within reach. moving: moving obstacles that may come within reach.
-        beyond [m]: the distance below which the request names no further obstacle, at most the sensor's range.
-        unseen: space that a scan does not show to be free. other_reservations: those of other robots.
-        widening: factor on every set of a plan (docs/method.md §15).
-        asked: factor that the request puts on the set of the next state; `widening` is never smaller.
-    """
-
+    # start (d,), heading [rad]: measured pose
     start: Array
     heading: float
-    turn: Array
-    near: Shapes
-    beyond: float
-    moving: MovingObstacles | None = None
-    unseen: OccupiedCells | OccludedRegions | None = None
-    other_reservations: OtherReservations | None = None
-    widening: float = 1.0
-    asked: float = 1.0
+    turn: Array  # (d, d): rotation from the robot's frame to the world
+    near: Shapes  # obstacles within reach
+    beyond: float  # [m]: the distance below which the request names no further obstacle, at most the sensor's range
+    moving: MovingObstacles | None = None  # moving obstacles that may come within reach
+    unseen: OccupiedCells | OccludedRegions | None = None  # space that a scan does not show to be free
+    other_reservations: OtherReservations | None = None  # those of other robots
+    widening: float = 1.0  # factor on every set of a plan (docs/method.md §15)
+    asked: float = 1.0  # factor that the request puts on the set of the next state; `widening` is never smaller
 
     @property
     def parked(self) -> LocalMap:

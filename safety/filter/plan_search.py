@@ -48,24 +48,17 @@ class DecisionRecord:
 
 @dataclass(frozen=True)
 class PlanCandidate:
-    """A plan that the filter may answer with.
-
-    Attributes:
-        plan (N, m), z (nz,): the inputs, and the regressors of their tube.
-        margin [m]: distance of the tube to the nearest half-space (docs/method.md §3).
-        constraints: the constraints whose tube belongs to the plan.
-        continues: the plan is the committed backup plan, and its earlier verification holds.
-        for_clearance: the proposal's tube is verified too, but comes nearer than the clearance margin.
-    """
+    """A plan that the filter may answer with."""
 
     kind: str
+    # plan (N, m), z (nz,): the inputs, and the regressors of their tube
     plan: Array
     z: Array
-    margin: float
+    margin: float  # [m]: distance of the tube to the nearest half-space (docs/method.md §3)
     verified: bool
-    constraints: TubeConstraints
-    continues: bool = False
-    for_clearance: bool = False
+    constraints: TubeConstraints  # the constraints whose tube belongs to the plan
+    continues: bool = False  # the plan is the committed backup plan, and its earlier verification holds
+    for_clearance: bool = False  # the proposal's tube is verified too, but comes nearer than the clearance margin
 
 
 class Linearized:

@@ -21,15 +21,11 @@ ROUNDING = 1e-12  # of a unit row of W: a row with smaller entries for f does no
 
 @dataclass(frozen=True)
 class ConstraintRows:
-    """Rows (3) of docs/method.md: `gradient z + spread m(z) <= bound`, where m(z) are the tube's magnitudes.
+    """Rows (3) of docs/method.md: `gradient z + spread m(z) <= bound`, where m(z) are the tube's magnitudes."""
 
-    Attributes:
-        gradient (rows, nz), spread (rows, L+N+1) >= 0, bound (rows,) [m, or the unit of a limit].
-    """
-
-    gradient: Array
-    spread: Array
-    bound: Array
+    gradient: Array  # (rows, nz)
+    spread: Array  # (rows, L+N+1) >= 0
+    bound: Array  # (rows,) [m, or the unit of a limit]
 
     def support(self, tube: Tube, z: Array) -> Array:
         """Return the left side of the rows (rows,) for regressors z."""

@@ -33,19 +33,15 @@ ROUNDED, DEPENDENT, MOST_EXCHANGES = 1e-11, 1e-11, 12
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """The problem `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`.
+    """The problem `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`."""
 
-    Attributes:
-        h, g (n,): diagonal and gradient of the cost.
-        A (rows, n), b (rows,): the constraints.
-        always: number of last rows (bounds and slew) that every reduced problem includes from the start.
-    """
-
+    # h, g (n,): diagonal and gradient of the cost
     h: Array
     g: Array
+    # A (rows, n), b (rows,): the constraints
     A: Array
     b: Array
-    always: int = 0
+    always: int = 0  # number of last rows (bounds and slew) that every reduced problem includes from the start
 
 
 @dataclass(frozen=True)

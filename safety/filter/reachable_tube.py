@@ -28,29 +28,24 @@ class Tube:
         p_i ∈ p_0 + R(θ_0) ( P_i z + c_i + Σ_l m_l(z) D_{i,l} [-1, 1] ),     m(z) = M |W z| + m_0
 
     so the support in a direction is affine in z and |W z| (docs/method.md §2, equation 2).
-
-    Attributes:
-        position (N, d, nz): P. offset (N, d): c, zero for a linear predictor.
-        directions (N, d, L): D.
-        W (q, nz): W.
-        M (L+N+1, q), m_0 (L+N+1,): rows for the L generators, then the N chord deviations β_k, then the stopping
-            distance σ.
-        more (N, r, nz), more_directions (N, r, L), more_offset (N, r): the same for other predicted coordinates, which
-            a limit or a further disc of the body needs.
-        first (n,): what a predictor that is not linear adds to the prediction of all coordinates after one period.
-        stretch (N,): factors that `directions` and `more_directions` hold already, or none.
     """
 
-    position: Array
-    directions: Array
-    W: Array
+    position: Array  # (N, d, nz): P
+    directions: Array  # (N, d, L): D
+    W: Array  # (q, nz): W
+    # M (L+N+1, q), m_0 (L+N+1,): rows for the L generators, then the N chord deviations β_k, then the stopping distance
+    # σ
     M: Array
     m_0: Array
+    # more (N, r, nz), more_directions (N, r, L), more_offset (N, r): the same for other predicted coordinates, which a
+    # limit or a further disc of the body needs
     more: Array
     more_directions: Array
-    offset: Array
+    offset: Array  # (N, d): c, zero for a linear predictor
     more_offset: Array
+    # (n,): what a predictor that is not linear adds to the prediction of all coordinates after one period
     first: Array = field(default_factory=lambda: np.zeros(0))
+    # (N,): factors that `directions` and `more_directions` hold already, or none
     stretch: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, z: Array) -> Tube:
@@ -130,18 +125,14 @@ def _tube(centers: Array, directions: Array, W: Array, M: Array, m_0: Array, d: 
 
 @dataclass(frozen=True)
 class RolloutTube(Tube):
-    """A tube around the rollout of one learned period (docs/method.md §13). Its own linear centers are zero.
+    """A tube around the rollout of one learned period (docs/method.md §13). Its own linear centers are zero."""
 
-    Attributes:
-        robot, one_step: the predictor, and the robot that it is about.
-        inputs_of (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs.
-        kept (r,): indices of the coordinates in `more`.
-    """
-
+    # robot, one_step: the predictor, and the robot that it is about
     robot: Robot = field(kw_only=True)
     one_step: OneStep = field(kw_only=True)
+    # (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs
     inputs_of: Array = field(kw_only=True)
-    kept: tuple[int, ...] = field(kw_only=True)
+    kept: tuple[int, ...] = field(kw_only=True)  # (r,): indices of the coordinates in `more`
 
     @cached_property
     def _kept(self) -> NDArray[np.int64]:
@@ -210,20 +201,13 @@ def stack_rollout(linear: Tube, robot: Robot, one_step: OneStep, inputs_of: Arra
 
 @dataclass(frozen=True)
 class RecursionMaps:
-    """The linear maps of the recursion: z_k = [E y_k; u_{k-1}; u_k], with the state y_k (n,), position first.
+    """The linear maps of the recursion: z_k = [E y_k; u_{k-1}; u_k], with the state y_k (n,), position first."""
 
-    Attributes:
-        E: indices of the coordinates of y in the regressor.
-        relative: number of leading coordinates that are predicted as displacements.
-        inputs: m. plan (N·m, F·m): S, from free inputs to all inputs.
-        first (n, nz): y_0 from z = [x_0; u_{-1}; f], with the position at zero.
-    """
-
-    E: tuple[int, ...]
-    relative: int
-    inputs: int
-    plan: Array
-    first: Array
+    E: tuple[int, ...]  # indices of the coordinates of y in the regressor
+    relative: int  # number of leading coordinates that are predicted as displacements
+    inputs: int  # m
+    plan: Array  # (N·m, F·m): S, from free inputs to all inputs
+    first: Array  # (n, nz): y_0 from z = [x_0; u_{-1}; f], with the position at zero
 
     def previous(self) -> Array:
         """Return the map (m, nz) from z to the input in force."""

@@ -30,15 +30,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Reservation:
-    """The reservation of one robot from now on.
+    """The reservation of one robot from now on."""
 
-    Attributes:
-        center, half_width (N, d) [m]: one box for each period, world. radius (N,) [m]: added around the box.
-    """
-
+    # center, half_width (N, d) [m]: one box for each period, world
     center: Array
     half_width: Array
-    radius: Array
+    radius: Array  # (N,) [m]: added around the box
 
     @staticmethod
     def of(center: Array, half_width: Array, radius: Array) -> Reservation:

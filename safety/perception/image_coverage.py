@@ -126,23 +126,16 @@ class GridWindow:
 
 @dataclass(frozen=True, eq=False)
 class BeamGrid:
-    """The geometry of a grid of beams, which its ranges do not change.
+    """The geometry of a grid of beams, which its ranges do not change."""
 
-    Attributes:
-        elevations: (E',) [rad] from pole to pole.
-        columns: A.
-        half_diagonal: largest angle [rad] from any direction to the nearest beam.
-        added: the numbers of rings (below, above) that the sensor does not see.
-        single, beam_window: the cover by single beams, and the beams that bound a patch's free range.
-        double, mesh_window: the same for meshes.
-    """
-
-    elevations: Array
-    columns: int
-    half_diagonal: float
-    added: tuple[int, int]
+    elevations: Array  # (E',) [rad] from pole to pole
+    columns: int  # A
+    half_diagonal: float  # largest angle [rad] from any direction to the nearest beam
+    added: tuple[int, int]  # the numbers of rings (below, above) that the sensor does not see
+    # single, beam_window: the cover by single beams, and the beams that bound a patch's free range
     single: SphereCover
     beam_window: GridWindow
+    # double, mesh_window: the same for meshes
     double: SphereCover
     mesh_window: GridWindow
 

@@ -30,16 +30,11 @@ SLIT = 0.1  # m: a smaller step between two ranges lets nothing through
 
 @dataclass(frozen=True)
 class OcclusionExits:
-    """Edges of shadows where something may come out.
+    """Edges of shadows where something may come out."""
 
-    Attributes:
-        before: (e,) number of the gap with the near surface.
-        angle: (e,) [rad] in the sensor's frame.
-        near, far: (e,) [m] from the sensor to the first and last point where something may pass.
-    """
-
-    before: NDArray[np.intp]
-    angle: Array
+    before: NDArray[np.intp]  # (e,) number of the gap with the near surface
+    angle: Array  # (e,) [rad] in the sensor's frame
+    # near, far: (e,) [m] from the sensor to the first and last point where something may pass
     near: Array
     far: Array
 

@@ -39,26 +39,17 @@ SPAN = 0.3  # s: least time between two positions of a velocity, and largest tim
 
 @dataclass(frozen=True)
 class _Hits:
-    """The hits of one scan.
+    """The hits of one scan."""
 
-    Attributes:
-        at, heading: pose of the sensor.
-        beams: (k,) numbers of the beams that hit something, ascending.
-        angles: (k,) of these beams in the sensor's frame [rad].
-        points: (k, 2) hits [m], world.
-        linked: (k,) whether a hit is on one surface with the next one.
-        centers: (g, 2) of the groups that stand apart [m].
-        groups: the indices of each group's hits.
-    """
-
+    # at, heading: pose of the sensor
     at: Array
     heading: float
-    beams: NDArray[np.intp]
-    angles: Array
-    points: Array
-    linked: NDArray[np.bool_]
-    centers: Array
-    groups: list[NDArray[np.intp]]
+    beams: NDArray[np.intp]  # (k,) numbers of the beams that hit something, ascending
+    angles: Array  # (k,) of these beams in the sensor's frame [rad]
+    points: Array  # (k, 2) hits [m], world
+    linked: NDArray[np.bool_]  # (k,) whether a hit is on one surface with the next one
+    centers: Array  # (g, 2) of the groups that stand apart [m]
+    groups: list[NDArray[np.intp]]  # the indices of each group's hits
 
 
 class ScanTracker:

@@ -131,17 +131,13 @@ def _position(scan: Scan | RangeImage) -> Array:
 
 @dataclass(frozen=True)
 class _StoredScan:
-    """A scan as free ranges by direction.
-
-    Attributes:
-        at, heading: pose of the sensor.
-        minima: (levels, SECTORS) minima[k, i] is the least free range [m] of the 2^k sectors from sector i on.
-    """
+    """A scan as free ranges by direction."""
 
     scan: Scan
+    # at, heading: pose of the sensor
     at: Array
     heading: float
-    minima: Array
+    minima: Array  # (levels, SECTORS) minima[k, i] is the least free range [m] of the 2^k sectors from sector i on
 
 
 class FanMemory(VisibilityMemory[Scan]):

@@ -35,23 +35,16 @@ log = logging.getLogger("brakeline.safety")
 
 @dataclass
 class ModelRegistry:
-    """The method in use for each robot, and all versions that have been in use.
+    """The method in use for each robot, and all versions that have been in use."""
 
-    Attributes:
-        archive: folder for every installed version; None: no archive.
-        limits: largest accepted bound of a validation report, by the robot's name. Defaults to the limit in the
-            description that the model set holds.
-        accept_bound: largest bound that the user accepts explicitly, in place of `limits`.
-        filters: the method in use, by the robot's name.
-        known: versions that have been in use.
-        numbers: number of the signature of the method in use, by the robot's name; 0: not signed.
-    """
-
-    archive: Path | None = None
+    archive: Path | None = None  # folder for every installed version; None: no archive
+    # largest accepted bound of a validation report, by the robot's name. Defaults to the limit in the description that
+    # the model set holds.
     limits: Mapping[str, float] = field(default_factory=dict)
-    accept_bound: float | None = None
-    filters: dict[str, Method] = field(default_factory=dict)
-    known: set[str] = field(default_factory=set)
+    accept_bound: float | None = None  # largest bound that the user accepts explicitly, in place of `limits`
+    filters: dict[str, Method] = field(default_factory=dict)  # the method in use, by the robot's name
+    known: set[str] = field(default_factory=set)  # versions that have been in use
+    # number of the signature of the method in use, by the robot's name; 0: not signed
     numbers: dict[str, int] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -269,23 +262,16 @@ class BatchHandler:
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """Settings of the process.
+    """Settings of the process."""
 
-    Attributes:
-        bus: how to join the bus.
-        models: model files, one for each robot.
-        archive, limits, accept_bound: of `ModelRegistry`.
-        name: of the process.
-        secrets: folder with the key of the plan tokens, on a bus without keys.
-    """
-
-    bus: BusSettings
-    models: tuple[Path, ...]
+    bus: BusSettings  # how to join the bus
+    models: tuple[Path, ...]  # model files, one for each robot
+    # archive, limits, accept_bound: of `ModelRegistry`
     archive: Path | None = None
-    name: str = "safety"
+    name: str = "safety"  # of the process
     limits: Mapping[str, float] = field(default_factory=dict)
     accept_bound: float | None = None
-    secrets: Path | None = None
+    secrets: Path | None = None  # folder with the key of the plan tokens, on a bus without keys
 
 
 def main(settings: SafetySettings) -> None:

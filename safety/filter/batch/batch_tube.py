@@ -18,17 +18,11 @@ Array = Any  # of any namespace
 
 @dataclass(frozen=True)
 class PathBatch:
-    """The predicted centers of a batch of plans.
+    """The predicted centers of a batch of plans."""
 
-    Attributes:
-        outputs (N, C, B): predicted coordinates after each period.
-        stretch (N, B) or (N, 1): factors on the sets.
-        first (n, B) or (n, 1): what a rollout adds to the prediction of all coordinates after one period.
-    """
-
-    outputs: Array
-    stretch: Array
-    first: Array
+    outputs: Array  # (N, C, B): predicted coordinates after each period
+    stretch: Array  # (N, B) or (N, 1): factors on the sets
+    first: Array  # (n, B) or (n, 1): what a rollout adds to the prediction of all coordinates after one period
 
 
 class TubeBatch:

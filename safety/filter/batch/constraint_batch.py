@@ -19,44 +19,30 @@ Array = Any  # of any namespace
 
 @dataclass(frozen=True)
 class SceneBatch:
-    """The surroundings of each robot of a batch: `LocalMap` for obstacles that stand still.
+    """The surroundings of each robot of a batch: `LocalMap` for obstacles that stand still."""
 
-    Attributes:
-        start: per axis (B,), world. turn: the rotations from the robots' frames to the world.
-        near: the obstacles within reach.
-        beyond (B,) [m]: the distance below which the request names no further obstacle, at most the sensor's range.
-        widening, reach (B,): factor on every set of a plan, and radius of the map [m].
-        far (B,): a tube may leave the sensor's range.
-        asked (B,): factor on the set of the next state.
-    """
-
-    start: Axes
-    turn: TurnBatch
-    near: NearObstacles
+    start: Axes  # per axis (B,), world
+    turn: TurnBatch  # the rotations from the robots' frames to the world
+    near: NearObstacles  # the obstacles within reach
+    # (B,) [m]: the distance below which the request names no further obstacle, at most the sensor's range
     beyond: Array
+    # widening, reach (B,): factor on every set of a plan, and radius of the map [m]
     widening: Array
     reach: Array
-    far: Array
-    asked: Array
+    far: Array  # (B,): a tube may leave the sensor's range
+    asked: Array  # (B,): factor on the set of the next state
 
 
 @dataclass(frozen=True)
 class PlanBatch:
-    """A batch of plans with their tubes and the half-spaces around them.
+    """A batch of plans with their tubes and the half-spaces around them."""
 
-    Attributes:
-        z (nz, B): regressors. path: predicted centers. sizes (L+N+1, B): magnitudes with widening.
-        planes: the half-spaces, for each disc of the body.
-        slack (R, B) [m]: bound minus support of the rows of all half-spaces.
-        extent (B,) [m]: distance from the measured position to the farthest point of the body in the tube.
-    """
-
-    z: Array
-    path: PathBatch
-    sizes: Array
-    planes: list[PlaneBatch]
-    slack: Array
-    extent: Array
+    z: Array  # (nz, B): regressors
+    path: PathBatch  # predicted centers
+    sizes: Array  # (L+N+1, B): magnitudes with widening
+    planes: list[PlaneBatch]  # the half-spaces, for each disc of the body
+    slack: Array  # (R, B) [m]: bound minus support of the rows of all half-spaces
+    extent: Array  # (B,) [m]: distance from the measured position to the farthest point of the body in the tube
 
 
 class ConstraintBatch:

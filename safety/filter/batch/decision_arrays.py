@@ -20,16 +20,13 @@ KINDS = (ALLOWED, ADJUSTED, FAILSAFE, RECOVERING)  # `DecisionArrays.kind` holds
 
 @dataclass(frozen=True)
 class BlockingArrays:
-    """The constraints that proposals violated: `BlockingConstraint` for each adjusted row.
+    """The constraints that proposals violated: `BlockingConstraint` for each adjusted row."""
 
-    Attributes:
-        obstacle (B,): index among the row's obstacles; -1: the tube leaves the visible space.
-        room, after (B,): see `BlockingConstraint`. normal, at (B, d): likewise; NaN if there is no half-space.
-    """
-
-    obstacle: Array
+    obstacle: Array  # (B,): index among the row's obstacles; -1: the tube leaves the visible space
+    # room, after (B,): see `BlockingConstraint`
     room: Array
     after: Array
+    # normal, at (B, d): likewise; NaN if there is no half-space
     normal: Array
     at: Array
 

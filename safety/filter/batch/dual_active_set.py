@@ -38,25 +38,21 @@ class BatchSolution:
 
 @dataclass
 class _Lanes:
-    """The state of all running lanes.
+    """The state of all running lanes."""
 
-    Attributes:
-        lane (B,): index in the batch. A (r, n, B), b (r, B), minimum (n, B): the problems; `minimum` under no rows.
-        x (n, B): the iterate. steps (B,).
-        rows (n, n, B), sides (n, B), used (n, B), multiplier (n, B): slots for active rows: A, b, whether in use.
-        row (n, B), side (B,), added (B,), waits (B,): the row to be added, its multiplier, whether there is one.
-    """
-
-    lane: Array
+    lane: Array  # (B,): index in the batch
+    # A (r, n, B), b (r, B), minimum (n, B): the problems; `minimum` under no rows
     A: Array
     b: Array
     minimum: Array
-    x: Array
-    steps: Array
+    x: Array  # (n, B): the iterate
+    steps: Array  # (B,)
+    # rows (n, n, B), sides (n, B), used (n, B), multiplier (n, B): slots for active rows: A, b, whether in use
     rows: Array
     sides: Array
     used: Array
     multiplier: Array
+    # row (n, B), side (B,), added (B,), waits (B,): the row to be added, its multiplier, whether there is one
     row: Array
     side: Array
     added: Array

@@ -76,12 +76,7 @@ class ObstacleArrays:
 
 @dataclass(frozen=True)
 class NearObstacles:
-    """The obstacles within reach, batch last: per axis (K, B); axes[j][i] is entry (j, i) of the rotations.
-
-    Attributes:
-        used (K, B): whether the slot holds an obstacle. slot (K, B): its index among the request's obstacles.
-        away (K, B) [m]: distance from the measured position, less the obstacle's margin.
-    """
+    """The obstacles within reach, batch last: per axis (K, B); axes[j][i] is entry (j, i) of the rotations."""
 
     center: Axes
     axes: list[Axes]
@@ -89,9 +84,9 @@ class NearObstacles:
     rho: Array
     round: Axes
     margin: Array
-    used: Array
-    slot: Array
-    away: Array
+    used: Array  # (K, B): whether the slot holds an obstacle
+    slot: Array  # (K, B): its index among the request's obstacles
+    away: Array  # (K, B) [m]: distance from the measured position, less the obstacle's margin
 
     def first(self, most: int) -> NearObstacles:
         """Return the first `most` slots."""

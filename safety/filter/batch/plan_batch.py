@@ -37,19 +37,12 @@ STANDING, VERIFIED, OPEN = range(3)  # of a committed plan: it stands, the model
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """The outcome of one request about B robots.
+    """The outcome of one request about B robots."""
 
-    Attributes:
-        inputs (B, m): to execute in the coming period.
-        decided (B,): whether the row has a decision; without one, the robot follows its committed plan.
-        answers: the decisions; None: the whole batch has none.
-        failure: why a row has no decision. Empty if all rows have one.
-    """
-
-    inputs: Array
-    decided: Flags
-    answers: DecisionArrays | None
-    failure: str = ""
+    inputs: Array  # (B, m): to execute in the coming period
+    decided: Flags  # (B,): whether the row has a decision; without one, the robot follows its committed plan
+    answers: DecisionArrays | None  # the decisions; None: the whole batch has none
+    failure: str = ""  # why a row has no decision. Empty if all rows have one.
 
 
 class BackupPlanBatch:

@@ -24,17 +24,12 @@ FEW = 24  # lanes, below which the single path is faster than a further step of 
 
 @dataclass(frozen=True)
 class LaneBatch:
-    """The inputs of a search, for each robot.
+    """The inputs of a search, for each robot."""
 
-    Attributes:
-        scene: the surroundings. z_0 (known, B): known regressors. proposal (m, B): within bounds and slew.
-        committed (F·m, B): free inputs of the committed plan.
-    """
-
-    scene: SceneBatch
-    z_0: Array
-    proposal: Array
-    committed: Array
+    scene: SceneBatch  # the surroundings
+    z_0: Array  # (known, B): known regressors
+    proposal: Array  # (m, B): within bounds and slew
+    committed: Array  # (F·m, B): free inputs of the committed plan
 
     def with_slots(self, most: int) -> LaneBatch:
         """Return the lanes with the first `most` slots for near obstacles."""
@@ -43,38 +38,26 @@ class LaneBatch:
 
 @dataclass(frozen=True)
 class ProposalBatch:
-    """The plans "the proposal, then braking" of a batch.
+    """The plans "the proposal, then braking" of a batch."""
 
-    Attributes:
-        plan: with the half-spaces around them. margin (B,) [m].
-        allowed (B,): the plan keeps the clearance margin. unsure (B,): rounding decides; left to the single path.
-    """
-
-    plan: PlanBatch
-    margin: Array
-    allowed: Array
-    unsure: Array
+    plan: PlanBatch  # with the half-spaces around them
+    margin: Array  # (B,) [m]
+    allowed: Array  # (B,): the plan keeps the clearance margin
+    unsure: Array  # (B,): rounding decides; left to the single path
 
 
 @dataclass
 class CandidateBatch:
-    """The results of a search.
+    """The results of a search."""
 
-    Attributes:
-        z (nz, B): regressors of the verified plans. margin (B,) [m]: their margins.
-        allowed, adjusted, hopeless (B,): the result. hopeless: no plan near the proposal is verified. A lane with
-            none of the three is left to the single path.
-        for_clearance (B,): the proposal is verified too.
-        steps (B,): of the solver.
-    """
-
-    z: Array
-    margin: Array
+    z: Array  # (nz, B): regressors of the verified plans
+    margin: Array  # (B,) [m]: their margins
+    # allowed, adjusted, hopeless (B,): the result
     allowed: Array
     adjusted: Array
-    hopeless: Array
-    for_clearance: Array
-    steps: Array
+    hopeless: Array  # no plan near the proposal is verified. A lane with none of the three is left to the single path.
+    for_clearance: Array  # (B,): the proposal is verified too
+    steps: Array  # (B,): of the solver
 
 
 class SearchBatch:
