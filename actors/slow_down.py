@@ -22,16 +22,12 @@ BY_CHANCE = 0.001  # the limit begins if so many plans outside are less likely t
 
 
 class SlowDown:
-    """The limit on the proposals of one robot. It begins and ends by itself, and logs both.
-
-    Attributes:
-        active: whether proposals are limited.
-    """
+    """The limit on the proposals of one robot. It begins and ends by itself, and logs both."""
 
     def __init__(self, robot: Robot, actor: str) -> None:
         self._robot, self._actor = robot, actor
         self._moves = np.array(robot.translates)
-        self.active = False
+        self.active = False  # whether proposals are limited
 
     @property
     def share(self) -> float:

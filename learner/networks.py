@@ -84,12 +84,7 @@ class HalfDense(Dense):
 
 
 class Network:
-    """`count` perceptrons of one shape: affine, ReLU, affine, …, affine.
-
-    Attributes:
-        sizes: (inputs, hidden…, outputs).
-        parameters: all weights and biases as one vector.
-    """
+    """`count` perceptrons of one shape: affine, ReLU, affine, …, affine."""
 
     def __init__(
         self,
@@ -99,8 +94,10 @@ class Network:
         precision: Precision = "float32",
         parameters: Tensor | None = None,
     ) -> None:
+        # sizes: (inputs, hidden…, outputs)
         self.sizes, self.count, self.batch, self.precision = sizes, count, batch, precision
         size = count * sum(o * i + o for i, o in pairwise(sizes))
+        # all weights and biases as one vector
         self.parameters = torch.zeros(size) if parameters is None else parameters
         self.gradients = torch.zeros(size)
         self._gradient_views = self._views(self.gradients)

@@ -30,17 +30,14 @@ def _widths(observation_dim: int, action_dim: int) -> tuple[int, ...]:
 
 
 class Batch:
-    """A batch of transitions that `ReplayBuffer.sample` fills. Torch and NumPy share its memory.
-
-    Attributes:
-        observation, action, reward, discount, next_observation, cost: tensors (1, batch, width).
-        arrays: the same as arrays (batch, width), in the order of `NAMES`.
-    """
+    """A batch of transitions that `ReplayBuffer.sample` fills. Torch and NumPy share its memory."""
 
     def __init__(self, size: int, observation_dim: int, action_dim: int) -> None:
         # Torch aligns its memory; with NumPy's alignment, the last bits of a product could differ from run to run.
         tensors = [torch.zeros(1, size, width) for width in _widths(observation_dim, action_dim)]
+        # the same as arrays (batch, width), in the order of `NAMES`
         self.arrays = tuple(tensor[0].numpy() for tensor in tensors)
+        # observation, action, reward, discount, next_observation, cost: tensors (1, batch, width)
         self.observation, self.action, self.reward, self.discount, self.next_observation, self.cost = tensors
 
     def __len__(self) -> int:

@@ -36,14 +36,11 @@ class Losses:
 
 
 class TD3:
-    """The networks, their targets and their optimisers.
-
-    Attributes:
-        cost_weight: λ.
-    """
+    """The networks, their targets and their optimisers."""
 
     def __init__(self, observation_dim: int, action_dim: int, config: TD3Config, seed: int) -> None:
         torch.set_num_threads(1)  # more threads than cores make all processes ten times slower
+        # cost_weight: λ
         self.config, self.updates, self.losses, self.cost_weight = config, 0, Losses(), 0.0
         self._generator = torch.Generator().manual_seed(seed)
         batch, joint = config.batch, observation_dim + action_dim

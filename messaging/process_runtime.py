@@ -180,14 +180,11 @@ class BusHandler(logging.Handler):
     """A handler that publishes log records in a thread of its own, until `close`.
 
     A thread that logs never waits for the bus: it may be the thread that empties the queue into which the line goes.
-
-    Attributes:
-        lost: number of lines that found `MAX_WAITING_LINES` lines waiting.
     """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
         super().__init__()
-        self.lost = 0
+        self.lost = 0  # number of lines that found `MAX_WAITING_LINES` lines waiting
         self._publisher, self._process = publisher, process
         self._lines: queue.Queue[pb.LogLine | None] = queue.Queue(MAX_WAITING_LINES)
         self._thread = threading.Thread(target=self._publish, name="log", daemon=True)

@@ -33,17 +33,13 @@ def controllers_at_rest(size: int) -> Controllers:
 
 
 class FlightController:
-    """Follows velocity setpoints; at the setpoint zero, the vehicle stops and holds its position.
-
-    Attributes:
-        record: the state of the controller, (1,) of `CONTROLLER`.
-    """
+    """Follows velocity setpoints; at the setpoint zero, the vehicle stops and holds its position."""
 
     body: Airframe = AIRFRAME
 
     def __init__(self) -> None:
         """Start at rest."""
-        self.record = controllers_at_rest(1)
+        self.record = controllers_at_rest(1)  # the state of the controller, (1,) of `CONTROLLER`
         self._fields = self.record.view(np.ndarray)  # the same, without the slow attributes of a record array
 
     def reset(self, yaw: float = 0.0) -> None:

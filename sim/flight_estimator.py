@@ -36,15 +36,13 @@ class FlightEstimator:
     """Adds errors that change slowly, as those of a Kalman filter: drawn once a period and interpolated linearly.
 
     Interpolated errors never exceed the cut-off, and errors of different periods are independent.
-
-    Attributes:
-        errors: (9,) of position [m], velocity [m/s] and attitude [rad].
     """
 
     def __init__(self, noise: QuadrotorNoise, rng: np.random.Generator, steps: int) -> None:
         """Draw the first errors. steps: number of calls of `advance` in a period."""
         self.noise, self._rng, self._steps = noise, rng, steps
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
+        # errors: (9,) of position [m], velocity [m/s] and attitude [rad]
         self.errors = self._next = self._draw()
         self._slopes = np.zeros(9)
         self._left = 0

@@ -19,10 +19,6 @@ class FloorPhysics:
 
     A collision is any contact, at any physics step, with a static obstacle. The robot's geoms answer to the contact
     bits 1 (floor) and 2 (obstacles) and offer none, so they never touch each other.
-
-    Attributes:
-        model, data: MuJoCo's; the robot's coordinates come first.
-        movers: the moving obstacles, and whether the robot touched one.
     """
 
     def __init__(self, mjcf: str, height: float, arena: Arena, sample_time: float, period: float) -> None:
@@ -37,8 +33,10 @@ class FloorPhysics:
         spec = mujoco.MjSpec.from_string(mjcf)
         add_obstacles(spec, arena)
         place_base(spec.body("base"), arena, height)
+        # model, data: MuJoCo's; the robot's coordinates come first
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        # the moving obstacles, and whether the robot touched one
         self.movers = MoverBodies(self.model, self.data, arena.crowd)
         self._time = -period
         self._steps = round(sample_time / self.model.opt.timestep)

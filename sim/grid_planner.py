@@ -24,11 +24,7 @@ MOST_CELLS = {2: 110**2, 3: 65_536}  # larger rooms have larger cells
 
 
 class ClearanceMap:
-    """The distance from the centre of every cell to the nearest obstacle.
-
-    Attributes:
-        cell: m, edge of a cell.
-    """
+    """The distance from the centre of every cell to the nearest obstacle."""
 
     def __init__(self, obstacles: Sequence[Obstacle], bounds: Sequence[tuple[float, float]]) -> None:
         """bounds: (low, high) of each of the d = 2 or 3 axes [m].
@@ -39,7 +35,7 @@ class ClearanceMap:
         self.dim = len(bounds)
         self.low: Array = np.array([low for low, _ in bounds])
         cell: float = max(CELL[self.dim], (math.prod(widths) / MOST_CELLS[self.dim]) ** (1.0 / self.dim))
-        self.cell: float = widths[0] / round(widths[0] / cell)
+        self.cell: float = widths[0] / round(widths[0] / cell)  # m, edge of a cell
         self.shape = tuple(round(width / self.cell) for width in widths)
         self._axes = [low + self.cell * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         self._shapes = Shapes.of(obstacles, dim=self.dim)

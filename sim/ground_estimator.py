@@ -56,9 +56,6 @@ class Estimator:
     """Dead reckoning, corrected once a period by a fixed share of its difference to the pose fix.
 
     The estimates of speed and turn rate are means of the last `RECENT` samples, not of the period.
-
-    Attributes:
-        pose: (3,) estimated x, y [m] and heading [rad].
     """
 
     RECENT = 2
@@ -88,7 +85,7 @@ class Estimator:
         self._ticks = self._count(wheels)
         gain = steady_gain(noise.drift_position, noise.fix_position)
         self._gain = np.array([gain, gain, steady_gain(noise.drift_heading, noise.fix_heading)])
-        self.pose = self._fix(pose)
+        self.pose = self._fix(pose)  # (3,) estimated x, y [m] and heading [rad]
 
     def update(self, wheels: Array, turn_rates: Array, pose: Array) -> Reading:
         """Update the estimate with the samples of one period.

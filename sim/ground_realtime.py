@@ -53,13 +53,7 @@ class RealtimeEstimator(Estimator):
 
 
 class RealtimeGroundRobot(GroundRobot):
-    """A ground robot in one arena. An input takes effect at the next sample and lasts until another one comes.
-
-    Attributes:
-        collisions: how often the robot began to touch a static obstacle.
-        closest: m, least distance from its footprint to an obstacle so far.
-        distance_driven: m.
-    """
+    """A ground robot in one arena. An input takes effect at the next sample and lasts until another one comes."""
 
     def __init__(
         self, arena: Arena, rng: np.random.Generator, noise: NoiseLevels | None = None, **physics: Any
@@ -73,9 +67,11 @@ class RealtimeGroundRobot(GroundRobot):
         noise = noise or NoiseLevels()
         pose, wheels = self._true_pose(), self._wheels()
         self.realtime_estimator = RealtimeEstimator(noise, rng, pose, wheels, WHEEL_RADIUS, SAMPLE_TIME)
+        # collisions: how often the robot began to touch a static obstacle
         self.collisions, self._touches = 0, False
+        # m, least distance from its footprint to an obstacle so far
         self.closest = float(self.clearance(self.true[:2]))
-        self.distance_driven = 0.0
+        self.distance_driven = 0.0  # m
 
     def drive(self, input: Array) -> None:
         """Drive at an input (2,) from now on, clipped as by `set_input`."""

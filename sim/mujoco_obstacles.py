@@ -48,17 +48,14 @@ def add_obstacles(spec: mujoco.MjSpec, arena: Arena) -> None:
 
 
 class MoverBodies:
-    """The moving obstacles of a compiled model, and the robot's contacts with them.
-
-    Attributes:
-        contacts: whether, since `begin_period`, a contact began while the robot moved, and while it stood. A robot that
-            begins to move under a person who steps over it counts as moving.
-    """
+    """The moving obstacles of a compiled model, and the robot's contacts with them."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, crowd: Crowd | OtherRobots | None) -> None:
         self._data, self._crowd = data, crowd
         self._pushes = crowd is None or crowd.pushes
         self._in_contact = False
+        # whether, since `begin_period`, a contact began while the robot moved, and while it stood. A robot that begins
+        # to move under a person who steps over it counts as moving.
         self.contacts = [False, False]
         names = [f"mover {i}" for i in range(0 if crowd is None else len(crowd))]
         self._bodies = [int(model.body_mocapid[model.body(name).id]) for name in names]

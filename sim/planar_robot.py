@@ -22,11 +22,6 @@ class PlanarRobot(SimulatedVehicle):
 
     The state is (x [m], y [m], heading [rad]) of the base's origin, then `speeds()`. The measured state has a normal
     error, cut off at the bounds of the robot's description.
-
-    Attributes:
-        true, measured: (n,) states.
-        input: (m,) input executed last.
-        model, data: MuJoCo's.
     """
 
     samples = SAMPLES
@@ -43,15 +38,17 @@ class PlanarRobot(SimulatedVehicle):
         """
         self.robot, self.arena = robot, arena
         self._physics = FloorPhysics(model, height, arena, robot.period / SAMPLES, robot.period)
+        # model, data: MuJoCo's
         self.model, self.data = self._physics.model, self._physics.data
         self._bound = np.asarray(robot.measurement_bound)
         self._discs = np.array([disc.at[:2] for disc in robot.body])  # in the robot's frame
         self._radii = np.array([disc.radius for disc in robot.body])
         self._rng, self._noise = rng, noise.scale
         self._odometry_scale = 1.0 + float(cut_normal(rng, self._noise * SCALE_ERROR, ()))
-        self.input = np.zeros(robot.action_dim)
+        self.input = np.zeros(robot.action_dim)  # (m,) input executed last
         mujoco.mj_forward(self.model, self.data)
         self._run()  # settle on the wheels
+        # true, measured: (n,) states
         self.true = self._state()
         self.measured = self._measure()
 

@@ -38,13 +38,6 @@ class Quadrotor(SimulatedVehicle):
     """One quadrotor in one arena, hovering at its start, or standing on the floor with its motors off.
 
     `controller` holds the heading at zero (east) by default.
-
-    Attributes:
-        true, measured: (9,) states (p [m], v [m/s], a [m/s²]; ENU) of the centre of mass.
-        input: (3,) velocity setpoint executed last [m/s], after clipping and slew.
-        flying: whether the controller drives the rotors; otherwise they stand, idle, or `set_thrusts` drives them.
-        collided: whether the vehicle touched a static obstacle since this was last set to False.
-        on_floor: whether the vehicle touched the floor in the last physics step.
     """
 
     robot, samples = QUADROTOR, SAMPLES
@@ -83,14 +76,16 @@ class Quadrotor(SimulatedVehicle):
         self._altered = False  # whether its body differs from that of compiled code
         self._moved = False  # whether compiled code moved it since MuJoCo's last step
         self._floor_geom = -1 if floor is None else self._model.geom("floor").id
+        # whether the controller drives the rotors; otherwise they stand, idle, or `set_thrusts` drives them
         self.flying = floor is None
-        self.collided = False
-        self.on_floor = False
+        self.collided = False  # whether the vehicle touched a static obstacle since this was last set to False
+        self.on_floor = False  # whether the vehicle touched the floor in the last physics step
         self._count = 0
         self._path: deque[list[float]] = deque(maxlen=64)  # true positions after each `advance` of the period
         self._before = np.zeros(3)  # m/s, the velocity before the last physics step
         self._air = np.zeros(3)  # m/s, the velocity of the wind
         self._acceleration: Vector = (0.0, 0.0, 0.0)
+        # (3,) velocity setpoint executed last [m/s], after clipping and slew
         self.input = np.zeros(QUADROTOR.action_dim)
         self.alter(**(changes or {}))
         mujoco.mj_forward(self._model, self._data)
@@ -98,6 +93,7 @@ class Quadrotor(SimulatedVehicle):
             self._hover()
         self._time = 0.0
         self._movers.begin_period()
+        # true, measured: (9,) states (p [m], v [m/s], a [m/s²]; ENU) of the centre of mass
         self.true, self.measured = self.state(), self.estimated_state(self.estimate())
 
     def step(self, input: Array) -> Period:

@@ -43,17 +43,13 @@ def check_fleet(robot: RobotWithTask, arena: str, size: int, conditions: Conditi
 
 
 class GroundWorld:
-    """Several robots in one room, each at the start of its arena.
-
-    Attributes:
-        robots: one for each arena.
-        robot_contacts: how often two robots began to touch each other.
-    """
+    """Several robots in one room, each at the start of its arena."""
 
     def __init__(self, arenas: Sequence[Arena], rngs: Sequence[np.random.Generator], conditions: Conditions) -> None:
         """Place a robot at the start of each arena: the same room with different starts and goals."""
         self._model = _build(arenas)
         self._data = mujoco.MjData(self._model)
+        # one for each arena
         self.robots = [TurtleBot(arena, self._model, self._data, i) for i, arena in enumerate(arenas)]
         changes = changes_of(conditions)
         for robot, rng in zip(self.robots, rngs, strict=True):
@@ -62,7 +58,7 @@ class GroundWorld:
         self._owner = _owners(self._model, len(arenas))
         self._physics_steps = round(SAMPLE_TIME / self._model.opt.timestep)
         self._touching: set[tuple[int, int]] = set()
-        self.robot_contacts = 0
+        self.robot_contacts = 0  # how often two robots began to touch each other
         mujoco.mj_forward(self._model, self._data)
         self._run([np.zeros(GROUND.action_dim)] * len(arenas))  # settle on the wheels
         for robot, rng in zip(self.robots, rngs, strict=True):
@@ -105,11 +101,7 @@ class GroundWorld:
 
 
 class FleetEnv:
-    """A world of `size` robots. `draw` makes a fresh one; `members` are the robots' own environments.
-
-    Attributes:
-        touches: how often two robots began to touch each other, over all worlds.
-    """
+    """A world of `size` robots. `draw` makes a fresh one; `members` are the robots' own environments."""
 
     def __init__(
         self, robot: RobotWithTask, arena: str, size: int, seed: int, conditions: Conditions | None = None
@@ -119,7 +111,7 @@ class FleetEnv:
         self.conditions = conditions or Conditions()
         check_fleet(robot, arena, size, self.conditions)
         self.members = [_Member(self, i) for i in range(size)]
-        self.touches = 0
+        self.touches = 0  # how often two robots began to touch each other, over all worlds
 
     def draw(self, episode_seed: int) -> None:
         """Draw a fresh world. Reset each member afterwards."""

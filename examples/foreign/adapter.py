@@ -21,19 +21,12 @@ FOLDERS = {"car": "safety_gymnasium", "point": "safety_gymnasium", "racecar": "b
 
 
 class Adapter(ABC):
-    """Read an environment: the state of its robot, its obstacles and the meaning of an action, all without errors.
+    """Read an environment: the state of its robot, its obstacles and the meaning of an action, all without errors."""
 
-    Attributes:
-        task: the name of the environment.
-        step: s, the time step of the environment.
-        held: periods for which an input is held while recording: enough to reach the highest speed.
-        half_width: m from the middle of the room to its walls.
-    """
-
-    task: str
-    step: float
-    held: int
-    half_width: float
+    task: str  # the name of the environment
+    step: float  # s, the time step of the environment
+    held: int  # periods for which an input is held while recording: enough to reach the highest speed
+    half_width: float  # m from the middle of the room to its walls
 
     def __init__(self, description: Path) -> None:
         self.robot = robot_named(str(description))

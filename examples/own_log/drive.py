@@ -128,15 +128,12 @@ VEHICLES = {
 
 
 class Simulator:
-    """Robots of one kind, all integrated at once by Euler's method.
-
-    Attributes:
-        state (n, count): true coordinates. Each robot stands at its start pose.
-    """
+    """Robots of one kind, all integrated at once by Euler's method."""
 
     def __init__(self, vehicle: Vehicle, generator: np.random.Generator, poses: Array) -> None:
         """Place robots at rest at the poses (count, 3)."""
         self.vehicle, self.generator = vehicle, generator
+        # (n, count): true coordinates. Each robot stands at its start pose.
         self.state = np.zeros((len(vehicle.state), len(poses)))
         self.state[:3] = poses.T
         steps = [round(delay / SUBSTEP) for delay in vehicle.delays]

@@ -26,16 +26,11 @@ MPSC: dict[str, Any] = {"horizon": 20, "q_lin": [1, 1, 1, 1], "r_lin": [0.1], "u
 
 
 class Unfiltered:
-    """Executes every proposal.
-
-    Attributes:
-        kinds: the decisions of the episode, by kind.
-        outside: steps of the episode in which the state left Brakeline's predicted set.
-    """
+    """Executes every proposal."""
 
     def __init__(self) -> None:
-        self.kinds: Counter[str] = Counter()
-        self.outside = 0
+        self.kinds: Counter[str] = Counter()  # the decisions of the episode, by kind
+        self.outside = 0  # steps of the episode in which the state left Brakeline's predicted set
 
     def reset(self) -> None:
         """Begin an episode."""

@@ -25,17 +25,12 @@ class Inbox:
     """A thread-safe queue of samples that never blocks: it drops and counts what exceeds its limits.
 
     The samples of one identity may take `SHARE` of the limit, so that one sender cannot take the place of the others.
-
-    Attributes:
-        limit: bytes.
-        bytes: of the waiting samples.
-        dropped: number of dropped samples by key.
     """
 
     def __init__(self, limit: int = LIMIT) -> None:
-        self.limit = limit
-        self.dropped: Counter[str] = Counter()
-        self.bytes = 0
+        self.limit = limit  # bytes
+        self.dropped: Counter[str] = Counter()  # number of dropped samples by key
+        self.bytes = 0  # of the waiting samples
         self._bytes_of: Counter[str] = Counter()  # by identity
         self._waiting: deque[tuple[Sample, int, str]] = deque()  # with the size and the identity of each
         self._lock = threading.Lock()

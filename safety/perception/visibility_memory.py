@@ -38,14 +38,10 @@ class VisibilityMemory(ABC, Generic[S]):
     """The free space that one robot's sensor has shown in one episode.
 
     Poses are measured ones, with their errors. The bounds hold as long as the world is not reset.
-
-    Attributes:
-        START: width [m] of the ring around the body that counts as free at the start.
-        nothing: a scan that shows nothing to be free.
     """
 
-    START = 0.1
-    nothing: S
+    START = 0.1  # width [m] of the ring around the body that counts as free at the start
+    nothing: S  # a scan that shows nothing to be free
 
     def __init__(self, footprint: float) -> None:
         """Begin an episode. footprint: radius of the body's disc or ball [m]."""

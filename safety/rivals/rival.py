@@ -17,13 +17,9 @@ from brakeline.safety.rivals.pretrained import Pretrained
 
 
 class Rival(ABC):
-    """A method with a model that was trained, or whose settings were chosen, beforehand.
+    """A method with a model that was trained, or whose settings were chosen, beforehand."""
 
-    Attributes:
-        observed: the size of the observation that it reads; 0: it reads none.
-    """
-
-    observed = 0
+    observed = 0  # the size of the observation that it reads; 0: it reads none
 
     def __init__(self, model: Pretrained) -> None:
         self.model, self.robot, self.version = model, model.robot, model.version

@@ -160,13 +160,10 @@ def bus_at(connect: str | Sequence[str], keys: Path | str | None, name: str) -> 
 
 
 class BusClient:
-    """A client over a bus, for robots of one kind. It closes the bus if it opened it.
-
-    Attributes:
-        deadline: longest wait for a decision [s].
-    """
+    """A client over a bus, for robots of one kind. It closes the bus if it opened it."""
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
+        # deadline: longest wait for a decision [s]
         self.bus, self.deadline = bus, deadline
         self.robot = robot_named(robot) if isinstance(robot, str) else robot
         self._owned = False

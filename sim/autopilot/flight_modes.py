@@ -68,28 +68,20 @@ class Setpoint:
 
 
 class FlightStateMachine:
-    """The modes of one vehicle. All methods but `tick` act at the present moment.
-
-    Attributes:
-        time: s since the vehicle was switched on.
-        armed, mode, landed: its state.
-        home: (x, y, z) m, where it armed last.
-        setpoint: the newest setpoint in offboard mode.
-        last_setpoint: s, when the newest setpoint came; -inf before the first.
-        announcements: texts for the ground station.
-    """
+    """The modes of one vehicle. All methods but `tick` act at the present moment."""
 
     def __init__(self, vehicle: Quadrotor, limits: FlightLimits, mode: Mode) -> None:
         """Start armed and holding if the vehicle flies, otherwise in `mode` on the ground."""
         self.vehicle, self.limits = vehicle, limits
-        self.time = 0.0
+        self.time = 0.0  # s since the vehicle was switched on
+        # armed, mode, landed: its state
         self.armed = vehicle.flying
         self.landed = LandedState.IN_AIR if vehicle.flying else LandedState.ON_GROUND
         self.mode = Mode.HOLD if vehicle.flying else mode
-        self.home = vehicle.position_and_velocity()[0]
-        self.setpoint = Setpoint(STILL)
-        self.last_setpoint = -math.inf
-        self.announcements: list[str] = []
+        self.home = vehicle.position_and_velocity()[0]  # (x, y, z) m, where it armed last
+        self.setpoint = Setpoint(STILL)  # the newest setpoint in offboard mode
+        self.last_setpoint = -math.inf  # s, when the newest setpoint came; -inf before the first
+        self.announcements: list[str] = []  # texts for the ground station
         self._mode_before_landing = mode
         self._flown_velocity = STILL  # m/s, the setpoint after the limits of acceleration
         self._takeoff_height = 0.0  # m

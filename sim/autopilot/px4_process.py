@@ -50,13 +50,7 @@ PARAMETERS: dict[str, float] = {
 
 
 class Px4Process:
-    """A running PX4.
-
-    Attributes:
-        remote, local: UDP ports of 127.0.0.1 that PX4 sends MAVLink to and from.
-        connection: TCP connection on which PX4 waits for sensors.
-        log: the file with the output of PX4.
-    """
+    """A running PX4."""
 
     def __init__(self, folder: Path, remote: int, parameters: dict[str, float] | None = None) -> None:
         """Start PX4.
@@ -70,12 +64,13 @@ class Px4Process:
             LaunchError: the folder holds no PX4, or PX4 did not start.
         """
         binary, aliases, etc = _find_parts(folder)
+        # remote, local: UDP ports of 127.0.0.1 that PX4 sends MAVLink to and from
         self.remote, self.local = remote, free_udp_port()
         self._folder = tempfile.TemporaryDirectory(prefix="px4-")
         root = Path(self._folder.name)
         for name in ("bin", "rootfs"):
             (root / name).mkdir()
-        self.log = root / "px4.log"
+        self.log = root / "px4.log"  # the file with the output of PX4
         for name in ("px4", *(f"px4-{word}" for word in ALIAS.findall(aliases.read_text()))):
             (root / "bin" / name).symlink_to(binary)
         (root / "bin" / "px4-alias.sh").symlink_to(aliases)
@@ -100,7 +95,7 @@ class Px4Process:
                 start_new_session=True,  # so that ^C ends only this program
             )
         try:
-            self.connection = self._accept()
+            self.connection = self._accept()  # TCP connection on which PX4 waits for sensors
         except BaseException:
             self._end()
             raise

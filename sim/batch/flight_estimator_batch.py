@@ -17,16 +17,13 @@ CONJUGATE, FORWARD_RIGHT_DOWN = np.array([1.0, -1.0, -1.0, -1.0]), np.array([1.0
 
 
 class FlightEstimatorBatch:
-    """The estimates of N quadrotors. Every argument and result has a row for each of the `rows` that it is about.
-
-    Attributes:
-        errors: (N, 9) of position [m], velocity [m/s] and attitude [rad] at the start of the period.
-    """
+    """The estimates of N quadrotors. Every argument and result has a row for each of the `rows` that it is about."""
 
     def __init__(self, size: int, noise: QuadrotorNoise, streams: NormalStreams) -> None:
         """streams: the source of all errors."""
         self._noise, self._streams = noise, streams
         self._sigma = noise.scale * np.repeat((noise.position, noise.velocity, noise.attitude), 3)
+        # errors: (N, 9) of position [m], velocity [m/s] and attitude [rad] at the start of the period
         self.errors, self._next = np.zeros((size, 9)), np.zeros((size, 9))
 
     def begin(self, rows: Rows) -> None:

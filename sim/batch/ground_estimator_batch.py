@@ -16,18 +16,14 @@ Rows = NDArray[np.intp]
 
 
 class GroundEstimatorBatch:
-    """The estimates of N robots. Every argument and result has a row for each of the `rows` that it is about.
-
-    Attributes:
-        pose: (N, 3) estimated x, y [m] and heading [rad].
-    """
+    """The estimates of N robots. Every argument and result has a row for each of the `rows` that it is about."""
 
     def __init__(
         self, size: int, noise: NoiseLevels, streams: NormalStreams, radius: float, sample_time: float
     ) -> None:
         """streams: the errors. radius: of a wheel [m]. sample_time: between two samples of encoders and gyro [s]."""
         self._noise, self._streams, self._radius, self._sample_time = noise, streams, radius, sample_time
-        self.pose = np.zeros((size, 3))
+        self.pose = np.zeros((size, 3))  # (N, 3) estimated x, y [m] and heading [rad]
         self._scale, self._bias, self._ticks = np.ones((size, 2)), np.zeros(size), np.zeros((size, 2))
         self._tick = 2.0 * math.pi / noise.encoder_ticks
         gain = steady_gain(noise.drift_position, noise.fix_position)

@@ -17,20 +17,16 @@ FACES_IN_PLANE, FACES_IN_SPACE = 4, 6  # obstacles that bound a room
 
 
 class ObstacleBatch:
-    """The obstacles of N arenas in the plane or in space. A row of an array belongs to one arena.
-
-    Attributes:
-        shapes: the arrays of `Shapes`, with the row first: center (N, K, d), axes (N, K, d, d), ...
-        count (N,): number of the K slots in use.
-    """
+    """The obstacles of N arenas in the plane or in space. A row of an array belongs to one arena."""
 
     def __init__(self, size: int, kind: ArenaKind) -> None:
         """Make room for the obstacles of `size` arenas of one kind."""
         d, faces = (2, FACES_IN_PLANE) if kind.height is None else (3, FACES_IN_SPACE)
         most = kind.cylinders[1] + kind.boxes[1] + kind.spheres[1] + faces
         widths = {"center": (d,), "axes": (d, d), "half": (d,), "rho": (), "round": (d,), "margin": ()}
+        # the arrays of `Shapes`, with the row first: center (N, K, d), axes (N, K, d, d), ...
         self.shapes: dict[str, Array] = {name: np.zeros((size, most, *width)) for name, width in widths.items()}
-        self.count = np.zeros(size, dtype=np.int64)
+        self.count = np.zeros(size, dtype=np.int64)  # (N,): number of the K slots in use
 
     def put(self, row: int, arena: Arena) -> None:
         """Put the obstacles of an arena into a row."""

@@ -34,17 +34,13 @@ Array = Any  # of any namespace
 
 
 class BatchFilter:
-    """Decides batches of requests with one filter. It stores nothing about a robot.
-
-    Attributes:
-        safety: the filter, which is also the single path.
-        covers: whether batches decide for this robot at all. For a robot in joint space, with limits or with a
-            feedback, the single path decides every request.
-    """
+    """Decides batches of requests with one filter. It stores nothing about a robot."""
 
     def __init__(self, safety: Filter) -> None:
         robot = safety.robot
-        self.safety = safety
+        self.safety = safety  # the filter, which is also the single path
+        # whether batches decide for this robot at all. For a robot in joint space, with limits or with a feedback, the
+        # single path decides every request.
         self.covers = bool(robot.position_dim) and not robot.limits and not robot.feedback
         self._prepared: dict[tuple[str, str], LaneDecisions] = {}
 

@@ -50,11 +50,6 @@ class BackupPlanBatch:
 
     It is for robots in lockstep, without feedback and without reservations, in a batch with one filter. A row
     without a valid decision follows its committed plan. If the filter raises an error, all rows do.
-
-    Attributes:
-        plan (B, N, m), input_in_force (B, m): see `BackupPlan`.
-        predicted: the sets of the next measured states.
-        independent: a robot forgets its scores when an episode begins, so no episode depends on another.
     """
 
     def __init__(self, safety: BatchMethod, size: int, turn_aside: bool = False) -> None:
@@ -67,9 +62,11 @@ class BackupPlanBatch:
         if robot.late or robot.feedback or not robot.position_dim:
             raise ValueError(f"{robot.name} keeps no plans in batches: decide with BackupPlan, one robot at a time")
         N, n, m = robot.horizon, robot.state_dim, robot.action_dim
-        self.independent = False
+        self.independent = False  # a robot forgets its scores when an episode begins, so no episode depends on another
         self.safety, self.robot, self._size, self._turn_aside = safety, robot, size, turn_aside
+        # plan (B, N, m), input_in_force (B, m): see `BackupPlan`
         self.plan, self.input_in_force = np.zeros((size, N, m)), np.zeros((size, m))
+        # the sets of the next measured states
         self.predicted = PredictionArrays(
             np.zeros((size, n)), np.zeros((size, n)), np.zeros(size), np.zeros(size, dtype=bool)
         )

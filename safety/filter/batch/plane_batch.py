@@ -91,17 +91,14 @@ def _stay_in_force(xp: Any, chosen: list[Array], parts: list[Array], blocked: Ar
 
 
 class EndBatch:
-    """The ends of a tube's periods for one disc, as `halfspace_kernels` has them, in a namespace and on a device.
-
-    Attributes:
-        end, period (E,): see `halfspace_kernels`.
-    """
+    """The ends of a tube's periods for one disc, as `halfspace_kernels` has them, in a namespace and on a device."""
 
     def __init__(self, ends: tuple[Array, ...], constant: Any, xp: Any) -> None:
         """Prepare the arrays of `ObstacleRows`. constant: brings an array to the namespace and device."""
         end, period, directions, columns, extra = ends
         self._xp = xp
         self.count = len(end)
+        # end, period (E,): see `halfspace_kernels`
         self.end, self.period, self.extra = constant(end), constant(period), constant(extra)
         self.columns = [constant(np.ascontiguousarray(columns[:, k])) for k in range(columns.shape[1])]
         d = directions.shape[1]
