@@ -85,9 +85,9 @@ def grants(name: str, prefix: str) -> list[Grant]:
         elif role in topic.listeners:
             granted += [(INGRESS, ("declare_subscriber",), everywhere), (EGRESS, ("put",), everywhere)]
     granted += [(INGRESS, ("liveliness_token",), f"{prefix}/{key}") for key in _own(ALIVE, name, shared=True)]
-    if role in HEALTH.listeners:  # they may watch which processes are alive, too
+    if role in HEALTH.listeners:  # they may ask which processes are alive, too
         everyone = f"{prefix}/{ALIVE.format(source='*')}"
-        granted.append((INGRESS, ("declare_liveliness_subscriber", "liveliness_query"), everyone))
+        granted.append((INGRESS, ("liveliness_query",), everyone))
         granted.append((EGRESS, ("liveliness_token", "reply"), everyone))
     return granted
 

@@ -17,14 +17,13 @@ from typing import Any, Self
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from brakeline.errors import Malformed
 from brakeline.messaging.bus.access_control import ALIVE
 from brakeline.messaging.bus.bundling import BundlePublisher, Unbundler
 from brakeline.messaging.bus.bus_settings import BusSettings, open_session
 from brakeline.messaging.bus.publisher import Publisher
 from brakeline.messaging.bus.query_client import QueryClient
 from brakeline.messaging.bus.query_server import Answer, QueryServer
-from brakeline.messaging.bus.subscription import Listener, ReceiverThreads, Sample, Subscription
+from brakeline.messaging.bus.subscription import Listener, ReceiverThreads, Sample
 from brakeline.messaging.bus.topic_keys import exact_key, key_of, names_of, own_key
 from brakeline.messaging.bus.zenoh_sessions import close_sessions
 from brakeline.messaging.message_checks import NAME
@@ -198,22 +197,6 @@ class Bus:
         )
         names = (str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
         return frozenset(name for name in names if NAME.fullmatch(name))
-
-    def watch(self, handler: Callable[[str, bool], None]) -> Subscription:
-        """Call `handler(source, alive)` for each process that is alive now, and for each that comes or goes."""
-        receiver = self._telemetry.liveliness().declare_subscriber(
-            self._full(ALIVE.format(source="*")), FifoChannel(FIFO), history=True
-        )
-
-        def take(sample: zenoh.Sample) -> None:
-            name = str(sample.key_expr).rsplit("/", 1)[1]
-            if not NAME.fullmatch(name):
-                raise Malformed(f"{name[:100]!r} is no name of a process")
-            handler(name, sample.kind == zenoh.SampleKind.PUT)
-
-        watching = Subscription("alive/*", receiver, take, self.rejected)
-        self._subscriptions.append(watching)
-        return watching
 
     def _full(self, key: str) -> str:
         return f"{self.settings.prefix}/{key}"

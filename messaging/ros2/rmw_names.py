@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import xxhash
 
-from brakeline.errors import BadRosName, Malformed
+from brakeline.errors import BadRosName
 
 NODE, PUBLISHER, SUBSCRIPTION = "NN", "MP", "MS"
 SPACE = "@ros2_lv"
@@ -68,12 +68,6 @@ def dds_type(kind: str) -> str:
     return f"{package}::{group}::dds_::{name}_"
 
 
-def ros_type(dds: str) -> str:
-    """Invert `dds_type`."""
-    package, group, _, name = dds.split("::")
-    return f"{package}/{group}/{name.removesuffix('_')}"
-
-
 def topic_key(domain: int, topic: str, kind: str, digest: str = ANY_HASH) -> str:
     """Return the key of a topic (its full name) of one type."""
     return f"{domain}/{topic.strip('/')}/{dds_type(kind)}/{digest}"
@@ -106,55 +100,16 @@ class GraphEntity:
             parts += [_mangled(self.topic), dds_type(self.type), self.digest, self.qos]
         return "/".join(parts)
 
-    @staticmethod
-    def parse(token: str) -> GraphEntity:
-        """Read a token. Raises BadRosName: it is not one of a node, publisher or subscription."""
-        parts = token.split("/")
-        try:
-            space, domain, session, node_id, id, kind, _, namespace, node, *topic = parts
-            if space != SPACE or len(topic) != (0 if kind == NODE else 4):
-                raise ValueError(kind)
-            where = int(domain), session, int(node_id), int(id), kind, _plain(namespace), node
-            if kind == NODE:
-                return GraphEntity(*where)
-            name, type_, digest, qos = topic
-            return GraphEntity(*where, _plain(name), ros_type(type_), digest, qos)
-        except ValueError as error:
-            raise BadRosName(f"not a token: {token!r}") from error
-
 
 def gid_of(token: str) -> bytes:
     """Return a publisher's global id: XXH3-128 of its liveliness token, low half first, each half little-endian."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
-@dataclass(frozen=True)
-class Attachment:
-    """The attachment of a message."""
-
-    sequence: int  # number of the message, from 1 on for each publisher
-    time: int  # ns since the Unix epoch
-    gid: bytes  # the publisher's global id
-
-    def encode(self) -> bytes:
-        """Encode the attachment."""
-        return ATTACHMENT.pack(self.sequence, self.time, GID, self.gid)
-
-    @staticmethod
-    def decode(payload: bytes) -> Attachment:
-        """Decode an attachment. Raises Malformed."""
-        try:
-            sequence, time, length, gid = ATTACHMENT.unpack(payload)
-        except struct.error as error:
-            raise Malformed(f"not an attachment: {error}") from error
-        if length != GID:
-            raise Malformed(f"not an attachment: a global id of {length} bytes")
-        return Attachment(sequence, time, gid)
+def attachment(sequence: int, time: int, gid: bytes) -> bytes:
+    """Encode the attachment of a publisher's message, numbered from 1 on; `time` in ns since the Unix epoch."""
+    return ATTACHMENT.pack(sequence, time, GID, gid)
 
 
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
-
-
-def _plain(name: str) -> str:
-    return name.replace("%", "/")

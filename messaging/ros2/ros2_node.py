@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Protocol, Self, TypeVar
@@ -25,7 +25,7 @@ from zenoh.ext import (
 )
 from zenoh.handlers import RingChannel
 
-from brakeline.errors import BadRosName, Malformed, Unreachable
+from brakeline.errors import Malformed, Unreachable
 from brakeline.messaging.bus.subscription import Subscription
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error, close_sessions, zenoh_config
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -33,11 +33,10 @@ from brakeline.messaging.ros2.cdr_messages import decode, digest_of, encode, typ
 from brakeline.messaging.ros2.rmw_names import (
     NODE,
     PUBLISHER,
-    SPACE,
     SUBSCRIPTION,
-    Attachment,
     GraphEntity,
     Qos,
+    attachment,
     full_name,
     gid_of,
     topic_key,
@@ -107,8 +106,7 @@ class RosPublisher(Generic[M]):
         payload, now = encode(message), time.time_ns()
         with self._lock, as_bus_error(f"cannot publish on {self.entity.topic}"):
             self.count += 1
-            attachment = Attachment(self.count, now, self._gid).encode()
-            self._sender.put(payload, attachment=attachment)
+            self._sender.put(payload, attachment=attachment(self.count, now, self._gid))
         if self._tap is not None:
             self._tap(self.entity.topic, self._kind, payload, now, self._qos)
 
@@ -215,19 +213,6 @@ class RosNode:
         self._subscriptions.append(subscription)
         self._declare(entity)
         return subscription
-
-    def graph(self, timeout: float = 1.0) -> tuple[GraphEntity, ...]:
-        """Return all nodes, publishers and subscriptions of the domain, including this node's own."""
-        entities = []
-        tokens = f"{SPACE}/{self.settings.domain}/**"
-        replies: Iterable[zenoh.Reply] = self._session.liveliness().get(tokens, timeout=timeout)
-        for reply in replies:
-            if reply.ok is not None:
-                try:
-                    entities.append(GraphEntity.parse(str(reply.ok.key_expr)))
-                except BadRosName:
-                    continue  # the token of a service, or an invalid one
-        return tuple(entities)
 
     def _entity(self, kind: str, topic: str = "", message: type | None = None, qos: Qos = RELIABLE) -> GraphEntity:
         with self._lock:
