@@ -17,11 +17,7 @@ class RateLimiter:
     """
 
     def __init__(self, samples_per_insert: float, batch: int, warmup: int, ahead: float = 0.0) -> None:
-        """Start at zero.
-
-        Args:
-            ahead: number of inserts that the actors may be ahead of the learner; 0: lockstep.
-        """
+        """Start at zero. ahead: number of inserts that the actors may be ahead of the learner; 0: lockstep."""
         self.samples_per_insert, self.batch, self.warmup = samples_per_insert, batch, warmup
         self.ceiling = batch + samples_per_insert * (1.0 + ahead)
         self.inserts = 0

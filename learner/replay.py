@@ -63,11 +63,7 @@ class ReplayBuffer:
         self.size = min(self.size + 1, self.capacity)
 
     def sample(self, generator: np.random.Generator, batch: Batch) -> None:
-        """Fill a batch.
-
-        Raises:
-            ValueError: the buffer is empty.
-        """
+        """Fill a batch. Raises ValueError: the buffer is empty."""
         if self.size == 0:
             raise ValueError("the replay buffer has nothing to sample from")
         rows = generator.integers(self.size, size=len(batch))

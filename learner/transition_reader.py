@@ -31,11 +31,7 @@ class StepReader:
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 
     def move(self, step: pb.Step) -> ActorStep:
-        """Return the step in a message.
-
-        Raises:
-            BadStep: the learner cannot learn from the step.
-        """
+        """Return the step in a message. Raises BadStep: the learner cannot learn from the step."""
         if step.robot != self.robot.name:
             raise BadStep("robot", f"{step.robot!r}, not {self.robot.name!r}")
         if not step.actor:

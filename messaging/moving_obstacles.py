@@ -26,11 +26,7 @@ class MovingObstacles:
 
     @staticmethod
     def of(obstacles: Sequence[Obstacle], dim: int) -> MovingObstacles:
-        """Stack obstacles, each with a motion.
-
-        Raises:
-            BadShape: an obstacle has another dimension than `dim`.
-        """
+        """Stack obstacles, each with a motion. Raises BadShape: an obstacle has another dimension than `dim`."""
         n = len(obstacles)
         motions = [obstacle.motion for obstacle in obstacles if obstacle.motion is not None]
         return MovingObstacles(

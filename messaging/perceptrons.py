@@ -39,11 +39,7 @@ class Perceptrons:
     """`count` perceptrons of equal shape. Equal inputs give equal outputs, bit for bit."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
-        """Copy the layers.
-
-        Raises:
-            BadWeights: layers do not fit each other, or are not finite.
-        """
+        """Copy the layers. Raises BadWeights: layers do not fit each other, or are not finite."""
         self.layers = [(np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)) for w, b in layers]
         first: tuple[int, ...] = self.layers[0][0].shape if self.layers else ()
         self.count, _, self.inputs = first if len(first) == 3 else (0, 0, 0)

@@ -379,11 +379,7 @@ def robot_named(name: str) -> Robot:
 
 
 def refuse_shipped_name(robot: Robot) -> Robot:
-    """Return the robot.
-
-    Raises:
-        UnknownRobot: the robot has the name of a shipped robot but differs from it.
-    """
+    """Return the robot. Raises UnknownRobot: the robot has the name of a shipped robot but differs from it."""
     name = robot.in_lockstep().name
     if name in shipped_robots() and robot.description != robot_named(name).description:
         raise UnknownRobot(f"{name} is the name of a robot that comes with the program: choose another")

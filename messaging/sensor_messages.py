@@ -61,11 +61,7 @@ def scan_message(scan: Scan) -> pb.Scan:
 
 
 def scan_of(message: pb.Scan) -> Scan:
-    """Return the scan in a message.
-
-    Raises:
-        BadScan: the scan is invalid.
-    """
+    """Return the scan in a message. Raises BadScan: the scan is invalid."""
     if len(message.pose) != 3 or len(message.mount) != 2:
         raise BadScan("a scan's pose has 3 coordinates, its mount 2")
     if len(message.ways) % 4:
@@ -99,11 +95,7 @@ def image_message(image: RangeImage) -> pb.RangeImage:
 
 
 def image_of(message: pb.RangeImage) -> RangeImage:
-    """Return the range image in a message.
-
-    Raises:
-        BadScan: the image is invalid.
-    """
+    """Return the range image in a message. Raises BadScan: the image is invalid."""
     if (len(message.at), len(message.attitude), len(message.mount)) != (3, 4, 3):
         raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
     if not message.rings or not message.ranges or len(message.ranges) % (2 * message.rings):

@@ -10,11 +10,7 @@ from brakeline.errors import BadText
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        BadText: the text is not JSON, or nested too deeply.
-    """
+    """Return the value of a JSON text. Raises BadText: the text is not JSON, or nested too deeply."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -22,11 +18,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the values of a TOML text.
-
-    Raises:
-        BadText: the text is not TOML, or nested too deeply.
-    """
+    """Return the values of a TOML text. Raises BadText: the text is not TOML, or nested too deeply."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:

@@ -273,11 +273,7 @@ def robot_maybe_with_task(name: str) -> Robot:
 
 
 def needs_task(robot: Robot) -> RobotWithTask:
-    """Return the robot, which must have a task.
-
-    Raises:
-        UnknownTask: the robot has no task.
-    """
+    """Return the robot, which must have a task. Raises UnknownTask: the robot has no task."""
     if not isinstance(robot, RobotWithTask):
         if not robot.position_dim:
             raise UnknownTask(f"{robot.name} {NO_SPACE}")
@@ -328,11 +324,7 @@ def address_in_real_time(name: str) -> str:
 
 
 def read_task(path: Path) -> Task:
-    """Read the task in a file.
-
-    Raises:
-        UnknownTask: the file has mistakes; the message lists all of them.
-    """
+    """Read the task in a file. Raises UnknownTask: the file has mistakes; the message lists all of them."""
     try:
         values = _with_base(path)
         arenas = values.get("arenas", {})

@@ -138,11 +138,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle of the present episode.
-
-        Raises:
-            gymnasium.error.ResetNeeded: no episode has started yet.
-        """
+        """The vehicle of the present episode. Raises gymnasium.error.ResetNeeded: no episode has started yet."""
         if self._vehicle is None:
             raise gymnasium.error.ResetNeeded("call reset() before the first step")
         return self._vehicle

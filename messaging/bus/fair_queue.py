@@ -35,11 +35,7 @@ class FairQueue(Generic[T]):
         return waiting.popleft() if len(waiting) > MAX_PER_CLIENT else None
 
     def next(self) -> T:
-        """Remove and return the newest query of the next client.
-
-        Raises:
-            StopIteration: the queue is empty.
-        """
+        """Remove and return the newest query of the next client. Raises StopIteration: the queue is empty."""
         client = next(iter(self._waiting))
         waiting = self._waiting.pop(client)
         query = waiting.pop()

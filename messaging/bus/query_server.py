@@ -56,11 +56,7 @@ class QueryServer(ReceiverThreads):
         asker_in: Callable[[str], str],
         rejected: RejectedMessages,
     ) -> None:
-        """Start to answer.
-
-        Args:
-            asker_in: returns the name of the asker in the key of a query.
-        """
+        """Start to answer. asker_in: returns the name of the asker in the key of a query."""
         self._handler, self._asker_in, self._rejected = handler, asker_in, rejected
         self._turns = FairQueue[PendingQuery]()
         self._state = threading.Lock()

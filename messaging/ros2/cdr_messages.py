@@ -71,11 +71,7 @@ def encode(message: Any) -> bytes:
 
 
 def decode(kind: type[M], payload: bytes) -> M:
-    """Decode a message of one type.
-
-    Raises:
-        Malformed: the bytes are not a message of that type.
-    """
+    """Decode a message of one type. Raises Malformed: the bytes are not a message of that type."""
     try:
         message = STORE.deserialize_cdr(payload, type_of(kind))
     except (SerdeError, AssertionError, IndexError, OverflowError, MemoryError) as error:

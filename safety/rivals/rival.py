@@ -25,11 +25,7 @@ class Rival(ABC):
         self.model, self.robot, self.version = model, model.robot, model.version
 
     def decide(self, request: Request) -> Decision:
-        """Return the method's decision; brake if the proposal is not finite.
-
-        Raises:
-            BadRequest: see `check`.
-        """
+        """Return the method's decision; brake if the proposal is not finite. Raises BadRequest: see `check`."""
         started = perf_counter_ns()
         self.check(request)
         if not request.finite:

@@ -275,11 +275,7 @@ class SafetySettings:
 
 
 def main(settings: SafetySettings) -> None:
-    """Serve until SIGINT or SIGTERM.
-
-    Raises:
-        BadModel: a file holds no model, or is not signed on a bus with keys.
-    """
+    """Serve until SIGINT or SIGTERM. Raises BadModel: a file holds no model, or is not signed on a bus with keys."""
     import brakeline.safety.filter.kernels.halfspace_kernels  # noqa: F401  # compiles for seconds the first time: do it before the service announces itself
 
     keys = settings.bus.keys

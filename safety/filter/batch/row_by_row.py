@@ -32,11 +32,7 @@ class RowByRow:
         self.model = getattr(method, "model", None)
 
     def decide_batch(self, requests: RequestArrays) -> DecisionArrays:
-        """Decide on NumPy arrays.
-
-        Raises:
-            BadRequest: a value is missing, not finite, or has the wrong size.
-        """
+        """Decide on NumPy arrays. Raises BadRequest: a value is missing, not finite, or has the wrong size."""
         started, every = perf_counter_ns(), np.ones(len(requests), dtype=bool)
         answers = blank_answers(self.robot, requests, np, "cpu")
         return completed(self._method, requests, answers, every, started, bound=None, judges=False)
