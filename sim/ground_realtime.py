@@ -17,15 +17,16 @@ from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
 from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
 
+BEAMS = 360  # of the lidar, in a turn
+
 
 class RealtimeEstimator(Estimator):
     """`Estimator`, one sample at a time: between two pose fixes it returns its dead reckoning."""
 
     def __init__(self, noise: NoiseLevels, rng: np.random.Generator, pose: Array, *wheels: Any) -> None:
         super().__init__(noise, rng, pose, *wheels)
-        self._moves: list[
-            tuple[float, float]
-        ] = []  # distance [m] and turn rate [rad/s] of each sample since the last fix
+        # distance [m] and turn rate [rad/s] of each sample since the last fix
+        self._moves: list[tuple[float, float]] = []
         self._recent: list[tuple[float, float]] = []
 
     def add_sample(self, wheels: Array, turn_rate: float, pose: Array) -> Array:
@@ -97,30 +98,19 @@ class SpinningLidar:
     """A lidar that measures beam after beam, one turn in `SAMPLES` samples: the ranges of a turn have different times.
 
     A beam that hits nothing reports inf, one that hits something too near reports -inf (REP 117).
-
-    Attributes:
-        nearest, farthest: m, the limits of a range.
-        mount: m, its position on the robot's x axis.
-        gap: rad between two beams.
     """
 
-    def __init__(
-        self,
-        arena: Arena,
-        rng: np.random.Generator,
-        noise: float,
-        beams: int = 360,
-        nearest: float = 0.12,
-        farthest: float = 3.5,
-        mount: float = -0.032,
-    ) -> None:
-        """Start the first turn. noise: standard deviation of a range [m]."""
-        self.nearest, self.farthest, self.mount = nearest, farthest, mount
-        self.gap = 2.0 * math.pi / beams
-        angles = self.gap * np.arange(beams)
+    farthest = 3.5  # m, limit of a range
+    mount = -0.032  # m, its position on the robot's x axis
+    gap = 2.0 * math.pi / BEAMS  # rad between two beams
+
+    def __init__(self, arena: Arena, rng: np.random.Generator, noise: float, nearest: float = 0.12) -> None:
+        """Start the first turn. noise: standard deviation of a range [m]; nearest: the other limit of a range [m]."""
+        self.nearest = nearest
+        angles = self.gap * np.arange(BEAMS)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         sectors = np.array_split(directions, SAMPLES)
-        self._sectors = [Lidar(arena, LidarRays(sector, farthest), noise, rng) for sector in sectors]
+        self._sectors = [Lidar(arena, LidarRays(sector, self.farthest), noise, rng) for sector in sectors]
         self._measured: list[Array] = []
 
     def measure_sector(self, true: Array) -> Array | None:
