@@ -37,14 +37,10 @@ class Disc:
 
     >>> Disc(at=(0.3, 0.4), radius=0.1).arm
     0.5
-
-    Attributes:
-        at: center (d,) relative to the position [m].
-        radius: [m].
     """
 
-    at: tuple[float, ...]
-    radius: float
+    at: tuple[float, ...]  # center (d,) relative to the position [m]
+    radius: float  # [m]
 
     @property
     def arm(self) -> float:
@@ -58,13 +54,10 @@ class Limit:
 
     >>> Limit("stay left of x = 2 m", weights=(1.0, 0.0, 0.0, 0.0, 0.0), most=2.0).most
     2.0
-
-    Attributes:
-        weights: (n,), one for each state coordinate.
     """
 
     name: str
-    weights: tuple[float, ...]
+    weights: tuple[float, ...]  # (n,), one for each state coordinate
     most: float
 
 
