@@ -50,6 +50,8 @@ class KeysCommand:
                 signer.sign(load(path)).save(path)
                 console.print(str(seal_of(path)), markup=False)
             return 0
+        for name in self.names:
+            role_of(name)  # a wrong name is refused before there is a folder
         authority = Authority(self.folder, self.days)
         for name in self.names:
             authority.issue(name, self.host)

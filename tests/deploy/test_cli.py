@@ -95,7 +95,7 @@ def test_an_impossible_command_fails_with_one_line_that_says_why(
     monkeypatch.chdir(tmp_path)
     status, out, err = command(*words.format(folder=tmp_path).split())
     assert (status, out) == (1, "") and said in err and err.startswith("brakeline ")
-    assert err.count("\n") == 1 and not {path.name for path in tmp_path.iterdir()} - {"run", "keys"}
+    assert err.count("\n") == 1 and not {path.name for path in tmp_path.iterdir()} - {"run"}
     assert not (tmp_path / "run" / "logs").exists()
 
 
