@@ -88,14 +88,22 @@ class Shapes:
     >>> shapes = Shapes.of([Obstacle("box", (2.0, 0.0), (1.0, 1.0)), Obstacle("sphere", (3.0, 0.0), (1.0,))], dim=2)
     >>> shapes.distance(np.zeros(2)).tolist()
     [1.5, 2.0]
+
+    Attributes:
+        center: (n, d) [m].
+        axes: rotations (n, d, d), world from local.
+        half: half edge lengths of the boxes (n, d) [m].
+        rho: rounding radii (n,) [m].
+        round: (n, d), 1 on the axes along which the rounding acts.
+        margin: (n,) [m].
     """
 
-    center: Array  # (n, d) [m]
-    axes: Array  # rotations (n, d, d), world from local
-    half: Array  # half edge lengths of the boxes (n, d) [m]
-    rho: Array  # rounding radii (n,) [m]
-    round: Array  # (n, d), 1 on the axes along which the rounding acts
-    margin: Array  # (n,) [m]
+    center: Array
+    axes: Array
+    half: Array
+    rho: Array
+    round: Array
+    margin: Array
 
     def __len__(self) -> int:
         return len(self.rho)

@@ -37,10 +37,14 @@ class Disc:
 
     >>> Disc(at=(0.3, 0.4), radius=0.1).arm
     0.5
+
+    Attributes:
+        at: center (d,) relative to the position [m].
+        radius: [m].
     """
 
-    at: tuple[float, ...]  # center (d,) relative to the position [m]
-    radius: float  # [m]
+    at: tuple[float, ...]
+    radius: float
 
     @property
     def arm(self) -> float:
@@ -54,10 +58,13 @@ class Limit:
 
     >>> Limit("stay left of x = 2 m", weights=(1.0, 0.0, 0.0, 0.0, 0.0), most=2.0).most
     2.0
+
+    Attributes:
+        weights: (n,), one for each state coordinate.
     """
 
     name: str
-    weights: tuple[float, ...]  # (n,), one for each state coordinate
+    weights: tuple[float, ...]
     most: float
 
 

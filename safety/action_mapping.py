@@ -23,10 +23,14 @@ class ActionMapping:
     >>> in_cm = ActionMapping(lambda action: action / 100.0, lambda control: 100.0 * control)
     >>> in_cm.action_to_control(np.array([25.0, 0.0])).tolist()
     [0.25, 0.0]
+
+    Attributes:
+        action_to_control: from an action of the environment to an input (m,) of the robot.
+        control_to_action: from an input (m,) to an action.
     """
 
-    action_to_control: Callable[[Any], ArrayLike]  # from an action of the environment to an input (m,) of the robot
-    control_to_action: Callable[[Array], Any]  # from an input (m,) to an action
+    action_to_control: Callable[[Any], ArrayLike]
+    control_to_action: Callable[[Array], Any]
 
 
 IDENTITY = ActionMapping(lambda action: action, lambda control: control)

@@ -25,11 +25,16 @@ class Prediction:
     >>> box = Prediction(center=np.zeros(5), half_width=np.full(5, 0.1), heading=0.0)
     >>> box.contains(robot_named("ground"), np.array([0.05, 0.0, 0.0, 0.0, 0.0]))
     True
+
+    Attributes:
+        center (n,): center of the set; its position is in the world.
+        half_width (n,): half-widths of the set.
+        heading: angle by which the box of the position is turned [rad].
     """
 
-    center: Array  # (n,): center of the set; its position is in the world
-    half_width: Array  # (n,): half-widths of the set
-    heading: float  # angle by which the box of the position is turned [rad]
+    center: Array
+    half_width: Array
+    heading: float
 
     def contains(self, robot: Robot, state: Array) -> bool:
         """Return whether the measured state (n,) lies in the set."""

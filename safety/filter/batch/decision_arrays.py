@@ -41,32 +41,58 @@ class DecisionArrays:
     >>> answers = Filter.load("ground").decide_batch(RequestArrays.of([request] * 3))
     >>> [KINDS[kind] for kind in answers.kind], answers.plan[:, 0].tolist()
     (['allowed', 'allowed', 'allowed'], [[0.2, 0.0], [0.2, 0.0], [0.2, 0.0]])
+
+    Attributes:
+        kind (B,): index in `KINDS`: 0 allowed, 1 adjusted, 2 failsafe, 3 recovering.
+        plan (B, N, m): see `Decision`.
+        tube_center (B, N, d): see `Decision`.
+        tube_half_width (B, N, d): see `Decision`.
+        margin (B,): see `Decision`.
+        verified (B,): see `Decision`.
+        at_least (B,): see `Decision`.
+        contained (B,): see `Decision`.
+        compared (B,): see `Decision`.
+        predicted_center (B, n): center of the set of the next measured state.
+        predicted_half_width (B, n): its half-widths.
+        predicted_heading (B,): heading of its frame [rad].
+        for_clearance (B,): see `Decision`; false where that is None.
+        score (B,): see `Decision`.
+        scored (B,): whether the row has a score.
+        steps (B,): number of steps of the solver.
+        proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
+        blocked: the constraints that the proposals of adjusted rows violated.
+        singly: the decisions of the rows that the single path decided, by row.
+        obstacles: those of the requests.
+        model: see `Decision`.
+        bound: see `Decision`.
+        judges: see `Decision`.
+        time_ms: time for the whole batch, divided by its rows.
     """
 
-    kind: Array  # (B,): index in `KINDS`: 0 allowed, 1 adjusted, 2 failsafe, 3 recovering
-    plan: Array  # (B, N, m): see `Decision`
-    tube_center: Array  # (B, N, d): see `Decision`
-    tube_half_width: Array  # (B, N, d): see `Decision`
-    predicted_center: Array  # (B, n): center of the set of the next measured state
-    predicted_half_width: Array  # (B, n): its half-widths
-    predicted_heading: Array  # (B,): heading of its frame [rad]
-    margin: Array  # (B,): see `Decision`
-    at_least: Array  # (B,): see `Decision`
-    verified: Array  # (B,): see `Decision`
-    contained: Array  # (B,): see `Decision`
-    compared: Array  # (B,): see `Decision`
-    for_clearance: Array  # (B,): see `Decision`; false where that is None
-    score: Array  # (B,): see `Decision`
-    scored: Array  # (B,): whether the row has a score
-    steps: Array  # (B,): number of steps of the solver
-    proposal_margin: Array  # (B,): margin of the proposal [m]; NaN where the single path decided
-    blocked: BlockingArrays  # the constraints that the proposals of adjusted rows violated
-    singly: Mapping[int, Decision]  # the decisions of the rows that the single path decided, by row
-    obstacles: ObstacleArrays  # those of the requests
-    model: str  # see `Decision`
-    bound: float | None  # see `Decision`
-    judges: bool  # see `Decision`
-    time_ms: float  # time for the whole batch, divided by its rows
+    kind: Array
+    plan: Array
+    tube_center: Array
+    tube_half_width: Array
+    predicted_center: Array
+    predicted_half_width: Array
+    predicted_heading: Array
+    margin: Array
+    at_least: Array
+    verified: Array
+    contained: Array
+    compared: Array
+    for_clearance: Array
+    score: Array
+    scored: Array
+    steps: Array
+    proposal_margin: Array
+    blocked: BlockingArrays
+    singly: Mapping[int, Decision]
+    obstacles: ObstacleArrays
+    model: str
+    bound: float | None
+    judges: bool
+    time_ms: float
 
     def __len__(self) -> int:
         return int(self.kind.shape[0])

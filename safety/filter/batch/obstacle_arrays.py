@@ -32,15 +32,24 @@ class ObstacleArrays:
     >>> post = Shapes.of([Obstacle("cylinder", (0.4, 0.0), (0.1,))], dim=2)
     >>> ObstacleArrays.of([post, Shapes.of([], dim=2)]).count.tolist()
     [1, 0]
+
+    Attributes:
+        center (B, K, d): see `Shapes`.
+        axes (B, K, d, d): see `Shapes`.
+        half (B, K, d): see `Shapes`.
+        rho (B, K): see `Shapes`.
+        round (B, K, d): see `Shapes`.
+        margin (B, K): see `Shapes`.
+        count (B,): number of obstacles of each request, integers.
     """
 
-    center: Array  # (B, K, d): see `Shapes`
-    axes: Array  # (B, K, d, d): see `Shapes`
-    half: Array  # (B, K, d): see `Shapes`
-    rho: Array  # (B, K): see `Shapes`
-    round: Array  # (B, K, d): see `Shapes`
-    margin: Array  # (B, K): see `Shapes`
-    count: Array  # (B,): number of obstacles of each request, integers
+    center: Array
+    axes: Array
+    half: Array
+    rho: Array
+    round: Array
+    margin: Array
+    count: Array
 
     @staticmethod
     def of(shapes: Sequence[Shapes]) -> ObstacleArrays:

@@ -23,12 +23,18 @@ class PredictionArrays:
 
     >>> PredictionArrays(np.zeros((2, 5)), np.full((2, 5), 0.1), np.zeros(2), given=np.array([True, False])).given.sum()
     np.int64(1)
+
+    Attributes:
+        center (B, n): see `Prediction`.
+        half_width (B, n): see `Prediction`.
+        heading (B,): see `Prediction`.
+        given (B,): whether the robot has one; the other rows are ignored.
     """
 
-    center: Array  # (B, n): see `Prediction`
-    half_width: Array  # (B, n): see `Prediction`
-    heading: Array  # (B,): see `Prediction`
-    given: Array  # (B,): whether the robot has one; the other rows are ignored
+    center: Array
+    half_width: Array
+    heading: Array
+    given: Array
 
 
 @dataclass(frozen=True)
@@ -38,12 +44,18 @@ class PastArrays:
     >>> both = np.ones(2, dtype=bool)
     >>> PastArrays(np.zeros((2, 3, 5)), np.zeros((2, 4, 2)), from_start=~both, given=both).inputs.shape
     (2, 4, 2)
+
+    Attributes:
+        states (B, N, n): see `PastWindow`.
+        inputs (B, N + 1, m): see `PastWindow`.
+        from_start (B,): see `PastWindow`.
+        given (B,): whether the robot has one; the other rows are ignored.
     """
 
-    states: Array  # (B, N, n): see `PastWindow`
-    inputs: Array  # (B, N + 1, m): see `PastWindow`
-    from_start: Array  # (B,): see `PastWindow`
-    given: Array  # (B,): whether the robot has one; the other rows are ignored
+    states: Array
+    inputs: Array
+    from_start: Array
+    given: Array
 
 
 @dataclass(frozen=True)
