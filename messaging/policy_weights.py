@@ -60,6 +60,11 @@ class MLP:
             layers.append((draw[:, :inputs], draw[:, inputs]))
         return cls(robot, layers)
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of inputs, and of outputs of each layer."""
+        return (self.robot.task.observation_dim, *(len(bias) for _, bias in self.layers))
+
     def __call__(self, observation: NDArray[Any]) -> Array:
         """Return the action (m,) in the robot's units."""
         return self._centre + self._half * self.normalised(observation)

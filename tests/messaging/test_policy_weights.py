@@ -21,16 +21,12 @@ def observation(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, GROUND.task.observation_dim)
 
 
-def widths(policy: MLP) -> list[int]:
-    return [len(bias) for _, bias in policy.layers]
-
-
 def test_round_trip_over_bytes_and_a_file(tmp_path):
     policy = decode(FILE)
     policy.save(tmp_path / "policy.safetensors")
     assert (tmp_path / "policy.safetensors").read_bytes() == FILE
     assert MLP.load(tmp_path / "policy.safetensors", GROUND).encode() == FILE
-    assert (policy.robot, policy.version, policy.noise, widths(policy)) == (GROUND, 7, 0.25, [16, 8, 2])
+    assert (policy.robot, policy.version, policy.noise, policy.sizes) == (GROUND, 7, 0.25, (26, 16, 8, 2))
     assert policy.encode() == FILE
     assert (policy(observation(0)) == POLICY(observation(0))).all()
 
@@ -67,7 +63,7 @@ def test_exploration():
 
 def test_untrained_policies_differ_by_seed_only():
     one, same, other = (MLP.untrained(GROUND, seed) for seed in (1, 1, 2))
-    assert widths(one) == [256, 256, 2]
+    assert one.sizes == (26, 256, 256, 2)
     assert one.encode() == same.encode() != other.encode()
 
 
@@ -85,7 +81,7 @@ def test_a_flipped_byte_is_refused_or_harmless(place, flip):
         policy = decode(bytes(data))
     except BadWeights:
         return
-    assert widths(policy)[-1] == 2
+    assert policy.sizes[0] == 26 and policy.sizes[-1] == 2
     assert np.isfinite(policy(observation(0))).all()
 
 

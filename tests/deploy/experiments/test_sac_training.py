@@ -28,7 +28,7 @@ def test_the_policy_is_the_deterministic_one_of_sac(env):
     seen = np.random.default_rng(0).uniform(0.0, 1.0, (5, GROUND.task.observation_dim)).astype(np.float32)
     policy = MLP(GROUND, _layers(model))
     assert policy.of_many(seen) == pytest.approx(model.predict(seen, deterministic=True)[0], abs=1e-6)
-    assert [len(bias) for _, bias in policy.layers] == [16, 16, 2]
+    assert policy.sizes == (26, 16, 16, 2)
 
 
 def test_it_learns_from_its_proposals_and_pays_for_corrections(env):
