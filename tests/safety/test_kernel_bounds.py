@@ -13,9 +13,27 @@ TESTS = Path(__file__).resolve().parents[1]
 # They call every kernel, with arrays of random sizes and with images of a real sensor's size.
 KERNEL_TESTS = (
     *(f"safety/test_{name}_kernels.py" for name in ("filter", "perception", "occlusion")),
-    "sim/test_flight_kernels.py",
-    "sim/test_arena_kernels.py",
-    "sim/test_batch_env.py::test_ranges_are_those_of_mujoco",
+    *(
+        f"sim/test_quadrotor.py::test_{name}"
+        for name in (
+            "the_controller_is_its_twin_bit_for_bit",
+            "free_flight_is_that_of_mujoco",
+            "a_vehicle_flies_freely_until_it_may_touch_something",
+        )
+    ),
+    *(
+        f"sim/test_arenas.py::test_{name}"
+        for name in (
+            "nearest_distances_are_those_of_the_shapes",
+            "without_an_obstacle_the_distance_is_infinite",
+            "connected_cells_are_those_of_one_label",
+            "the_distance_of_a_point_that_is_not_a_number_is_none",
+            "the_first_fitting_outline_is_that_of_the_gaps",
+            "gaps_between_outlines_are_exact",
+            "an_outline_does_not_fit_over_itself",
+        )
+    ),
+    "sim/test_lidar.py::test_ranges_are_those_of_mujoco",
 )
 OF_COMPILATION = ("every_kernel_has_a_twin", "refuses_other_types", "prepare_loads_every_kernel")  # no indices in these
 
