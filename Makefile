@@ -51,14 +51,14 @@ compiled: setup
 	$(COMPILE)
 	-$(BIN)/python -m pytest --collect-only > /dev/null
 
-# Real time in one process, real autopilots in another, whole runs in a third, the rest in two more at a lower priority
-# (tests/conftest.py); what was skipped, and why.
+# Real time in one process, real autopilots in another, whole runs in a third at a lower priority, the rest in a fourth
+# at a still lower one, and in those that are through (tests/conftest.py); what was skipped, and why.
 # What the processes of a few hundred runs import is compiled once, whatever the shell says.
 unit: export PYTHONDONTWRITEBYTECODE =
-# Five processes with two threads each on two cores wait for each other.
+# Four processes with two threads each on two cores wait for each other.
 unit: export OMP_NUM_THREADS = 1
 unit: compiled
-	$(BIN)/python -m pytest -m "not long" -n 5 --dist loadscope --no-loadscope-reorder -rs
+	$(BIN)/python -m pytest -m "not long" -n 4 --dist loadscope --no-loadscope-reorder -rs
 
 # For every save: no whole runs, no flights, no trainings.
 test-fast: export PYTHONDONTWRITEBYTECODE =

@@ -38,8 +38,8 @@ REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py", "tests/actors/test_ma
 WHOLE_RUNS = ("tests/system/",)
 LANES = (LIVE, REAL_AUTOPILOTS, WHOLE_RUNS)
 REST = ("tests/examples/", "tests/deploy/", "")  # the longest modules first: at the end no process waits for one
-ASIDE = pytest.StashKey[bool]()  # of a process: it has given way to the others
-BESIDE = 10  # by which the priority of a process is lower that is on no lane
+LOWER = (0, 0, 5, 10)  # by which the priority of a process is lower on each lane, and on none: nothing live waits
+ASIDE = pytest.StashKey[int]()  # of a process: by how much it is lower already
 
 
 def lane(nodeid: str) -> int:
@@ -80,11 +80,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A process on no lane takes what the lanes leave of the processor; nothing live waits."""
+    """Lower the priority of the process to that of the test's lane; it cannot rise again."""
     stash = item.config.stash
-    if "PYTEST_XDIST_WORKER" in os.environ and lane(item.nodeid) == len(LANES) and ASIDE not in stash:
-        stash[ASIDE] = True  # for good: none that was on a lane before goes back to it
-        os.nice(BESIDE)
+    before, wanted = stash.get(ASIDE, 0), LOWER[lane(item.nodeid)]
+    if "PYTEST_XDIST_WORKER" in os.environ and wanted > before:
+        stash[ASIDE] = wanted
+        os.nice(wanted - before)
 
 
 @pytest.fixture(scope="session")
