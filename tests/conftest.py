@@ -1,9 +1,11 @@
 """A small recording of the ground robot, made once a session, for the tests that need a model set; and who runs what
 where tests run side by side (`pytest -n 4`)."""
 
+import fcntl
 import gc
 import os
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ LIVE = (
 REAL_AUTOPILOTS = ("tests/system/test_real_autopilots.py", "tests/actors/test_mavlink_vehicle.py")
 WHOLE_RUNS = ("tests/system/",)
 LANES = (LIVE, REAL_AUTOPILOTS, WHOLE_RUNS)
+ALONE = ("tests/system/test_real_autopilots.py", "tests/system/test_fly.py", "tests/system/test_ros2.py")
 REST = ("tests/examples/", "tests/deploy/", "")  # the longest modules first: at the end no process waits for one
 LOWER = (0, 0, 5, 10)  # by which the priority of a process is lower on each lane, and on none: nothing live waits
 ASIDE = pytest.StashKey[int]()  # of a process: by how much it is lower already
@@ -76,6 +79,19 @@ def pytest_collection_finish() -> None:
     """Switch the garbage collector on, which then passes over the collected tests."""
     gc.freeze()
     gc.enable()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Let only one of the live tests run that need nearly a processor: two of them, on two lanes, starve each other."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or not item.nodeid.startswith(ALONE):
+        return (yield)
+    with (Path(tempfile.gettempdir()) / f"brakeline-tests-{os.getuid()}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            return (yield)
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)  # closing it would not do: a child may have it open, too
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -89,6 +89,7 @@ def test_what_is_logged_goes_out_on_the_bus(join: Join, endpoint: str) -> None:
         log.debug("not this")
     log.error("not this either: it has ended")
     assert wait_for_goodbye(health).notes["model"] == "v3"
+    until(lambda: len(lines) >= 2)  # another thread delivers them
     assert [(line.process, line.level, line.text) for line in lines] == [
         ("worker", "INFO", "2 robots"),
         ("worker", "ERROR", "bad"),
