@@ -18,6 +18,7 @@ from brakeline.deploy.data import data_paths, model_store, simulated_recording
 from brakeline.errors import BadModel
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.accepting import BOUND
+from tests.browser import CHROMIUM, Page
 from tests.robots import GROUND, QUADROTOR
 
 gc.disable()  # until all tests are collected: to search the half million objects takes a second in each process
@@ -109,6 +110,15 @@ def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The session's, for all who run its tests side by side."""
     own = tmp_path_factory.getbasetemp()
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A browser for all tests of a process that open pages one after the other."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: no page was opened")
+    with Page(tmp_path_factory.mktemp("browser")) as page:
+        yield page
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The names in rmw_zenoh: keys of topics, and the liveliness tokens that show nodes in the ROS graph; and attachments.
+"""The conventions of rmw_zenoh: keys of topics, liveliness tokens that show nodes in the ROS graph, and attachments.
 
 topic   <domain>/<name without outer slashes>/<pkg>::msg::dds_::<Type>_/RIHS01_<hash>
 token   @ros2_lv/<domain>/<session>/<node id>/<id>/<kind>/<enclave>/<namespace>/<node>

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from brakeline.deploy.cli import COMMANDS
-from tests.browser import CHROMIUM, Page
+from tests.browser import Page
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -48,14 +48,6 @@ def test_the_reference_shows_docstrings_and_help(site: Path) -> None:
     assert '<span class="gp">' in python, "examples are code"
     for command, entry in COMMANDS.items():
         assert f'id="{command}"' in line and f"usage: brakeline {command} " in line and entry.summary in line, command
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: no page of the site was opened")
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        yield page
 
 
 @pytest.fixture

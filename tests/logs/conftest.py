@@ -19,7 +19,7 @@ from brakeline.messaging.bus import Bus, BusSettings, Sample
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, TOPICS
-from tests.browser import CHROMIUM, Page, drawn
+from tests.browser import Page, drawn
 from tests.logs.sample_log import mixed
 from tests.waiting import until
 
@@ -88,14 +88,6 @@ def report(analysis: LogAnalysis, tmp_path_factory: pytest.TempPathFactory) -> t
     path = tmp_path_factory.mktemp("report") / "report.html"
     write(path, analysis.figures(), analysis.by_label())
     return path, json.loads(json.dumps(analysis.figures()))
-
-
-@pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: no page was opened")
-    with Page(tmp_path_factory.mktemp("browser")) as page:
-        yield page
 
 
 @pytest.fixture
