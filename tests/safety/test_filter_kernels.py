@@ -133,6 +133,7 @@ def cases(rng, d):
         "roomiest_planes": (rng.normal(size=(6, 2 * N + 1, d)), rng.normal(size=(6, 2 * N + 1)) + 1.0, path),
         "planes_beside": (*near.parts, near.margin, start, start + path[1:], 0.1, measured),
         "hildreth_active_set": (h, g, A, b, 20),
+        "exact_solution": (h, g, A, b + rng.choice([0.0, 1.0]), rng.permutation(30)[:8]),
         "clip_to_bounds": (rng.normal(size=2), before, low, high, slew),
         "regressors_of_braking": (z, rng.random((3, 2)), rng.normal(size=2)),
     }
