@@ -61,8 +61,13 @@ def _turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) 
     search.record.iterations += record.iterations
     if aside is None:
         return stopped
-    search.record.reason += f"; the robot turns aside to the {'left' if turn > 0.0 else 'right'}"
+    search.record.reason += turns_aside_to(turn)
     return replace(aside, kind=ADJUSTED, for_clearance=stopped.for_clearance)
+
+
+def turns_aside_to(turn: float) -> str:
+    """Return what a reason adds for a turn: positive to the left."""
+    return f"; the robot turns aside to the {'left' if turn > 0.0 else 'right'}"
 
 
 def is_blocked(robot: Robot, proposed: Any, executed: Any, tolerance: float = 0.0) -> Any:
@@ -76,6 +81,12 @@ def is_blocked(robot: Robot, proposed: Any, executed: Any, tolerance: float = 0.
     return moves & (abs(executed) <= BLOCKED * abs(proposed) + tolerance)
 
 
+def way_ahead(robot: Robot) -> float:
+    """Return the way [m] of `PERIODS` at the highest speed."""
+    speed = robot.translates.index(True)
+    return float(PERIODS * robot.period * max(abs(bound[speed]) for bound in robot.bounds))
+
+
 def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array, Array]:
     """Return the sectors in which a standing robot cannot drive on: their middles (n,) and half-angles (n,) [rad].
 
@@ -83,8 +94,6 @@ def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array,
     directions in which the robot would come nearer by more than r on its next `PERIODS`.
     """
     safety, at = search.safety, search.standing
-    speed = safety.robot.translates.index(True)
-    way = PERIODS * safety.robot.period * max(abs(bound[speed]) for bound in safety.robot.bounds)
     each, row, rooms = rows_per_obstacle(safety.robot.horizon), 0, []
     for planes in at.planes:
         rows = each * len(planes.normals)
@@ -93,7 +102,8 @@ def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array,
     room = np.concatenate(rooms) - safety.clearance_margin
     normals = np.concatenate([planes.normals[:, 0] for planes in at.planes])
     ahead = search.local_map.heading + (math.pi if backwards else 0.0)
-    return np.arctan2(normals[:, 1], normals[:, 0]) - ahead, np.arccos(np.clip(room / way, 0.0, 1.0))
+    half_angles = np.arccos(np.clip(room / way_ahead(safety.robot), 0.0, 1.0))
+    return np.arctan2(normals[:, 1], normals[:, 0]) - ahead, half_angles
 
 
 def free_turn(middles: Array, half_angles: Array) -> float:

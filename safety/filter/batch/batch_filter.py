@@ -5,7 +5,7 @@
 
 The batch decides the rows whose answer is the proposal or the input of a QP, among obstacles that stand still. It
 leaves every other row to `Filter.decide`, the *single path*: a state outside the recorded domain, a proposal that is
-not finite, a plan that turns in place, a blocked robot that is to turn aside, a failsafe, a recovery, and every
+not finite, a plan that turns in place, a failsafe, a recovery, and every
 comparison whose result rounding could change.
 """
 
@@ -68,14 +68,21 @@ def completed(
 
     started [ns]: time of the requests; about: `bound` and `judges` of `Decision`.
     """
-    xp, device = array_api_compat.array_namespace(answers["plan"]), array_api_compat.device(answers["plan"])
-    singly = {}
-    for row in np.flatnonzero(left).tolist():
-        try:
-            singly[row] = method.decide(requests.row(row))
-        except BadRequest as error:
-            raise BadRequest(error.field, f"row {row}: {error}") from error
-        write_decision(answers, row, singly[row], xp, device)
+    singly, rows = {}, np.flatnonzero(left).tolist()
+    if rows:
+        xp, device = array_api_compat.array_namespace(answers["plan"]), array_api_compat.device(answers["plan"])
+        own = requests.rows(rows)
+        written = blank_answers(method.robot, own, np, "cpu")
+        for number, row in enumerate(rows):
+            try:
+                singly[row] = method.decide(own.row(number))
+            except BadRequest as error:
+                raise BadRequest(error.field, f"row {row}: {error}") from error
+            write_decision(written, number, singly[row])
+        to = xp.asarray(np.array(rows), device=device)
+        del written["blocked"]  # `singly` holds it
+        for name, array in written.items():
+            answers[name][to] = xp.asarray(array, device=device)
     time_ms = (perf_counter_ns() - started) * 1e-6 / max(len(requests), 1)
     about |= {"model": method.version, "time_ms": time_ms}
     return DecisionArrays(**answers, singly=singly, obstacles=requests.obstacles, **about)
@@ -150,14 +157,15 @@ def blank_answers(robot: Robot, requests: RequestArrays, xp: Any, device: Any) -
     for name in ("at_least", "verified", "contained", "compared", "for_clearance", "scored"):
         arrays[name] = xp.zeros(B, dtype=xp.bool, device=device)
     arrays["kind"] = xp.full(B, KINDS.index("failsafe"), dtype=xp.int64, device=device)
-    arrays["steps"] = xp.zeros(B, dtype=xp.int64, device=device)
+    for name in ("steps", "turned"):
+        arrays[name] = xp.zeros(B, dtype=xp.int64, device=device)
     blank = {name: xp.full((B, d), xp.nan, dtype=xp.float64, device=device) for name in ("normal", "at")}
     alone = {name: xp.full(B, xp.nan, dtype=xp.float64, device=device) for name in ("room", "after")}
     arrays["blocked"] = BlockingArrays(xp.full(B, -1, dtype=xp.int64, device=device), **alone, **blank)
     return arrays
 
 
-def write_decision(answers: dict[str, Any], row: int, decision: Decision, xp: Any, device: Any) -> None:
+def write_decision(answers: dict[str, Any], row: int, decision: Decision) -> None:
     """Write a decision of the single path into its row. A method that verifies nothing has no tube."""
     predicted = decision.predicted
     values = {
@@ -173,7 +181,7 @@ def write_decision(answers: dict[str, Any], row: int, decision: Decision, xp: An
     for name, value in values.items():
         array = np.asarray(value, dtype=float)
         if array.size:
-            answers[name][row] = xp.asarray(array, device=device)
+            answers[name][row] = array
     for name in ("at_least", "verified", "contained", "compared"):
         answers[name][row] = getattr(decision, name)
     answers["for_clearance"][row] = bool(decision.for_clearance)

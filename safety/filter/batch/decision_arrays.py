@@ -12,6 +12,7 @@ from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host
 from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision
+from brakeline.safety.filter.turning_aside import turns_aside_to
 
 Array = Any  # of any namespace
 
@@ -59,6 +60,7 @@ class DecisionArrays:
         score (B,): see `Decision`.
         scored (B,): whether the row has a score.
         steps (B,): number of steps of the solver.
+        turned (B,): 1 or -1 where the plan turns a blocked robot aside, to the left or right; else 0.
         proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
         blocked: the constraints that the proposals of adjusted rows violated.
         singly: the decisions of the rows that the single path decided, by row.
@@ -85,6 +87,7 @@ class DecisionArrays:
     score: Array
     scored: Array
     steps: Array
+    turned: Array
     proposal_margin: Array
     blocked: BlockingArrays
     singly: Mapping[int, Decision]
@@ -105,6 +108,10 @@ class DecisionArrays:
         adjusted, blocked = kind == ADJUSTED, kind != ALLOWED
         set_ = (on_host(self.predicted_center[index]), on_host(self.predicted_half_width[index]))
         reason = f"the proposal's tube comes within {float(self.proposal_margin[index]):.3g} m of the free space's edge"
+        if not adjusted:
+            reason += "; no verified input was found"
+        elif turned := int(self.turned[index]):
+            reason += turns_aside_to(turned)
         return Decision(
             kind=kind,
             plan=on_host(self.plan[index]),
@@ -114,7 +121,7 @@ class DecisionArrays:
             margin=float(self.margin[index]),
             at_least=bool(self.at_least[index]),
             model=self.model,
-            reason="" if not blocked else reason if adjusted else f"{reason}; no verified input was found",
+            reason=reason if blocked else "",
             verified=bool(self.verified[index]),
             contained=bool(self.contained[index]),
             compared=bool(self.compared[index]),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brakeline.safety.filter.backup_plan import SAME_SET
+from brakeline.safety.filter.batch.aside_batch import AsideBatch
 from brakeline.safety.filter.batch.constraint_batch import PlanBatch, SceneBatch, taken
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host, within_reach
@@ -17,19 +18,17 @@ from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
 from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
-from brakeline.safety.filter.turning_aside import is_blocked, may_turn_aside
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
 
 Array = Any  # of any namespace
 
-LANES, NUMBERS = 512, 1 << 17  # lanes, and their rows of half-spaces, that a processor's cache can hold
+LANES, NUMBERS = 2048, 1 << 19  # lanes at once, and their rows of half-spaces; more take no less time for each
 FEWEST = 32  # lanes at once, whatever the number of obstacles
-MANY = 8  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
+MANY = 2  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
 LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 16, 1 << 26
 HUGE = 1e100  # a larger number is left to the single path
-NEARLY = 1e-5  # of an input: as blocked as this may be, the single path decides
 
 
 class LaneDecisions:
@@ -43,7 +42,7 @@ class LaneDecisions:
         self._constraints = self._search.constraints
         self._clearance, self._reach = safety.clearance_margin, base.reach
         self._start, self._growth = safety.start, safety.constraints.growth
-        self._speed = robot.translates.index(True) if may_turn_aside(robot) else None
+        self._aside = AsideBatch(safety, self._search, constant, xp)
         self._furthest = max(robot.sight, base.reach)
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
@@ -179,8 +178,8 @@ class LaneDecisions:
         proposed = self._search.propose(lanes)
         found = self._search.adjust(lanes, proposed)
         goes_on = found.hopeless & self._goes_on(requests, rows)
-        adjusted = found.adjusted & ~self._turns_aside(requests, rows, lanes.proposal, found.z)
-        done = xp.nonzero(found.allowed | adjusted | goes_on)[0]
+        self._aside.turn(lanes, found, self._asks_to_turn(requests, rows))
+        done = xp.nonzero(found.allowed | found.adjusted | goes_on)[0]
         if not done.shape[0]:
             return done
         to, scene = xp.take(rows, done, axis=0), taken(xp, lanes.scene, done)
@@ -200,16 +199,16 @@ class LaneDecisions:
         kind = xp.where(goes_on, KINDS.index(FAILSAFE), xp.where(found.adjusted, KINDS.index(ADJUSTED), 0))
         answers["kind"][to] = xp.astype(xp.take(kind, done, axis=0), xp.int64)
         answers["for_clearance"][to] = xp.take(found.for_clearance & ~goes_on, done, axis=0)
+        answers["turned"][to] = xp.take(found.turned, done, axis=0)
         answers["steps"][to] = xp.astype(xp.take(found.steps, done, axis=0), xp.int64)
         return done
 
-    def _turns_aside(self, requests: RequestArrays, rows: Array, proposal: Array, z: Array) -> Array:
-        """Return which lanes (B,) with adjusted plans are blocked and may turn aside: `turning_aside.find_plan`."""
-        xp, aside, speed = self._xp, requests.turn_aside, self._speed
-        if aside is False or speed is None:
-            return xp.zeros_like(rows, dtype=xp.bool)
-        blocked = is_blocked(self._robot, proposal[speed], z[self._search.known + speed], NEARLY)
-        return blocked if aside is True else blocked & xp.take(aside, rows, axis=0)
+    def _asks_to_turn(self, requests: RequestArrays, rows: Array) -> Array:
+        """Return which of some rows let the filter turn a blocked robot aside (B,)."""
+        xp, aside = self._xp, requests.turn_aside
+        if isinstance(aside, bool):
+            return xp.full_like(rows, aside, dtype=xp.bool)
+        return xp.take(aside, rows, axis=0)
 
     def _goes_on(self, requests: RequestArrays, rows: Array) -> Array:
         """Return whether the committed plans of some rows still count as verified (B,): see `Filter.decide`.

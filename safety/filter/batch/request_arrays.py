@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
+import array_api_compat
 import numpy as np
 
 from brakeline.errors import BadRequest
@@ -134,6 +135,22 @@ class RequestArrays:
             predicted=PredictionArrays(center, half_width, heading, given) if given.any() else None,
             past=PastArrays(states, inputs, from_start > 0.0, windows) if windows.any() else None,
         )
+
+    def rows(self, rows: list[int]) -> RequestArrays:
+        """Return some of the requests, as NumPy arrays."""
+        xp, device = array_api_compat.array_namespace(self.state), array_api_compat.device(self.state)
+        index = xp.asarray(np.array(rows), device=device)
+
+        def those(part: Any) -> Any:
+            if part is None or isinstance(part, bool | str):
+                return part
+            if hasattr(part, "__dataclass_fields__"):
+                return type(part)(**{name: those(value) for name, value in vars(part).items()})
+            if isinstance(part, Sequence):
+                return [part[row] for row in rows]
+            return on_host(xp.take(part, index, axis=0))
+
+        return cast(RequestArrays, those(self))
 
     def row(self, index: int) -> Request:
         """Return the request of one robot, as NumPy arrays."""

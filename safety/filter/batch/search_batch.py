@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Array = Any  # of any namespace
 
-FEW = 24  # lanes, below which the single path is faster than a further step of the search
+FEW = 12  # lanes, below which the single path is faster than a further step of the search
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class CandidateBatch:
     hopeless: Array  # no plan near the proposal is verified. A lane with none of the three is left to the single path.
     for_clearance: Array  # (B,): the proposal is verified too
     steps: Array  # (B,): of the solver
+    turned: Array  # (B,): 1 or -1: the plan turns a blocked robot aside, to the left or right; else 0
 
 
 class SearchBatch:
@@ -114,10 +115,11 @@ class SearchBatch:
     def adjust(self, lanes: LaneBatch, proposed: ProposalBatch) -> CandidateBatch:
         """Search for plans near proposals that are not allowed at once: with the clearance margin, then without."""
         xp, verified = self._xp, proposed.margin > 0.0
-        stay = self._staying(lanes)
+        stay = self.staying(lanes)
         z, margin = (xp.asarray(part, copy=True) for part in (proposed.plan.z, proposed.margin))
         allowed, adjusted, hopeless, for_clearance = (xp.zeros_like(verified) for _ in range(4))
-        found = CandidateBatch(z, margin, allowed, adjusted, hopeless, for_clearance, xp.zeros_like(margin))
+        counts = xp.zeros_like(margin), xp.zeros_like(margin, dtype=xp.int64)
+        found = CandidateBatch(z, margin, allowed, adjusted, hopeless, for_clearance, *counts)
         open_ = self._neither_nearer(lanes, proposed.plan, stay, xp.nonzero(verified)[0], found)
         for with_clearance in (True, False):
             if not with_clearance:  # a verified proposal that no input betters
@@ -162,7 +164,7 @@ class SearchBatch:
             z = self.regressors(lanes.z_0, nothing)
         return self.constraints.around(lanes.scene, z)
 
-    def _staying(self, lanes: LaneBatch) -> Array:
+    def staying(self, lanes: LaneBatch) -> Array:
         """Return the regressors (nz, B) of turning in place."""
         in_place = self._xp.where(self._standing, lanes.proposal, self._nothing)
         return self.regressors(lanes.z_0, self.limited(in_place, lanes.z_0[self.known - self._m :]))

@@ -177,7 +177,7 @@ def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int
             count += 1
     while count:
         _multipliers(h, g, A, b, active, count, multiplier)
-        worst = multiplier[:count].argmin()
+        worst = int(multiplier[:count].argmin())
         if multiplier[worst] >= 0.0:
             break
         count = _without(active, multiplier, count, worst)
