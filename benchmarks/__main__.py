@@ -23,6 +23,7 @@ from benchmarks import (
     askers,
     autopilot_conformance,
     batch_decide,
+    batch_device,
     batch_simulation,
     changed_robots,
     costs,
@@ -75,6 +76,8 @@ class Bench:
     """Let each sender of crowd send this many junk messages a second."""
     minutes: float = 10.0
     """Fly each policy of flights for this long in each arena [min]."""
+    device: str = "cuda"
+    """Decide on this device of torch in batch-device."""
     against: Path | None = None
     """Run step with the code of this checkout, too, at the same time."""
     folder: Path = Path("runs/flights")
@@ -98,6 +101,7 @@ class Benchmark:
 BENCHMARKS = {
     "decide": Benchmark(decide, lambda _: decide.run()),
     "batch": Benchmark(batch_decide, lambda _: batch_decide.run()),
+    "batch-device": Benchmark(batch_device, lambda given: batch_device.run(given.device), named=True),
     "batch-simulation": Benchmark(batch_simulation, lambda _: batch_simulation.run()),
     "perception": Benchmark(perception_cost, lambda _: perception_cost.run()),
     "solvers": Benchmark(solvers, lambda _: solvers.run()),

@@ -1,0 +1,80 @@
+"""Time `decide_batch` on an accelerator, beside the same batch in NumPy and the loop over `decide` on one core.
+
+The requests are those of policies behind the filter, repeated until a batch is full. The tensors stay on the device.
+The time is that of the clock, until the device has finished. This needs a torch that knows the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import batch_decide
+from benchmarks.timing import Figures, spread_of
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.model_set import DIRECT, ONE_STEP
+
+SIZES = (4096, 65_536, 1_048_576)  # of batches
+LOOP, BLOCKS = 1024, 5  # requests of the loop
+
+
+def run(device: str) -> Figures:
+    """Return a row for each robot, mode, policy and size of a batch."""
+    figures: Figures = {}
+    for name in ("ground", "quadrotor"):
+        for mode in (ONE_STEP, DIRECT):
+            for policy in ("trained", "random"):
+                ready, requests = batch_decide.asked(name, mode, policy)
+                figures |= measured(f"{name}, {mode}, {policy}", ready, RequestArrays.of(requests), device)
+    return figures
+
+
+def measured(title: str, ready: Filter, requests: RequestArrays, device: str, sizes: tuple[int, ...] = SIZES) -> Figures:
+    """Return a row for each size of a batch that repeats the requests."""
+    figures: Figures = {}
+    few = [requests.row(row) for row in range(min(LOOP, len(requests)))]
+    ours, theirs = ready.decide_batch(requests), ready.decide_batch(on_device(requests, device))
+    apart = {
+        "other kind": int((ours.kind != theirs.kind.cpu().numpy()).sum()),
+        "apart": float(np.abs(ours.plan - theirs.plan.cpu().numpy()).max()),
+    }
+    for size in sizes:
+        arrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
+        answers = ready.decide_batch(arrays)
+        times = []
+        for _ in range(BLOCKS):
+            batch = seconds(lambda: ready.decide_batch(arrays), device) / size
+            times.append((batch, seconds(lambda: [ready.decide(request) for request in few], device) / len(few)))
+        least = np.min(times, axis=0)
+        figures[f"{title}: {size} on {device}"] = {
+            "batch 1/s": 1.0 / least[0],
+            "loop 1/s": 1.0 / least[1],
+            **spread_of(np.array([loop / batch for batch, loop in times])),
+            "singly %": 100.0 * len(answers.singly) / size,
+            "allowed %": 100.0 * float((answers.kind == 0).sum()) / size,
+            **apart,
+        }
+    return figures
+
+
+def seconds(call: Callable[[], object], device: str) -> float:
+    """Return the time of a call [s], until the device has finished."""
+    before = perf_counter()
+    call()
+    if device != "cpu":
+        torch.accelerator.synchronize()
+    return perf_counter() - before
+
+
+def on_device(part: Any, device: str) -> Any:
+    """Return requests whose arrays are tensors on a device."""
+    if isinstance(part, np.ndarray):
+        return torch.from_numpy(np.ascontiguousarray(part)).to(device)
+    if hasattr(part, "__dataclass_fields__"):
+        return type(part)(**{name: on_device(value, device) for name, value in vars(part).items()})
+    return part
