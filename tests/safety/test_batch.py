@@ -161,6 +161,31 @@ def test_a_batch_turns_blocked_robots_aside(filters, form):
     assert {1, -1} <= set(turned)
 
 
+def test_a_batch_lets_standing_robots_turn_in_place():
+    ready, rng, requests = ground(), np.random.default_rng(2), []
+    robot = ready.robot
+    for _ in range(80):
+        action = np.array([rng.choice([0.0, 0.0, 0.2]), rng.uniform(-0.5, 0.5)])
+        stand = plain(ready, np.zeros(5), action, np.zeros(2), np.zeros((3, 2)))
+        bearings, away = rng.uniform(-3, 3, 4), robot.footprint + 0.1 + rng.uniform(-0.02, 0.2, 4)
+        posts = [
+            Obstacle("cylinder", (r * np.cos(angle), r * np.sin(angle)), (0.1,))
+            for angle, r in zip(bearings, away, strict=True)
+        ]
+        around = Shapes.of(posts[: rng.integers(0, 5)], 2)
+        requests.append(replace(stand, obstacles=around, widening=float(rng.choice([1.0, 1.5]))))
+    answers = check_same(ready, requests)
+    in_place = [row for row in range(80) if ready.turns_in_place(regressors(ready, requests[row]))]
+    allowed = [row for row in in_place if KINDS[answers.kind[row]] == ALLOWED]
+    assert 20 < len(allowed) < len(in_place) < 80
+    assert not set(allowed) & set(answers.singly)
+
+
+def regressors(ready, request):
+    z_0 = np.concatenate([request.state[list(ready.robot.regressor)], request.input_in_force])
+    return ready.inputs.regressors(z_0, ready.inputs.limited(request.action, request.input_in_force))
+
+
 def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
     monkeypatch.setattr(lane_decisions, "LANES", 7)
     check_same(ground(), scenes(ground(), 50, crowd=0.8))
@@ -267,8 +292,9 @@ def test_what_the_batch_does_not_cover_is_decided_singly(monkeypatch):
     ready = ground()
     stand = plain(ready, np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), np.zeros((3, 2)))
     outside = replace(stand, state=np.array([0.0, 0.0, 0.0, 5.0, 0.0]))
-    turning = replace(stand, action=np.array([0.0, 0.4]))
-    assert sorted(check_same(ready, [stand, outside, turning]).singly) == [1, 2]
+    post = Shapes.of([Obstacle("cylinder", (0.25, 0.0), (0.1,))], 2)
+    standing = replace(stand, action=np.array([0.2, 0.4]), obstacles=post)  # it may turn in place
+    assert sorted(check_same(ready, [stand, outside, standing]).singly) == [1, 2]
     requests, batch = scenes(ready, 5), BatchFilter(ready)
     assert batch.covers
     monkeypatch.setattr(batch, "covers", False)  # as it is for some robots

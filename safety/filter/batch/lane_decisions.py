@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from brakeline.safety.filter.backup_plan import SAME_SET
 from brakeline.safety.filter.batch.aside_batch import AsideBatch
-from brakeline.safety.filter.batch.constraint_batch import PlanBatch, SceneBatch, taken
+from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch, taken
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host, within_reach
+from brakeline.safety.filter.batch.qp_batch import ROUNDING
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.batch.score_batch import ScoreBatch
 from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
 from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
+from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
+from brakeline.safety.model.model_set import ModelSet
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -27,7 +31,7 @@ Array = Any  # of any namespace
 LANES, NUMBERS = 2048, 1 << 19  # lanes at once, and their rows of half-spaces; more take no less time for each
 FEWEST = 32  # lanes at once, whatever the number of obstacles
 MANY = 2  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
-LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 16, 1 << 26
+LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 18, 1 << 26
 HUGE = 1e100  # a larger number is left to the single path
 
 
@@ -47,9 +51,14 @@ class LaneDecisions:
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
         self._domain = constant(safety.domain[:, :, None])
-        self._box = None if safety.in_place is None else constant(safety.in_place[0][:, :, None])
         self._schedule = constant(safety.inputs.schedule)
-        self._predicts = _NextState(safety, constant, xp)
+        self._general = _Sets(self._constraints, _NextState(safety.model, safety.tube, constant, xp))
+        self._box, self._turning = None, self._general
+        turning = safety.model.turning()
+        if safety.in_place is not None and turning is not None:
+            box, own = safety.in_place
+            self._box = constant(box[:, :, None])
+            self._turning = _Sets(ConstraintBatch(own, constant, xp), _NextState(turning, own.tube, constant, xp))
         rollout = self._constraints.tube.rollout
         self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
         at_home = str(device) == "cpu"
@@ -159,18 +168,40 @@ class LaneDecisions:
         """Decide lanes whose proposals are allowed at once; return their indices, and those of lanes to adjust."""
         xp, k = self._xp, self._domain.shape[1]
         in_domain = xp.all((lanes.z_0[:k] >= self._domain[0]) & (lanes.z_0[:k] <= self._domain[1]), axis=0)
-        leave, single = xp.zeros_like(in_domain), ~in_domain
+        leave = in_place = xp.zeros_like(in_domain)
         if self._box is not None:
             z = self._search.regressors(lanes.z_0, lanes.proposal)
             within = (z >= self._box[0]) & (z <= self._box[1])
             leave = xp.all(within[: self._search.known], axis=0)  # a robot that stands may turn in place
-            single |= xp.all(within, axis=0)
+            in_place = xp.all(within, axis=0)
         proposed = self._search.propose(lanes)
-        done = xp.nonzero(proposed.allowed & ~single)[0]
+        done = xp.nonzero(proposed.allowed & in_domain & ~in_place)[0]
         if done.shape[0]:
             part, margin = taken(xp, proposed.plan, done), xp.take(proposed.margin, done, axis=-1)
-            self._write(requests, taken(xp, lanes.scene, done), part, margin, xp.take(rows, done, axis=0), answers)
-        return done, xp.nonzero(~proposed.allowed & ~proposed.unsure & ~leave & ~single)[0]
+            scene, to = taken(xp, lanes.scene, done), xp.take(rows, done, axis=0)
+            self._write(self._general, requests, scene, part, margin, to, answers)
+        rest = xp.nonzero(~proposed.allowed & ~proposed.unsure & ~leave & in_domain)[0]
+        turning = xp.nonzero(in_place & in_domain)[0]
+        if turning.shape[0]:
+            done = xp.concat([done, self._allow_in_place(requests, lanes, turning, rows, answers)])
+        return done, rest
+
+    def _allow_in_place(
+        self, requests: RequestArrays, lanes: LaneBatch, turning: Array, rows: Array, answers: dict[str, Any]
+    ) -> Array:
+        """Decide lanes whose proposals turn in place, if they are allowed at once; return the indices of these."""
+        xp, constraints = self._xp, self._turning.constraints
+        lanes = taken(xp, lanes, turning)
+        scene = replace(lanes.scene, far=(lanes.scene.widening > 1.0) | constraints.base_far)
+        plan = constraints.around(scene, self._search.regressors(lanes.z_0, lanes.proposal))
+        margin = constraints.least(scene, plan.slack, plan.extent)
+        # A plan in place needs no clearance margin.
+        allowed = xp.nonzero((scene.near.none(xp, margin) & ~scene.far) | (margin >= ROUNDING))[0]
+        if allowed.shape[0]:
+            scene, plan, margin = taken(xp, scene, allowed), taken(xp, plan, allowed), taken(xp, margin, allowed)
+            to = xp.take(rows, turning[allowed], axis=0)
+            self._write(self._turning, requests, scene, plan, margin, to, answers)
+        return turning[allowed]
 
     def _adjust(self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]) -> Array:
         """Decide lanes whose proposals are not allowed at once; return the indices of those that are decided."""
@@ -193,7 +224,7 @@ class LaneDecisions:
         margin = xp.where(
             xp.take(goes_on, done, axis=0), c.least(scene, plan.slack, plan.extent), xp.take(margin, done)
         )
-        self._write(requests, scene, plan, margin, to, answers)
+        self._write(self._general, requests, scene, plan, margin, to, answers)
         kept = xp.take(rows, xp.nonzero(goes_on)[0], axis=0)
         answers["plan"][kept] = xp.take(requests.plan, kept, axis=0)
         kind = xp.where(goes_on, KINDS.index(FAILSAFE), xp.where(found.adjusted, KINDS.index(ADJUSTED), 0))
@@ -215,14 +246,17 @@ class LaneDecisions:
 
         This model set verified the plan, and the measured state is in its predicted set. Such a robot recovers nowhere.
         """
-        xp, host = self._xp, on_host(rows).tolist()
-        model = requests.model
-        own = [(model if isinstance(model, str) else model[row]) == self._version for row in host]
-        verified = xp.asarray(np.array(own, dtype=bool), device=self._device)
+        xp, model = self._xp, requests.model
+        if isinstance(model, str):
+            verified = xp.full_like(rows, model == self._version, dtype=xp.bool)
+        else:
+            own = [model[row] == self._version for row in on_host(rows).tolist()]
+            verified = xp.asarray(np.array(own, dtype=bool), device=self._device)
         return verified & self._contained(requests, xp.take(requests.state, rows, axis=0), rows)
 
     def _write(
         self,
+        sets: _Sets,
         requests: RequestArrays,
         scene: SceneBatch,
         plan: PlanBatch,
@@ -230,17 +264,16 @@ class LaneDecisions:
         to: Array,
         answers: dict[str, Any],
     ) -> None:
-        """Write the verified plans of the rows `to` as allowed ones. scene, plan, margin: of these rows."""
+        """Write the verified plans of the rows `to` as allowed ones. sets, scene, plan, margin: of these rows."""
         xp, robot = self._xp, self._robot
-        centers, half = self._constraints.sets(scene, plan)
+        centers, half = sets.constraints.sets(scene, plan)
         state = xp.take(requests.state, to, axis=0)
-        predicted, predicted_half = self._predicts(scene, plan)
+        predicted, predicted_half = sets.of_next_state(scene, plan)
         heading = xp.zeros_like(margin)
         if robot.heading is not None:
             heading = state[:, robot.heading]
             predicted[robot.heading] += heading
-        empty = xp.all(~scene.near.used, axis=0) if scene.near.used.shape[0] else xp.ones_like(scene.far)
-        margin, at_least = self._constraints.clear(scene, plan, margin, empty)
+        margin, at_least = sets.constraints.clear(scene, plan, margin, scene.near.none(xp, margin))
         inputs = xp.permute_dims(self._schedule @ plan.z[robot.regressor_dim :], (1, 0))
         values = {
             "kind": xp.zeros_like(to),
@@ -324,13 +357,20 @@ class LaneDecisions:
         }
 
 
+class _Sets(NamedTuple):
+    """The sets of plans of one kind: of all plans, or of those that turn in place."""
+
+    constraints: ConstraintBatch
+    of_next_state: _NextState
+
+
 class _NextState:
     """The predicted sets of the next measured states: `TubeConstraints.predict` for a batch."""
 
-    def __init__(self, safety: Filter, constant: Any, xp: Any) -> None:
-        model, n, nz = safety.model, safety.robot.state_dim, safety.tube.position.shape[2]
-        self._xp, self._d, self._heading = xp, safety.robot.position_dim, safety.robot.heading
-        first = model.first
+    def __init__(self, model: ModelSet, tube: Tube, constant: Any, xp: Any) -> None:
+        robot, nz, first = model.robot, tube.position.shape[2], model.first
+        n = robot.state_dim
+        self._xp, self._d, self._heading = xp, robot.position_dim, robot.heading
         self._regressor = constant(model.first_regressor(np.eye(nz)).T)
         self._C, self._W, self._M = constant(first.C[:n]), constant(first.W), constant(first.M)
         self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])

@@ -88,6 +88,10 @@ class NearObstacles:
     slot: Array  # (K, B): its index among the request's obstacles
     away: Array  # (K, B) [m]: distance from the measured position, less the obstacle's margin
 
+    def none(self, xp: Any, lanes: Array) -> Array:
+        """Return which lanes (B,) have no obstacle; `lanes` is any array (B,) of them."""
+        return xp.all(~self.used, axis=0) if self.used.shape[0] else xp.ones_like(lanes, dtype=xp.bool)
+
     def first(self, most: int) -> NearObstacles:
         """Return the first `most` slots."""
         return self._each(lambda part: part[:most])

@@ -106,7 +106,7 @@ class SearchBatch:
         xp, scene, least = self._xp, lanes.scene, self.constraints.least
         plan = self.constraints.around(scene, self.regressors(lanes.z_0, lanes.proposal))
         margin = least(scene, plan.slack, plan.extent)
-        empty = xp.all(~scene.near.used, axis=0) if scene.near.used.shape[0] else xp.ones_like(scene.far)
+        empty = scene.near.none(xp, margin)
         kept = least(scene, plan.slack - self._clearance, plan.extent, self._clearance)
         room = xp.maximum(margin - max(self._clearance, 0.0), kept)
         allowed = (empty & ~scene.far) | (room >= ROUNDING)
