@@ -21,7 +21,7 @@ MOST_ITERATIONS = 100
 MOST_INNER_ITERATIONS = 50
 INFEASIBLE_ROWS = "primal_infeasible"
 # Only a few rows are active in a solution, so the solver first gets the rows of a quick guess (`hildreth_active_set`).
-# Its answer, also to all rows, is off by up to 0.3 of an input's range where rows are nearly parallel. From the rows
+# Its answer, also to all rows, is off by up to 0.03 of an input's range where rows are nearly parallel. From the rows
 # that carry it, a few steps of an active-set method find the exact solution of all rows. They also correct the verdict
 # that few rows are infeasible (13 of 9,727 were feasible). If they find nothing, and the few rows may be feasible, the
 # solver gets all rows. The rows have unit length, so small problems need no preconditioner, and a firm penalty
