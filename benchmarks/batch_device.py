@@ -7,6 +7,7 @@ The time is that of the clock, until the device has finished. This needs a torch
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -34,7 +35,9 @@ def run(device: str) -> Figures:
     return figures
 
 
-def measured(title: str, ready: Filter, requests: RequestArrays, device: str, sizes: tuple[int, ...] = SIZES) -> Figures:
+def measured(
+    title: str, ready: Filter, requests: RequestArrays, device: str, sizes: tuple[int, ...] = SIZES
+) -> Figures:
     """Return a row for each size of a batch that repeats the requests."""
     figures: Figures = {}
     few = [requests.row(row) for row in range(min(LOOP, len(requests)))]
@@ -48,7 +51,7 @@ def measured(title: str, ready: Filter, requests: RequestArrays, device: str, si
         answers = ready.decide_batch(arrays)
         times = []
         for _ in range(BLOCKS):
-            batch = seconds(lambda: ready.decide_batch(arrays), device) / size
+            batch = seconds(partial(ready.decide_batch, arrays), device) / size
             times.append((batch, seconds(lambda: [ready.decide(request) for request in few], device) / len(few)))
         least = np.min(times, axis=0)
         figures[f"{title}: {size} on {device}"] = {
