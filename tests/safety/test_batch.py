@@ -187,7 +187,7 @@ def regressors(ready, request):
 
 
 def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
-    monkeypatch.setattr(lane_decisions, "LANES", 7)
+    monkeypatch.setattr(lane_decisions, "PLAN_ROWS", 50)  # seven lanes
     check_same(ground(), scenes(ground(), 50, crowd=0.8))
 
 

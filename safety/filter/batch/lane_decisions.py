@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 Array = Any  # of any namespace
 
-LANES, NUMBERS = 2048, 1 << 19  # lanes at once, and their rows of half-spaces; more take no less time for each
+# Numbers that a processor's cache can hold: a plan's rows for one obstacle, and for all near ones, of all lanes at once
+PLAN_ROWS, ROWS = 1 << 14, 1 << 17
 FEWEST = 32  # lanes at once, whatever the number of obstacles
-MANY = 2  # times LANES: rows whose near obstacles are found at once, and which are then sorted by their number
-LANES_ON_DEVICE, NUMBERS_ON_DEVICE = 1 << 18, 1 << 26
+MANY = 4  # times the lanes: rows whose near obstacles are found at once, and which are then sorted by their number
+LANES_ON_DEVICE, ROWS_ON_DEVICE = 1 << 18, 1 << 26
 HUGE = 1e100  # a larger number is left to the single path
 
 
@@ -61,8 +62,9 @@ class LaneDecisions:
             self._turning = _Sets(ConstraintBatch(own, constant, xp), _NextState(turning, own.tube, constant, xp))
         rollout = self._constraints.tube.rollout
         self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
-        at_home = str(device) == "cpu"
-        self._lanes, self._numbers = (LANES, NUMBERS) if at_home else (LANES_ON_DEVICE, NUMBERS_ON_DEVICE)
+        self._lanes, self._rows = LANES_ON_DEVICE, ROWS_ON_DEVICE
+        if str(device) == "cpu":
+            self._lanes, self._rows = PLAN_ROWS // rows_per_obstacle(self._constraints.N), ROWS
 
     def decide(self, requests: RequestArrays, answers: dict[str, Any]) -> Array:
         """Write the decisions that the batch can make into `answers`; return which rows (B,) they are."""
@@ -158,7 +160,7 @@ class LaneDecisions:
         while first < order.shape[0]:
             own = order[first : first + self._lanes]
             most = int(xp.max(xp.take(count, own, axis=0)))
-            own = own[: max(FEWEST, self._numbers // (rows * max(most, 1)))]
+            own = own[: max(FEWEST, self._rows // (rows * max(most, 1)))]
             first += own.shape[0]
             yield taken(xp, lanes, own).with_slots(most), own
 
