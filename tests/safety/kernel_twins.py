@@ -126,7 +126,7 @@ def exact_solution(h, g, A, b, guess):
     """`active_set_kernels.exact_solution`, by the method for many problems at once, and without a guess."""
     nothing = np.zeros((0, 1), dtype=int)
     found = solve_batch(np, h[:, None], g[:, None], A[..., None], b[:, None], nothing)
-    return found.x[:, 0] if found.solved[0] else np.full(len(h), np.nan)
+    return found.x[:, 0] if found.solved[0] else np.full(len(h), np.nan), bool(found.infeasible[0])
 
 
 def clip_to_bounds(wanted, before, low, high, slew):

@@ -81,8 +81,8 @@ def test_the_active_rows_alone_give_the_solution_of_all_rows(parts):
             assert ours.residual <= ACCURACY and (program.A @ ours.x - program.b).max() <= ACCURACY
             assert np.abs(ours.x - theirs).max() < 1e-6
             assert value(program, ours.x) == pytest.approx(value(program, theirs), abs=1e-5)
-        assert (solve(program).x == ours.x).all(), "it is deterministic"
-    assert 10 < impossible < 90 and np.median(parts) < 30, "few of 172 rows"
+        assert np.array_equal(solve(program).x, ours.x, equal_nan=True), "it is deterministic"
+    assert 10 < impossible < 90 and np.mean(parts) < 30, "few of 172 rows, also where there is no solution"
 
 
 def test_the_guessed_active_set_changes_no_solution(monkeypatch):

@@ -160,9 +160,11 @@ def _checked(h: Array, g: Array, A: Array, b: Array, active: NDArray[np.int64], 
     return x if good else np.full(len(x), np.nan)
 
 
-@compiled("f8[::1](f8[::1], f8[::1], f8[:,::1], f8[::1], i8[::1])")
-def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int64]) -> Array:
-    """Return the solution (n,) of `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`; NaN if the method finds none.
+@compiled("Tuple((f8[::1], b1))(f8[::1], f8[::1], f8[:,::1], f8[::1], i8[::1])")
+def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int64]) -> tuple[Array, bool]:
+    """Return the solution (n,) of `min ½ xᵀ diag(h) x + gᵀ x  s.t.  A x <= b`, and whether there is none.
+
+    If the method finds neither a solution nor a proof that there is none, it returns NaN and false.
 
     guess: indices of rows that may be active. The method begins with those of them that are independent and have
     multipliers of at least zero. Then it adds the row that is violated most, and drops rows whose multipliers reach
@@ -188,7 +190,7 @@ def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int
             row, over = _most_violated(A, b, x)
             added = 0.0
             if not over > TOLERANCE:
-                return _checked(h, g, A, b, active, count, multiplier)
+                return _checked(h, g, A, b, active, count, multiplier), False
         curvature = _curvature(h, A, active, count, row, pull, direction)
         full, first, partial = np.inf, -1, np.inf
         if curvature > 0.0:
@@ -198,7 +200,7 @@ def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int
                 first, partial = i, multiplier[i] / pull[i]
         length = min(full, partial)
         if not length < np.inf:  # no x meets all rows
-            break
+            return np.full(n, np.nan), True
         if curvature > 0.0:
             x -= length * direction
             over -= length * curvature
@@ -210,4 +212,4 @@ def exact_solution(h: Array, g: Array, A: Array, b: Array, guess: NDArray[np.int
             row = -1
         else:
             count = _without(active, multiplier, count, first)
-    return np.full(n, np.nan)
+    return np.full(n, np.nan), False
