@@ -47,17 +47,20 @@ def measured(
         "apart": float(np.abs(ours.plan - theirs.plan.cpu().numpy()).max()),
     }
     for size in sizes:
-        arrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
+        arrays: RequestArrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
         answers = ready.decide_batch(arrays)
         times = []
         for _ in range(BLOCKS):
             batch = seconds(partial(ready.decide_batch, arrays), device) / size
-            times.append((batch, seconds(lambda: [ready.decide(request) for request in few], device) / len(few)))
+            numpy = seconds(partial(ready.decide_batch, requests), "cpu") / len(requests)
+            loop = seconds(lambda: [ready.decide(request) for request in few], "cpu") / len(few)
+            times.append((batch, numpy, loop))
         least = np.min(times, axis=0)
         figures[f"{title}: {size} on {device}"] = {
             "batch 1/s": 1.0 / least[0],
-            "loop 1/s": 1.0 / least[1],
-            **spread_of(np.array([loop / batch for batch, loop in times])),
+            f"numpy 1/s, {len(requests)}": 1.0 / least[1],
+            "loop 1/s": 1.0 / least[2],
+            **spread_of(np.array([loop / batch for batch, _, loop in times])),
             "singly %": 100.0 * len(answers.singly) / size,
             "allowed %": 100.0 * float((answers.kind == 0).sum()) / size,
             **apart,
