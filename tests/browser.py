@@ -65,8 +65,8 @@ class Page:
             time.sleep(0.05)
         port, path = address.read_text().splitlines()[:2]
         # No pings: their thread calls `random`, which Hypothesis forbids while another test draws its examples.
-        address = f"ws://127.0.0.1:{port}{path}"
-        self._socket = stack.enter_context(connect(address, max_size=None, ping_interval=None))
+        there = f"ws://127.0.0.1:{port}{path}"
+        self._socket = stack.enter_context(connect(there, max_size=None, ping_interval=None))
         targets = self.call("Target.getTargets")["targetInfos"]
         target = next(target["targetId"] for target in targets if target["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
