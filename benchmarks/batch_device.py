@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +46,7 @@ def measured(
         "apart": float(np.abs(ours.plan - theirs.plan.cpu().numpy()).max()),
     }
     for size in sizes:
-        arrays: RequestArrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
+        arrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
         answers = ready.decide_batch(arrays)
         times = []
         for _ in range(BLOCKS):
@@ -77,10 +76,6 @@ def seconds(call: Callable[[], object], device: str) -> float:
     return perf_counter() - before
 
 
-def on_device(part: Any, device: str) -> Any:
+def on_device(requests: RequestArrays, device: str) -> RequestArrays:
     """Return requests whose arrays are tensors on a device."""
-    if isinstance(part, np.ndarray):
-        return torch.from_numpy(np.ascontiguousarray(part)).to(device)
-    if hasattr(part, "__dataclass_fields__"):
-        return type(part)(**{name: on_device(value, device) for name, value in vars(part).items()})
-    return part
+    return requests.mapped(lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device))

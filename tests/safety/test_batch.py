@@ -207,25 +207,12 @@ def test_past_windows_are_scored():
 def test_torch_gives_the_same_answers_in_its_own_tensors(crowd, rows):
     torch = pytest.importorskip("torch")
     ready, requests = ground(), RequestArrays.of(scenes(ground(), rows, crowd))
-    theirs, ours = ready.decide_batch(moved(requests, torch.asarray)), ready.decide_batch(requests)
+    theirs, ours = ready.decide_batch(requests.mapped(torch.asarray)), ready.decide_batch(requests)
     assert isinstance(theirs.plan, torch.Tensor) and set(theirs.singly) == set(ours.singly)
     assert theirs.kind.tolist() == ours.kind.tolist()
     for name in ("plan", "margin", "tube_center", "tube_half_width", "predicted_center", "predicted_half_width"):
         assert np.abs(np.asarray(getattr(theirs, name)) - getattr(ours, name)).max() < SAME
     assert theirs.row(0).kind == ours.row(0).kind
-
-
-def moved(requests, change):
-    """Return requests with all arrays changed."""
-
-    def one(value):
-        if isinstance(value, np.ndarray):
-            return change(value)
-        if hasattr(value, "__dataclass_fields__"):
-            return type(value)(**{name: one(part) for name, part in vars(value).items()})
-        return value
-
-    return one(requests)
 
 
 def test_obstacles_may_have_empty_slots_with_any_numbers():

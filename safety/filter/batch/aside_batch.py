@@ -1,4 +1,4 @@
-"""Turns the blocked robots of a batch aside: `turning_aside` for many robots (docs/method.md §4); the batch is last."""
+"""Turn the blocked robots of a batch aside: `turning_aside` for many robots (docs/method.md §4); the batch is last."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class AsideBatch:
         robot = safety.robot
         self._xp, self._search, self._robot, self._period = xp, search, robot, robot.period
         self._clearance = safety.clearance_margin
-        self.speed = robot.translates.index(True) if may_turn_aside(robot) else None
-        if self.speed is not None:
+        self._speed = robot.translates.index(True) if may_turn_aside(robot) else None
+        if self._speed is not None:
             self._way = way_ahead(robot)
             self._translates = constant([[float(translates)] for translates in robot.translates]) > 0.5
 
@@ -39,7 +39,7 @@ class AsideBatch:
         asks (B,): the request lets the filter do so. A lane whose result rounding could change is no longer adjusted:
         it is left to the single path.
         """
-        xp, speed = self._xp, self.speed
+        xp, speed = self._xp, self._speed
         if speed is None:
             return
         speeds = lanes.proposal[speed], found.z[self._search.known + speed]
@@ -95,7 +95,7 @@ class AsideBatch:
         K, B = lanes.scene.near.rho.shape
         slack = xp.reshape(plan.slack, (len(plan.planes), rows_per_obstacle(constraints.N), K, B))
         room = xp.reshape(xp.min(slack, axis=1), (-1, B)) - self._clearance
-        ahead = xp.where(lanes.proposal[self.speed] < 0.0, math.pi, 0.0)
+        ahead = xp.where(lanes.proposal[self._speed] < 0.0, math.pi, 0.0)
         towards = [xp.atan2(planes.turned[1][0], planes.turned[0][0]) for planes in plan.planes]
         half_angles = xp.acos(xp.clip(room / self._way, 0.0, 1.0))
         used = xp.concat([lanes.scene.near.used] * len(plan.planes))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import array_api_compat
@@ -136,21 +136,31 @@ class RequestArrays:
             past=PastArrays(states, inputs, from_start > 0.0, windows) if windows.any() else None,
         )
 
+    def mapped(self, change: Callable[[Array], Array]) -> RequestArrays:
+        """Return the requests with every array changed, for example moved to a GPU.
+
+        >>> from brakeline import Request, RequestArrays, Shapes
+        >>> stand = np.zeros((3, 2))
+        >>> request = Request(np.zeros(5), [0.2, 0.0], stand[0], stand, Shapes.of([], dim=2), known_free=True)
+        >>> RequestArrays.of([request]).mapped(lambda array: array[:0]).plan.shape
+        (0, 3, 2)
+        """
+
+        def through(part: Any) -> Any:
+            if part is None or isinstance(part, bool | str | list | tuple):
+                return part
+            if hasattr(part, "__dataclass_fields__"):
+                return type(part)(**{name: through(value) for name, value in vars(part).items()})
+            return change(part)
+
+        return cast(RequestArrays, through(self))
+
     def rows(self, rows: list[int]) -> RequestArrays:
         """Return some of the requests, as NumPy arrays."""
         xp, device = array_api_compat.array_namespace(self.state), array_api_compat.device(self.state)
         index = xp.asarray(np.array(rows), device=device)
-
-        def those(part: Any) -> Any:
-            if part is None or isinstance(part, bool | str):
-                return part
-            if hasattr(part, "__dataclass_fields__"):
-                return type(part)(**{name: those(value) for name, value in vars(part).items()})
-            if isinstance(part, Sequence):
-                return [part[row] for row in rows]
-            return on_host(xp.take(part, index, axis=0))
-
-        return cast(RequestArrays, those(self))
+        some = self.mapped(lambda part: on_host(xp.take(part, index, axis=0)))
+        return some if isinstance(self.model, str) else replace(some, model=[self.model[row] for row in rows])
 
     def row(self, index: int) -> Request:
         """Return the request of one robot, as NumPy arrays."""
