@@ -24,7 +24,11 @@ LOOP, BLOCKS = 1024, 5  # requests of the loop
 
 
 def run(device: str) -> Figures:
-    """Return a row for each robot, mode, policy and size of a batch."""
+    """Return a row for each robot, mode, policy and size of a batch. Exits if torch cannot use the device."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch raises both
+        raise SystemExit(f"torch {torch.__version__} cannot use {device!r}: {error}. Name another --device.") from error
     figures: Figures = {}
     for name in ("ground", "quadrotor"):
         for mode in (ONE_STEP, DIRECT):
