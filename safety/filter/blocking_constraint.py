@@ -58,7 +58,8 @@ class Planes:
 
     start: Array  # (d,): start of the nominal path of the disc's centre, world [m]
     ends: Array  # (N, d): its positions at the ends of the periods, world [m]
-    normals: Array  # (n, N, d): normals of the half-spaces
+    normals: Array  # (n, N, d): normals of the half-spaces, world
+    turned: Array  # (n, N, d): the same in the robot's frame
     offsets: Array  # (n, N): offsets about `start` [m], already reduced by `keep_off` and `measured`
     keep_off: float  # distance to the obstacles [m]
     measured: Array  # (d,): bound of the position's measurement error [m]

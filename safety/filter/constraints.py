@@ -15,7 +15,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, worst
 from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
-from brakeline.safety.filter.kernels import halfspace_kernels, tube_kernels
+from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap, local_map
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.qp import Center, ConstraintRows, ObstacleRows
@@ -254,7 +254,8 @@ class TubeConstraints:
 
     def margin(self, rows: ConstraintRows, z: Array) -> float:
         """Return the smallest slack [m, or the unit of a limit] of the rows for the exact tube of z."""
-        return self.least(rows.bound - rows.support(self.tube, z), z)
+        sizes = tube_kernels.magnitudes(*self._sized, z)
+        return self.least(qp_kernels.row_slack(rows.gradient, rows.spread, rows.bound, z, sizes), z)
 
     def margin_in(self, local_map: LocalMap, z: Array) -> float:
         """Return the margin of the plan with regressors z in a map (docs/method.md §3)."""
@@ -296,7 +297,8 @@ class TubeConstraints:
                 if isinstance(local_map.unseen, seen.OccupiedCells) and local_map.unseen.speed > 0.0:
                     self._let_pass(beside[-1][1])
             normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
-            found.append(Planes(start, ends, normals, offsets, disc.radius, measured))
+            turned = normals if self.robot.heading is None else normals @ local_map.turn
+            found.append(Planes(start, ends, normals, turned, offsets, disc.radius, measured))
         return found
 
     def _let_pass(self, levels: Array) -> None:
@@ -315,8 +317,7 @@ class TubeConstraints:
         planes, tube = planes or self.planes(local_map, z), self.tube.affine(z)
         parts = []
         for disc, plane in zip(self.discs, planes, strict=True):
-            normals = self._turned(plane.normals, local_map)
-            parts.append(disc.layout.rows(disc.center(tube), normals, plane.offsets, self.widening))
+            parts.append(disc.layout.rows(disc.center(tube), plane.turned, plane.offsets, self.widening))
         return stack_rows(parts + self._further(local_map, tube, z))
 
     def slack(self, local_map: LocalMap, z: Array, planes: list[Planes] | None = None) -> Array:
@@ -326,16 +327,11 @@ class TubeConstraints:
             sizes *= self.widening
         found = []
         for disc, plane in zip(self.discs, planes or self.planes(local_map, z), strict=True):
-            normals = self._turned(plane.normals, local_map)
-            found.append(disc.layout.slack(disc.center(self.tube), normals, plane.offsets, sizes, z))
+            found.append(disc.layout.slack(disc.center(self.tube), plane.turned, plane.offsets, sizes, z))
         if self.limits is not None or local_map.other_reservations is not None:
             tube = self.tube.affine(z)
             found += [rows.bound - rows.support(tube, z) for rows in self._further(local_map, tube, z)]
         return found[0] if len(found) == 1 else np.concatenate(found)
-
-    def _turned(self, normals: Array, local_map: LocalMap) -> Array:
-        """Turn normals from the world to the robot's frame."""
-        return normals if self.robot.heading is None else normals @ local_map.turn
 
     def _further(self, local_map: LocalMap, tube: Tube, z: Array) -> list[ConstraintRows]:
         """Return the rows of reservations and of state limits. tube: with centers that are affine in z."""

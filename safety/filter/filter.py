@@ -71,7 +71,7 @@ class Filter:
         constraints: compares the tube of any plan with a map of the surroundings.
         in_place: bounds of z (2, nz), and the constraints for plans in place within them; None without such plans.
         standing (m,): inputs that leave the robot in place.
-        translating (nz,): 1 for free inputs that move it, else 0.
+        translating (nz,): the regressors that are free inputs and move it.
         domain (2, r): recorded range of [x_0; input in force], with room for rounding.
         clearance_margin: distance to obstacles that the QP keeps [m].
         reach: an obstacle farther away than this cannot change a decision [m].
@@ -104,7 +104,7 @@ class Filter:
         self.ordinary = FastRequestCheck(robot)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
-        self.translating = np.concatenate([np.zeros(robot.regressor_dim), driven])
+        self.translating = np.concatenate([np.zeros(robot.regressor_dim, dtype=bool), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self._score = None if model.one_step is None else WindowScore(model, model.one_step)
         self.start = 1.0 if model.one_step is None else model.one_step.start

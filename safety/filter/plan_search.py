@@ -5,9 +5,9 @@ The search stops at the first verified plan of: the proposal with the clearance 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
 from time import perf_counter_ns
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes
 from brakeline.safety.filter.constraints import TubeConstraints
-from brakeline.safety.filter.kernels import tube_kernels
+from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows
 from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
@@ -34,7 +34,10 @@ LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
 
 @dataclass
 class DecisionRecord:
-    """The values that the filter collects during one decision, for its report."""
+    """The values that the filter collects during one decision, for its report.
+
+    find_blocking: finds the constraint that the proposal violates; only the report needs it.
+    """
 
     started: int
     solver: str = ""
@@ -43,10 +46,14 @@ class DecisionRecord:
     reason: str = ""
     contained: bool = True
     broken: int = 0
-    blocked_by: BlockingConstraint | None = None
+    find_blocking: Callable[[], BlockingConstraint] | None = None
+
+    @property
+    def blocked_by(self) -> BlockingConstraint | None:
+        return None if self.find_blocking is None else self.find_blocking()
 
 
-@dataclass(frozen=True)
+@dataclass
 class PlanCandidate:
     """A plan that the filter may answer with."""
 
@@ -126,7 +133,7 @@ class PlanSearch:
         edge = "m of the free space's edge" if safety.robot.position_dim else "(in its own unit) of a limit"
         record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
         blocking = kept_off if margin >= 0.0 else np.zeros(len(slack))
-        record.blocked_by = constraints.worst_of(local_map, z, slack, planes, blocking)
+        record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, blocking)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.
         adjusted = None
@@ -136,9 +143,11 @@ class PlanSearch:
             found = (self._solve(start, with_clearance) for start in self._starting_points(proposed, committed))
             adjusted = next((candidate for candidate in found if candidate is not None), None)
             if adjusted is not None:
-                adjusted = replace(adjusted, for_clearance=margin >= 0.0)
                 break
+        for_clearance = margin >= 0.0 and adjusted is not None
         adjusted = self._turned_only(adjusted) or adjusted
+        if adjusted is not None:
+            adjusted.for_clearance = for_clearance
         if adjusted is None:
             record.reason += "; no verified input was found"
         return adjusted
@@ -184,7 +193,8 @@ class PlanSearch:
             if not isinstance(safety.tube, RolloutTube):  # the rows hold everywhere
                 if exact.margin(choice, z) < 0.0:
                     return None
-                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, exact.margin(at.rows, z), True, exact)
+                margin = exact.margin(at.rows, z)
+                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
             at = self._around(z)
             exact, needed = at.constraints, 0.0
             margin = exact.least(at.slack, z)
@@ -203,16 +213,13 @@ class PlanSearch:
         if safety.in_place is None:
             return None
         (box, constraints), m = safety.in_place, len(self.proposal)
-        turn = np.where(safety.standing, np.clip(self.proposal, *box[:, -m:]), safety.inputs.nothing)
+        turn = np.where(safety.standing, self.proposal.clip(*box[:, -m:]), safety.inputs.nothing)
         z = safety.inputs.regressors(self.z_0, safety.inputs.limited(turn, self.before))
         if not tube_kernels.within(z, box) or (adjusted is not None and self._off(adjusted.z) <= self._off(z)):
             return None
         constraints = constraints.at(z, local_map.widening)
-        margin, for_clearance = constraints.margin_in(local_map, z), adjusted is not None and adjusted.for_clearance
-        if margin < 0.0:
-            return None
-        plan = safety.inputs.plan(z)
-        return PlanCandidate(ADJUSTED, plan, z, margin, True, constraints, for_clearance=for_clearance)
+        margin = constraints.margin_in(local_map, z)
+        return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, constraints) if margin >= 0.0 else None
 
     def _off(self, z: Array) -> float:
         """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""
@@ -258,13 +265,7 @@ class PlanSearch:
         return at.kept
 
     def _tightened(self, at: Linearized) -> ConstraintRows:
-        rows, inside = at.rows, self._too_near_to_turn(at)
-        bound = np.where(inside, rows.bound, rows.bound - at.kept_off)
-        if not inside.any():
-            return ConstraintRows(rows.gradient, rows.spread, bound)
-        closer = rows.gradient[inside] * self.safety.translating
-        return ConstraintRows(
-            np.vstack([rows.gradient, closer]),
-            np.vstack([rows.spread, np.zeros((len(closer), rows.spread.shape[1]))]),
-            np.concatenate([bound, closer @ self._staying[0] + 2.0 * ROW_TIGHTENING]),
-        )
+        rows, too_near = at.rows, self._too_near_to_turn(at)
+        stay, room = self._staying[0], 2.0 * ROW_TIGHTENING
+        parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
+        return ConstraintRows(*qp_kernels.tightened(*parts))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.filter.kernels import halfspace_kernels
+from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels
 from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
@@ -116,6 +116,11 @@ class QPBuilder:
         self.change = np.arange(1.0, steps + 1.0)[:, None] * np.asarray(robot.action_slew)
         self.slew = np.tile(robot.action_slew, steps)[limited]
         self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
+        # The bounds of the fixed rows are affine in z_0: the first free input changes from the input in force.
+        first = np.eye(free, m)[limited] @ np.eye(m, self.known, k=self.known - m)
+        slope = np.vstack([-self.W_known, self.W_known, np.zeros((2 * free, self.known)), first, -first])
+        bound = np.concatenate([np.zeros(2 * atoms), self.box, self.slew, self.slew])
+        self._fixed_rows = whole(self.fixed), bound / self.length, whole(slope / self.length[:, None])
 
     def program(self, rows: ConstraintRows, z_0: Array, proposal: Array) -> QuadraticProgram | None:
         """Build the QP for known regressors z_0 (known,) and a proposal r (m,); None if a row rules out every input.
@@ -125,39 +130,20 @@ class QPBuilder:
         obstacles, nearly all rows are.
         """
         m = self.robot.action_dim
-        constant = self.M_c @ np.abs(self.W_c @ z_0) + self.tube.m_0
-        offset = self.W_known @ z_0
-        center, radius = self.reachable(z_0[-m:])
-        atom, deviation = offset + self.W_f @ center, self.abs_W_f @ radius
-        atoms = np.stack([np.maximum(np.abs(atom) - deviation, 0.0), np.abs(atom) + deviation])
-        count, A, b = halfspace_kernels.presolve_rows(
-            rows.gradient,
-            rows.spread,
-            rows.bound,
-            z_0,
-            constant,
-            self.M_t,
-            center,
-            radius,
-            atoms,
-            self.scale,
-            ROW_TIGHTENING,
-        )
+        inputs = self.reachable(z_0[-m:])
+        constant = qp_kernels.known_magnitudes(self.W_c, self.M_c, self.tube.m_0, z_0)
+        atoms = qp_kernels.atom_range(self.W_known, self.W_f, z_0, *inputs)
+        parts = constant, self.M_t, *inputs, atoms, self.scale, ROW_TIGHTENING, *self._fixed_rows
+        count, A, b = qp_kernels.presolved_rows(rows.gradient, rows.spread, rows.bound, z_0, *parts)
         if count < 0:
             return None
-        first = np.zeros(self.free)
-        first[:m] = z_0[-m:]
-        first = first[self.limited]
         g = np.zeros(len(self.h))
         g[:m] = -proposal / self.scale[:m]
-        fixed = np.concatenate([-offset, offset, self.box, self.slew + first, self.slew - first]) / self.length
-        return QuadraticProgram(
-            self.h, g, np.vstack([A[:count], self.fixed]), np.concatenate([b[:count], fixed]), len(fixed)
-        )
+        return QuadraticProgram(self.h, g, A[:count], b[:count], len(self.fixed))
 
     def reachable(self, before: Array) -> tuple[Array, Array]:
         """Return center and half-widths (F·m,) of the free inputs within bounds and slew after `before` (m,)."""
-        return halfspace_kernels.reachable(self.low, self.high, self.change, before)
+        return qp_kernels.reachable(self.low, self.high, self.change, before)
 
     def inputs(self, x: Array) -> Array:
         """Return the free inputs (F·m,) of a solution x."""

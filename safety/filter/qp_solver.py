@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from proxsuite import proxqp
 
-from brakeline.safety.filter.kernels.active_set_kernels import exact_solution, hildreth_active_set
+from brakeline.safety.filter.kernels.active_set_kernels import carrying_rows, exact_solution, likely_rows
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -20,15 +20,29 @@ SOLVED = "solved"
 MOST_ITERATIONS = 100
 MOST_INNER_ITERATIONS = 50
 INFEASIBLE_ROWS = "primal_infeasible"
-# Only a few rows are active in a solution, so the solver first gets the rows of a quick guess (`hildreth_active_set`).
-# Its answer, also to all rows, is off by up to 0.03 of an input's range where rows are nearly parallel. From the rows
-# that carry it, a few steps of an active-set method find the exact solution of all rows, or that there is none. They
-# also correct the verdict that few rows are infeasible (13 of 9,727 were feasible). If they find neither, the solver
-# gets all rows; it takes up to 30 ms to find that there is no solution. The rows have unit length, so small problems
-# need no preconditioner, and a firm penalty (`FIRMNESS`) makes them converge sooner.
+# Only a few rows are active in a solution, so the solver first gets the rows of a quick guess (`likely_rows`). Its
+# answer, also to all rows, is off by up to 0.03 of an input's range where rows are nearly parallel. From the rows that
+# carry it, a few steps of an active-set method find the exact solution of all rows, or that there is none. They also
+# correct the verdict that few rows are infeasible (13 of 9,727 were feasible). So a rough answer to few rows is enough
+# (`ROUGH`). If the method finds neither, the solver gets all rows; it takes up to 30 ms to find that there is no
+# solution. The rows have unit length, so small problems need no preconditioner, and a firm penalty (`FIRMNESS`) makes
+# them converge sooner.
 STEPS, SOON = 20, 30  # STEPS: of the ascent; SOON: iterations
-EXACT, FIRMNESS = 1e-7, 1e-2
+ROUGH, FIRMNESS = 1e-3, 1e-2
 CARRIES = 1e-7  # least multiplier of a row that carries an answer
+
+
+def _settings(accuracy: float, iterations: int) -> proxqp.Settings:
+    settings = proxqp.Settings()
+    settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS
+    settings.eps_abs, settings.eps_rel = accuracy, 0.0
+    settings.eps_primal_inf = settings.eps_dual_inf = NOT_INFEASIBLE
+    settings.max_iter, settings.max_iter_in = iterations, MOST_INNER_ITERATIONS
+    settings.verbose = False
+    return settings
+
+
+OF_FEW_ROWS, OF_ALL_ROWS = _settings(ROUGH, SOON), _settings(ACCURACY, MOST_ITERATIONS)
 
 
 @dataclass(frozen=True)
@@ -46,16 +60,17 @@ class QuadraticProgram:
 
 @dataclass(frozen=True)
 class Solution:
-    """x (n,), the solver's status, its iterations, and the recomputed residual of the rows (positive: violated).
+    """x (n,), the solver's status, and its iterations.
 
     carrying: indices of the rows whose multipliers are above `CARRIES`, the largest first.
+    residual: by how much x violates the worst row, recomputed; negative if x violates none, infinite without an x.
     """
 
     x: Array
     status: str
     iterations: int
-    residual: float
     carrying: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    residual: float = np.inf
 
     @property
     def found(self) -> bool:
@@ -63,20 +78,21 @@ class Solution:
 
 
 NOTHING = np.array([np.nan])
-INFEASIBLE = Solution(NOTHING, "ruled out", 0, np.inf)  # of a program that need not be solved
+INFEASIBLE = Solution(NOTHING, "ruled out", 0)  # of a program that need not be solved
 
 
 def solve(program: QuadraticProgram) -> Solution:
     """Solve with a cold start: the answer depends on the problem alone, so a log can be replayed."""
-    inside = hildreth_active_set(program.h, program.g, program.A, program.b, STEPS)
-    inside[len(program.b) - program.always :] = True
-    few = _solved(QuadraticProgram(program.h, program.g, program.A[inside], program.b[inside]), few=True)
-    carrying = few.carrying[:0] if few.status == INFEASIBLE_ROWS else np.flatnonzero(inside)[few.carrying]
-    exact = _exact(program, few, carrying)
+    index, A, b = likely_rows(program.h, program.g, program.A, program.b, program.always, STEPS)
+    few = _solved(QuadraticProgram(program.h, program.g, A, b), index, few=True)
+    exact = _exact(program, few, few.carrying[:0] if few.status == INFEASIBLE_ROWS else few.carrying)
     if exact is None:
-        solution = _solved(program)
+        solution = _solved(program, np.arange(len(program.b)))
         exact = _exact(program, solution, solution.carrying) or solution
-    return exact
+    if not exact.found:
+        return exact
+    residual = float((program.A @ exact.x - program.b).max()) if len(program.b) else 0.0
+    return Solution(exact.x, exact.status, exact.iterations, exact.carrying, residual)
 
 
 def _exact(program: QuadraticProgram, solution: Solution, carrying: Index) -> Solution | None:
@@ -86,38 +102,25 @@ def _exact(program: QuadraticProgram, solution: Solution, carrying: Index) -> So
     """
     x, impossible = exact_solution(program.h, program.g, program.A, program.b, carrying)
     if np.isfinite(x).all():
-        residual = float((program.A @ x - program.b).max(initial=-np.inf))
-        return replace(solution, x=x, status=SOLVED, residual=residual, carrying=carrying)
+        return Solution(x, SOLVED, solution.iterations, carrying)
     if impossible or solution.status == INFEASIBLE_ROWS:
-        return replace(solution, x=NOTHING, status=INFEASIBLE_ROWS)
+        return Solution(NOTHING, INFEASIBLE_ROWS, solution.iterations, carrying)
     return None
 
 
-def _solved(program: QuadraticProgram, few: bool = False) -> Solution:
+def _solved(program: QuadraticProgram, index: Index, few: bool = False) -> Solution:
+    """Solve with ProxQP. index (rows,): the number of each row among all rows, for `Solution.carrying`."""
     rows, n = program.A.shape
     qp = proxqp.dense.QP(n, 0, rows)
-    settings = qp.settings
-    settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS
-    settings.eps_abs = EXACT if few else ACCURACY
-    settings.eps_rel = 0.0
-    settings.eps_primal_inf = NOT_INFEASIBLE
-    settings.eps_dual_inf = NOT_INFEASIBLE
-    settings.max_iter = SOON if few else MOST_ITERATIONS
-    settings.max_iter_in = MOST_INNER_ITERATIONS
-    settings.verbose = False
     parts = np.diag(program.h), program.g, None, None, program.A, None, program.b
     if few:
-        # By its residuals alone one answer in seventy was off by more than a thousandth of an input's range.
-        settings.check_duality_gap = True
-        settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = EXACT, 0.0
+        qp.settings = OF_FEW_ROWS
         qp.init(*parts, compute_preconditioner=False, mu_in=FIRMNESS)
     else:
+        qp.settings = OF_ALL_ROWS
         qp.init(*parts)
     qp.solve()
-    x = np.array(qp.results.x)
-    status = str(qp.results.info.status).rsplit(".", maxsplit=1)[-1].removeprefix("PROXQP_").lower()
-    residual = float((program.A @ x - program.b).max()) if rows else 0.0
-    multipliers = np.array(qp.results.z)
-    order = np.argsort(-multipliers, kind="stable")
-    carrying = order[multipliers[order] > CARRIES]
-    return Solution(x, status, int(qp.results.info.iter), residual, carrying)
+    results = qp.results
+    x, status = np.array(results.x), results.info.status.name.removeprefix("PROXQP_").lower()
+    carrying = carrying_rows(np.array(results.z), index, CARRIES)
+    return Solution(x, status, int(results.info.iter), carrying)

@@ -37,8 +37,33 @@ def least(slack, most):
     return np.append(slack, most).min()  # NaN if one value is
 
 
-def presolve_rows(gradient, spread, bound, z_0, constant, M, center, radius, atoms, scale, tightening):
-    """`halfspace_kernels.presolve_rows`."""
+def row_slack(gradient, spread, bound, z, sizes):
+    """`qp_kernels.row_slack`."""
+    return bound - gradient @ z - spread @ sizes
+
+
+def tightened(gradient, spread, bound, kept_off, too_near, translating, stay, room):
+    """`qp_kernels.tightened`."""
+    closer = gradient[too_near] * translating
+    slopes, spreads = np.vstack([gradient, closer]), np.vstack([spread, 0.0 * spread[too_near]])
+    return slopes, spreads, np.concatenate([np.where(too_near, bound, bound - kept_off), closer @ stay + room])
+
+
+def known_magnitudes(W_c, M_c, m_0, z_0):
+    """`qp_kernels.known_magnitudes`."""
+    return m_0 + M_c @ np.abs(W_c @ z_0)
+
+
+def atom_range(W_known, W_f, z_0, center, radius):
+    """`qp_kernels.atom_range`."""
+    atom, deviation = np.abs(W_known @ z_0 + W_f @ center), np.abs(W_f) @ radius
+    return np.stack([np.maximum(atom - deviation, 0.0), atom + deviation])
+
+
+def presolved_rows(
+    gradient, spread, bound, z_0, constant, M, center, radius, atoms, scale, tightening, fixed, fixed_bound, fixed_slope
+):
+    """`qp_kernels.presolved_rows`."""
     f, t = gradient[:, len(z_0) :], spread @ M
     bound = bound - tightening - gradient[:, : len(z_0)] @ z_0 - spread @ constant
     least = f @ center - np.abs(f) @ radius + t @ atoms[0]
@@ -48,11 +73,12 @@ def presolve_rows(gradient, spread, bound, z_0, constant, M, center, radius, ato
     if (least > bound).any():
         return -1, A[:0], bound[:0]
     chosen = most > bound
-    return int(chosen.sum()), A[chosen] / length[chosen, None], (bound / length)[chosen]
+    A, b = np.vstack([A[chosen] / length[chosen, None], fixed]), (bound / length)[chosen]
+    return len(A), A, np.concatenate([b, fixed_bound + fixed_slope @ z_0])
 
 
 def reachable(low, high, change, before):
-    """`halfspace_kernels.reachable`."""
+    """`qp_kernels.reachable`."""
     least, most = np.maximum(before - change, low), np.minimum(before + change, high)
     return 0.5 * (least + most).ravel(), 0.5 * (most - least).ravel()
 
@@ -120,6 +146,19 @@ def hildreth_active_set(h, g, A, b, steps):
         multipliers[best] += step[best]
         x = x - step[best] * A[best] / h
     return chosen
+
+
+def likely_rows(h, g, A, b, always, steps):
+    """`active_set_kernels.likely_rows`."""
+    index = np.flatnonzero(hildreth_active_set(h, g, A, b, steps) | (np.arange(len(b)) >= len(b) - always))
+    return index, A[index], b[index]
+
+
+def carrying_rows(multiplier, index, least):
+    """`active_set_kernels.carrying_rows`."""
+    return np.array(
+        [index[i] for i in sorted(range(len(index)), key=lambda i: -multiplier[i]) if multiplier[i] > least]
+    )
 
 
 def exact_solution(h, g, A, b, guess):

@@ -10,6 +10,7 @@ from brakeline.safety.filter import plan_inputs
 from brakeline.safety.filter.kernels import (
     active_set_kernels,
     halfspace_kernels,
+    qp_kernels,
     rollout_kernels,
     shape_kernels,
     tube_kernels,
@@ -24,6 +25,7 @@ N, L, Q, NZ, FREE = 4, 5, 6, 7, 3  # periods, generators, rows of W, regressors,
 MAGNITUDES = L + N + 1
 MODULES = (
     halfspace_kernels,
+    qp_kernels,
     tube_kernels,
     active_set_kernels,
     plan_inputs,
@@ -69,7 +71,8 @@ def presolve_arguments(rng, room):
     M, atoms = rng.random((MAGNITUDES, Q)), np.sort(rng.random((2, Q)), axis=0)
     known = rng.normal(size=NZ - FREE), rng.random(MAGNITUDES)
     inputs = rng.normal(size=FREE), rng.random(FREE)
-    return gradient, spread, bound, *known, M, *inputs, atoms, rng.uniform(0.5, 2.0, FREE + Q), 1e-6
+    fixed = rng.normal(size=(4, FREE + Q)), rng.normal(size=4), rng.normal(size=(4, NZ - FREE))
+    return gradient, spread, bound, *known, M, *inputs, atoms, rng.uniform(0.5, 2.0, FREE + Q), 1e-6, *fixed
 
 
 def shapes(rng, d):
@@ -97,12 +100,18 @@ def cases(rng, d):
     step = rng.normal(size=(9, NZ)), W_t, M_t[:, :9], rng.random((NZ, 9)), m_0[:9], rng.random((9, 9))
     predictor, leverage = rollout_parts(rng, d), (np.tril(rng.normal(size=(12, 12))), rng.uniform(0.0, 3.0))
     plan = 0.5 * rng.normal(size=6), rng.normal(size=(2 + 2 + 2 * N, 6)) / 3.0
+    presolve = presolve_arguments(rng, rng.uniform(0.0, 12.0))
+    rows = presolve[:3]
     near, path = shapes(rng, d), np.vstack([np.zeros(d), np.cumsum(0.3 * rng.normal(size=(N, d)), axis=0)])
     return {
         "rows": (*parts, MAGNITUDES, widening),
         "slack": (*parts, rng.random(MAGNITUDES), z),
         "least": (rng.normal(size=30), 0.5),
-        "presolve_rows": presolve_arguments(rng, rng.uniform(0.0, 12.0)),
+        "row_slack": (*rows, z, rng.random(MAGNITUDES)),
+        "tightened": (*rows, rng.random(20), rng.random(20) < 0.4, rng.random(NZ) < 0.5, z, 1e-6),
+        "known_magnitudes": (W_t.T[:, FREE:], M_t.T, m_0, z[FREE:]),
+        "atom_range": (W_t.T[:, FREE:], W_t.T[:, :FREE], z[FREE:], rng.normal(size=FREE), rng.random(FREE)),
+        "presolved_rows": presolve,
         "reachable": (low, high, np.arange(1.0, 4.0)[:, None] * slew, before),
         "filled_by_plans": (
             *(W_t.T, plans[0], M_t.T, m_0, position, offset, *plans[1:], widening),
@@ -133,6 +142,8 @@ def cases(rng, d):
         "roomiest_planes": (rng.normal(size=(6, 2 * N + 1, d)), rng.normal(size=(6, 2 * N + 1)) + 1.0, path),
         "planes_beside": (*near.parts, near.margin, start, start + path[1:], 0.1, measured),
         "hildreth_active_set": (h, g, A, b, 20),
+        "likely_rows": (h, g, A, b, 4, 20),
+        "carrying_rows": (rng.choice([-1.0, 0.0, 0.5, 0.5, 2.0], 12), rng.permutation(30)[:12], 1e-7),
         "exact_solution": (h, g, A, b + rng.choice([0.0, 1.0]), rng.permutation(30)[:8]),
         "clip_to_bounds": (rng.normal(size=2), before, low, high, slew),
         "regressors_of_braking": (z, rng.random((3, 2)), rng.normal(size=2)),
@@ -152,7 +163,7 @@ def test_each_kernel_gives_what_its_plain_twin_gives(seed, d):
     for name, values in cases(np.random.default_rng(seed), d).items():
         arguments = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) and x.ndim else x for x in values]
         ours, plain = kernels[name](*arguments), getattr(kernel_twins, name)(*arguments)
-        if name == "presolve_rows":
+        if name == "presolved_rows":
             count = ours[0]
             ours = count, ours[1][: max(count, 0)], ours[2][: max(count, 0)]
         ours, plain = (value if isinstance(value, tuple) else (value,) for value in (ours, plain))
@@ -162,8 +173,8 @@ def test_each_kernel_gives_what_its_plain_twin_gives(seed, d):
 
 
 def test_the_presolve_cases_have_rows_that_rule_out_and_rows_that_are_left():
-    counts = {kernel_twins.presolve_rows(*cases(np.random.default_rng(s), 2)["presolve_rows"])[0] for s in range(40)}
-    assert -1 in counts and 0 < max(counts) <= 20
+    counts = {kernel_twins.presolved_rows(*cases(np.random.default_rng(s), 2)["presolved_rows"])[0] for s in range(40)}
+    assert -1 in counts and 4 < max(counts) <= 24
 
 
 def test_a_value_that_is_not_a_number_is_never_the_least():

@@ -1,6 +1,6 @@
 """The QPs of a batch (docs/method.md §4): rows at linearised plans, presolve, solution; the batch is last.
 
-The twin of `QPBuilder` and `halfspace_kernels.presolve_rows`. Its answers are candidates, as any solver's.
+The twin of `QPBuilder` and `qp_kernels.presolved_rows`. Its answers are candidates, as any solver's.
 """
 
 from __future__ import annotations

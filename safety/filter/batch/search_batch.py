@@ -75,7 +75,7 @@ class SearchBatch:
         self._slew, self._nothing = constant(inputs.slew[:, None]), constant(inputs.nothing[:, None])
         self._braking = constant(inputs.braking.reshape(-1, 1))
         self._standing = constant(safety.standing[:, None].astype(float)) > 0.5
-        self._translating = constant(safety.translating[self.known :, None, None])
+        self._translating = constant(safety.translating[self.known :, None, None].astype(float))
         self._repeats = len(inputs.braking)
 
     # --- inputs and regressors -------------------------------------------------------------------------------------

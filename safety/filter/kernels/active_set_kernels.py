@@ -52,6 +52,24 @@ def hildreth_active_set(h: Array, g: Array, A: Array, b: Array, steps: int) -> N
     return chosen
 
 
+@compiled("Tuple((i8[::1], f8[:,::1], f8[::1]))(f8[::1], f8[::1], f8[:,::1], f8[::1], i8, i8)")
+def likely_rows(
+    h: Array, g: Array, A: Array, b: Array, always: int, steps: int
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the indices (k,), A (k, n) and b (k,) of the rows of `hildreth_active_set` and of the last `always`."""
+    chosen = hildreth_active_set(h, g, A, b, steps)
+    chosen[len(b) - always :] = True
+    index = np.flatnonzero(chosen)
+    return index, A[index], b[index]
+
+
+@compiled("i8[::1](f8[::1], i8[::1], f8)")
+def carrying_rows(multiplier: Array, index: NDArray[np.int64], least: float) -> NDArray[np.int64]:
+    """Return the indices of the rows with multipliers (k,) above `least`, the largest first."""
+    order = np.argsort(-multiplier, kind="mergesort")
+    return index[order[multiplier[order] > least]]
+
+
 @compiled("i8(i8[::1], f8[::1], i8, i8)")
 def _without(active: NDArray[np.int64], multiplier: Array, count: int, which: int) -> int:
     """Remove one of the active rows, with its multiplier; return how many are left."""
