@@ -170,8 +170,7 @@ class Dataset:
         """Write a safetensors file with the concatenated trajectories and their lengths."""
         names = ("states", "inputs", "paths", "turned")
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
-        still = np.zeros(self.robot.action_dim)
-        tensors["before"] = np.array([still if t.before is None else t.before for t in self.trajectories])
+        tensors["before"] = np.array([self._before(t) for t in self.trajectories])
         if all(t.headings is not None for t in self.trajectories):
             tensors["headings"] = np.concatenate([t.headings for t in self.trajectories])
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
@@ -253,16 +252,20 @@ class Dataset:
         except (OSError, ValueError, TypeError):
             return {}
 
+    def _before(self, t: Trajectory) -> Array:
+        """Return the input in force (m,) at the start of a trajectory; zero of a robot that stood still."""
+        return np.zeros(self.robot.action_dim) if t.before is None else t.before
+
     def digest(self) -> str:
-        """Return a hash of the recorded numbers, 12 hexadecimal digits."""
+        """Return a hash of the recorded numbers, 12 hexadecimal digits: the same after `save` and `load`."""
         sha = hashlib.sha256()
         for t in self.trajectories:
             sha.update(t.states.tobytes())
             sha.update(t.inputs.tobytes())
             sha.update(t.paths.tobytes())
             sha.update(t.turned.tobytes())
-            for part in (t.before, t.headings):
-                sha.update(b"" if part is None else part.tobytes())
+            sha.update(self._before(t).tobytes())
+            sha.update(b"" if t.headings is None else t.headings.tobytes())
         return sha.hexdigest()[:12]
 
 

@@ -52,7 +52,7 @@ def test_a_saved_data_set_is_loaded_unchanged(small, tmp_path):
     moving.save(path)
     again = Dataset.load(path)
     again.save(str(tmp_path / "named"))
-    assert Dataset.load(str(tmp_path / "named")).digest() == again.digest()
+    assert Dataset.load(str(tmp_path / "named")).digest() == again.digest() == moving.digest()
     assert again.about == small.about and again.periods == 240
     for one, other in zip(moving.trajectories, again.trajectories, strict=True):
         for name in ("states", "inputs", "paths", "turned"):
