@@ -73,20 +73,20 @@ class Containment:
     def figures(self, model: ModelSet, kind: str = "") -> dict[str, float]:
         """Return the shares [%] beside the stated bounds, and what the counts show with confidence.
 
-        kind: the kind of driving whose row states the bound of plans; by default that of all driving.
+        kind: the kind of driving whose row states the bounds; by default those of all driving.
         """
-        stated = float(model.about[f"bound_plan {kind}".strip()])
+        plan, step = (float(model.about[f"bound_{part} {kind}".strip()]) for part in ("plan", "step"))
         return {
             "plans": self.plans,
             "plans outside": self.plans_outside,
             "plans [%]": 100.0 * self.plans_outside / max(self.plans, 1),
             "plans, at least [%]": 100.0 * lower_bound(self.plans_outside, self.plans),
-            "plans, stated at most [%]": 100.0 * stated,
+            "plans, stated at most [%]": 100.0 * plan,
             "steps": self.steps,
             "steps outside": self.steps_outside,
             "steps [%]": 100.0 * self.steps_outside / max(self.steps, 1),
             "steps, at least [%]": 100.0 * lower_bound(self.steps_outside, self.steps),
-            "steps, stated at most [%]": 100.0 * float(model.about["bound_step"]),
+            "steps, stated at most [%]": 100.0 * step,
             "largest error [% of its set]": 100.0 * self.largest,
         }
 

@@ -95,7 +95,8 @@ def reached(robot: RobotWithTask, snapshots: list[Snapshot]) -> dict[str, float]
 
 def goals(robot: RobotWithTask, policy: MLP) -> float:
     """Return the share of fresh episodes in which a policy behind the filter reaches the goal."""
-    env = BatchSafetyWrapper(BatchNavigationEnv(robot, EPISODES, seed_key=FRESH), Filter.load(robot.name))
+    episodes = BatchNavigationEnv(robot, EPISODES, seed_key=FRESH)
+    env = BatchSafetyWrapper(episodes, Filter.load(robot.name), turn_aside=robot.task.turn_aside)
     observations, _ = env.reset(options={"episode_seeds": np.arange(EPISODES)})
     done, reached = np.zeros((2, EPISODES), dtype=bool)
     for _ in range(robot.task.arenas["default"].step_limit):

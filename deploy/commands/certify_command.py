@@ -277,13 +277,13 @@ def group_table(report: ValidationReport) -> StackingTable:
     """Return the statement of a validation report by kind of driving (docs/method.md §14)."""
     table = StackingTable(title="by kind of driving")
     table.add_column("driving")
-    for column in ("windows", "plans", "violations", "on average", "≤ per plan", "largest error"):
+    for column in ("windows", "plans", "violations", "on average", "≤ per plan", "≤ per step", "largest error"):
         table.add_column(column, justify="right")
     for group in report.groups:
         counts = str(group.windows), str(group.plans), str(group.violations)
-        shares = f"{group.marginal:.2%}", percent(group.bound), f"{group.excess:.0%} of its set"
-        table.add_row(group.name, *counts, *shares)
-    table.caption = "windows may overlap, plans do not; bounds at 99 % confidence"
+        shares = f"{group.marginal:.2%}", percent(group.bound), percent(group.bound_step)
+        table.add_row(group.name, *counts, *shares, f"{group.excess:.0%} of its set")
+    table.caption = "windows may overlap, plans and steps do not; bounds at 99 % confidence"
     return table
 
 

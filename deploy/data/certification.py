@@ -84,6 +84,7 @@ def _stated(model: ModelSet, report: ValidationReport, data: Dataset) -> ModelSe
     figures = {name: getattr(report, name) for name in ("bound_step", "bound_plan", "bound_episode", "outside_hour")}
     about = {name: f"{value:.6g}" for name, value in figures.items()}
     about |= {f"bound_plan {group.name}": f"{group.bound:.6g}" for group in report.groups}
+    about |= {f"bound_step {group.name}": f"{group.bound_step:.6g}" for group in report.groups}
     about |= {"windows": str(report.windows), "violations": str(report.violations)}
     about |= {"minutes": f"{data.periods * data.robot.period / 60.0:.6g}", "inflation": f"{report.inflation:.6g}"}
     return replace(model, about=model.about | about)

@@ -61,6 +61,8 @@ class GroupStatement:
         marginal: expected share of new windows outside.
         bound: the largest share of plans outside, at 99 % confidence.
         excess: the largest ratio of an error to its bound.
+        step_violations: number of `windows` whose first step was outside.
+        bound_step: the largest share of steps outside, at 99 % confidence.
     """
 
     name: str
@@ -70,6 +72,8 @@ class GroupStatement:
     marginal: float
     bound: float
     excess: float
+    step_violations: int
+    bound_step: float
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,8 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
     robot, s, ready = model.robot, calibration.samples, Filter(model)
     apart = non_overlapping_starts(s.start, robot.horizon)
     plans, steps = int(apart.sum()), len(s.z)
-    outside, steps_outside = calibration.scores > 1.0, int((calibration.first_scores > 1.0).sum())
+    outside, first_outside = calibration.scores > 1.0, calibration.first_scores > 1.0
+    steps_outside = int(first_outside.sum())
     bound_step = upper_bound(steps_outside, steps)
     return ValidationReport(
         certificate=model.model_config.certificate,
@@ -280,6 +285,8 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
                 _marginal(outside[kind]),
                 upper_bound(int((kind & apart & outside).sum()), int((kind & apart).sum())),
                 float(calibration.scores[kind].max(initial=0.0)),
+                int((kind & first_outside).sum()),
+                upper_bound(int((kind & first_outside).sum()), int(kind.sum())),
             )
             for name, kind in driving_kinds(robot, s.z, s.start).items()
             if kind.any()

@@ -17,7 +17,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.dataset import Dataset, Trajectory
-from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, START
+from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, START, driving_kinds
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.one_step_fitting import fit_one_step, samples_of
@@ -88,6 +88,11 @@ def test_the_stated_shares_hold_on_fresh_driving_overall_and_in_every_kind_of_dr
     assert first.mean() < report.bound_step
     assert report.violations == 0 and report.marginal < 0.01
     assert {START, RESTLESS, "standing", "fast and turning"} <= {group.name for group in report.groups}
+    kinds = driving_kinds(ROBOT, fresh.z, fresh.start)
+    for group in report.groups:
+        one = kinds[group.name]
+        assert outside[one].mean() <= group.bound and first[one].mean() <= group.bound_step, group.name
+        assert group.bound_step >= report.bound_step, "from fewer steps"
 
 
 def test_a_verified_plans_tube_is_about_the_rollout_of_its_inputs():

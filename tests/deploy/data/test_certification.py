@@ -91,7 +91,8 @@ def test_with_few_violations_more_of_the_same_helps_and_within_the_limit_nothing
 
 def test_few_cruises_are_missing_from_the_data_of_a_policy_that_will_cruise(held, data):
     groups = tuple(
-        GroupStatement(name, 9 * n, n, 0, 0.0, 1.0, 1.0) for name, n in (("speed at its bound", 44), ("fast", 90))
+        GroupStatement(name, 9 * n, n, 0, 0.0, 1.0, 1.0, 0, 1.0)
+        for name, n in (("speed at its bound", 44), ("fast", 90))
     )
     loose = replace(data, robot=replace(GROUND, accept_bound=0.9))
     (line,) = recording_advice(replace(held, mode="one-step", groups=groups), loose)
