@@ -18,6 +18,7 @@ from brakeline.actors.mavlink.position_lookahead import MASK, PARAMETERS, Positi
 from brakeline.actors.mavlink.telemetry import ESTIMATORS, SOURCES, Array
 from brakeline.errors import CommandRefused, MavlinkError, NoAutopilot, TelemetryMissing
 
+HEARTBEAT_INTERVAL = 1.0  # s between two of our heartbeats, as autopilots expect
 VELOCITY_ONLY = 0x0DC7  # type mask: ignore position, acceleration, yaw and yaw rate
 REPLY_TIMEOUT = 0.5  # s for a reply, before the message is sent again
 COMMAND_ATTEMPTS = 5
@@ -111,7 +112,7 @@ class AutopilotClient(MavlinkDecoder):
         self._mav.timesync_send(0, now)
 
     def heartbeat(self) -> None:
-        """Send our heartbeat; autopilots expect one a second."""
+        """Send our heartbeat; an autopilot expects one every `HEARTBEAT_INTERVAL`."""
         self._mav.heartbeat_send(
             mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
+from brakeline.actors.mavlink.autopilot_commands import HEARTBEAT_INTERVAL, AutopilotClient
 from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
@@ -301,7 +301,7 @@ class MavlinkVehicle(PeriodicVehicle):
             client.ask_time(time.monotonic_ns())
         if self._truth is not None:
             self._truth.poll()
-        if now - self._heartbeat_at >= 1.0:
+        if now - self._heartbeat_at >= HEARTBEAT_INTERVAL:
             self._heartbeat_at = now
             client.heartbeat()
         if self._velocity is not None and now - self._sent_at >= RESEND:
