@@ -77,10 +77,14 @@ def empty_arena(robot: RobotWithTask, position: tuple[float, float] = (0.0, 0.0)
     return Arena("yard", room_boundary(size, height), start, goal, 0.25, 10**9, room_bounds(size, height))
 
 
+def empty_arena_at_random(robot: RobotWithTask, rng: np.random.Generator) -> Arena:
+    """Return an empty arena; in the plane, the start has a random heading."""
+    return empty_arena(robot, heading=float(rng.uniform(-np.pi, np.pi)) if robot.position_dim == 2 else 0.0)
+
+
 def vehicle_in_empty_arena(robot: RobotWithTask, rng: np.random.Generator, conditions: Conditions) -> Vehicle:
     """Return a vehicle with nothing near it; in the plane with a random heading."""
-    heading = float(rng.uniform(-np.pi, np.pi)) if robot.position_dim == 2 else 0.0
-    return _maker(robot, conditions)(empty_arena(robot, heading=heading), rng)
+    return _maker(robot, conditions)(empty_arena_at_random(robot, rng), rng)
 
 
 _maker = lru_cache(maxsize=1)(simulated_vehicle)  # the same one for all trajectories: a real autopilot starts once

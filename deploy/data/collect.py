@@ -3,19 +3,47 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import os
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.recording_origin import origin
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
-from brakeline.deploy.vehicle_factory import vehicle_in_empty_arena
+from brakeline.deploy.vehicle_factory import empty_arena_at_random, vehicle_in_empty_arena
+from brakeline.errors import NoBatch
+from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
 PERIODS, RESTLESS_PERIODS = 300, 120  # per trajectory; the restless ones are short, so there are many starts
+AT_ONCE = 50  # trajectories that a batch records
+THREADS = min(8, os.cpu_count() or 1)  # for the physics of a batch
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """A trajectory to record: its number, its random generator, and whether the robot drives restlessly."""
+
+    number: int
+    rng: np.random.Generator
+    restless: bool
+
+    @property
+    def periods(self) -> int:
+        return RESTLESS_PERIODS if self.restless else PERIODS
+
+    def inputs(self, robot: RobotWithTask) -> Generator[Array, Array | None, None]:
+        return restless_excitation(robot, self.rng) if self.restless else excitation(robot, self.rng)
+
+    def check(self, collision: bool) -> None:
+        if collision:
+            raise RuntimeError(
+                f"trajectory {self.number} touched something: the recording yard is too small for the robot"
+            )
 
 
 def record(
@@ -24,25 +52,61 @@ def record(
     """Yield trajectories from the robot's simulator, and after them `restless` short ones of restless driving.
 
     Each one begins at rest and has its own random generator, seeded with (seed, number). Therefore a recording that
-    was interrupted can continue and give the same data: `first` trajectories exist already.
+    was interrupted can continue and give the same data: `first` trajectories exist already. Many robots at once, where
+    a batch simulates them, give what one after the other gives, up to rounding.
 
     Raises:
         RuntimeError: the robot touched something.
     """
-    for number in range(first, trajectories + restless):
-        steady = number < trajectories
-        rng = np.random.default_rng((seed, number) if steady else (seed, number - trajectories, 1))
-        vehicle = vehicle_in_empty_arena(robot, rng, conditions)
-        built = TrajectoryBuilder(vehicle.measured)
-        inputs = excitation(robot, rng) if steady else restless_excitation(robot, rng)
-        for u in itertools.islice(inputs, PERIODS if steady else RESTLESS_PERIODS):
-            period = vehicle.step(u)
-            if period.collision:
-                raise RuntimeError(
-                    f"trajectory {number} touched something: the recording yard is too small for the robot"
-                )
-            built.add(vehicle.input, period.measured, period.subsamples, period.turned)
-        yield built.trajectory()
+    from brakeline.sim.batch.batch_factory import check_vehicles  # brings the simulators
+
+    keys = [(seed, k) for k in range(trajectories)] + [(seed, k, 1) for k in range(restless)]
+    recipes = [_Recipe(k, np.random.default_rng(keys[k]), k >= trajectories) for k in range(first, len(keys))]
+    try:
+        check_vehicles(robot, conditions)
+    except NoBatch:
+        yield from (_recorded(robot, recipe, conditions) for recipe in recipes)
+        return
+    for k in range(0, len(recipes), AT_ONCE):
+        yield from _recorded_at_once(robot, recipes[k : k + AT_ONCE], conditions)
+
+
+def _recorded(robot: RobotWithTask, recipe: _Recipe, conditions: Conditions) -> Trajectory:
+    """Record one trajectory."""
+    vehicle = vehicle_in_empty_arena(robot, recipe.rng, conditions)
+    built = TrajectoryBuilder(vehicle.measured)
+    for u in itertools.islice(recipe.inputs(robot), recipe.periods):
+        period = vehicle.step(u)
+        recipe.check(period.collision)
+        built.add(vehicle.input, period.measured, period.subsamples, period.turned)
+    return built.trajectory()
+
+
+def _recorded_at_once(robot: RobotWithTask, recipes: Sequence[_Recipe], conditions: Conditions) -> list[Trajectory]:
+    """Record many trajectories at once."""
+    from brakeline.sim.batch.batch_factory import vehicle_batch
+    from brakeline.sim.batch.normal_streams import NormalStreams
+
+    streams = NormalStreams(len(recipes), ahead=False)  # each generator draws the inputs as well
+    kind = robot.task.arenas["default"]
+    robots = vehicle_batch(robot, len(recipes), kind, conditions, THREADS, streams)
+    for row, recipe in enumerate(recipes):
+        streams.begin(row, recipe.rng)
+    generators = [recipe.rng for recipe in recipes]
+    rows = np.arange(len(recipes))
+    robots.begin(rows, [empty_arena_at_random(robot, rng) for rng in generators], generators)
+    built = [TrajectoryBuilder(state.copy()) for state in robots.measured]
+    inputs = [recipe.inputs(robot) for recipe in recipes]
+    for k in range(max(recipe.periods for recipe in recipes)):
+        rows = np.array([row for row, recipe in enumerate(recipes) if k < recipe.periods])
+        robots.set_input(rows, np.array([next(inputs[row]) for row in rows.tolist()]))
+        period = robots.finish(rows, robots.advance(rows))
+        for i, row in enumerate(rows.tolist()):
+            recipes[row].check(bool(period.collision[i]))
+            executed = robots.input[row].copy()
+            built[row].add(executed, period.measured[i], period.subsamples[i], float(period.turned[i]))
+    robots.close()
+    return [one.trajectory() for one in built]
 
 
 def dataset(

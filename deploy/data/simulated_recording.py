@@ -17,7 +17,6 @@ from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-PACE = 0.25  # s per trajectory, on a core that other processes share
 SAVE_EVERY = 20.0  # s: a killed recording loses no more than this
 SEED = 20260
 RESTLESS_SHARE = 0.5  # restless trajectories, in addition, for each other one
@@ -69,10 +68,10 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
     restless = math.ceil(RESTLESS_SHARE * trajectories)
     total = trajectories + restless
     driven = _load_partial(part, robot, origin(robot, seed, conditions, restless))
-    before = f"{len(driven)} of them recorded before" if driven else _duration(PACE * trajectories)
+    before = f", {len(driven)} of them recorded before" if driven else ""
     console.print(
-        f"recording {robot.name} once, into {path}: {total} trajectories, {before}. You can interrupt it: the "
-        "next call continues.",
+        f"recording {robot.name} once, into {path}: {total} trajectories{before}. You can interrupt it: the next call "
+        "continues.",
         markup=False,
     )
     rest = collect.record(robot, trajectories, seed, conditions, len(driven), restless)
@@ -119,10 +118,6 @@ def _load_partial(part: Path, robot: Robot, about: dict[str, str]) -> list[Traje
     if partial.robot.layout() != robot.layout() or partial.about != about:
         return []
     return [replace(t, before=None) for t in partial.trajectories]  # each began at rest
-
-
-def _duration(seconds: float) -> str:
-    return f"about {seconds / 60.0:.0f} min" if seconds > 90.0 else f"about {10 * math.ceil(seconds / 10.0)} s"
 
 
 def data_for(robot: Robot) -> Dataset:

@@ -19,23 +19,16 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import arena_kind, draw_arena
-from brakeline.sim.batch.ground_batch import GroundBatch
+from brakeline.sim.batch.batch_factory import ADVICE, check_vehicles, vehicle_batch
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.observation_batch import GroundObservationBatch, ObservationBatch, QuadrotorObservationBatch
-from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
-from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
+from brakeline.sim.batch.vehicle_batch import PeriodBatch
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.ground_robot import GROUND
 from brakeline.sim.navigation_env import OBSERVED_LIMIT
-from brakeline.sim.quadrotor import QUADROTOR
 from brakeline.sim.sim_conditions import Conditions
 
-# The code of the tasks that batches simulate: simulator and observation.
-GROUND_CODES = "brakeline.sim.ground_robot:simulated", "brakeline.sim.observations:GroundObservation"
-QUADROTOR_CODES = (
-    "brakeline.deploy.quadrotor_vehicles:embedded",
-    "brakeline.sim.observations:QuadrotorObservation",
-)
+# The code of the observations of batches, by the robots' dimension.
+OBSERVED = {2: "brakeline.sim.observations:GroundObservation", 3: "brakeline.sim.observations:QuadrotorObservation"}
 
 Infos = dict[str, Any]
 Flags = NDArray[np.bool_]
@@ -108,11 +101,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         kind = arena_kind(self.robot, arena)
         self._streams = NormalStreams(num_envs)
         flies = self.robot.position_dim == 3
-        self._robots: VehicleBatch
-        if flies:
-            self._robots = QuadrotorBatch(num_envs, kind, self.conditions, self._streams)
-        else:
-            self._robots = GroundBatch(num_envs, kind, self.conditions, threads if threads > 1 else 0, self._streams)
+        self._robots = vehicle_batch(self.robot, num_envs, kind, self.conditions, threads, self._streams)
         observed = QuadrotorObservationBatch if flies else GroundObservationBatch
         self._observations: ObservationBatch = observed(
             num_envs, self.robot, self._robots.obstacles, self._streams, self.conditions.lidar_noise(flies)
@@ -283,15 +272,11 @@ def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> Non
         NoBatch: this robot, arena or perception can only be simulated one by one.
         UnknownName: the robot has no arena of this name.
     """
-    kind, advice = arena_kind(robot, arena), "use NavigationEnv, or train without --backend batch"
-    codes = robot.task.simulator, robot.task.senses
-    if (robot.layout(), codes) not in ((GROUND.layout(), GROUND_CODES), (QUADROTOR.layout(), QUADROTOR_CODES)):
-        raise NoBatch(f"{robot.name} with the task {robot.task.name} is not simulated in batches: {advice}")
+    kind = arena_kind(robot, arena)
+    check_vehicles(robot, conditions)
+    if robot.task.senses != OBSERVED[robot.position_dim]:
+        raise NoBatch(f"{robot.name} with the task {robot.task.name} is not observed in batches: {ADVICE}")
     if kind.movers is not None or kind.ring is not None:
-        raise NoBatch(f"the arena {arena} has moving obstacles or other robots, which no batch simulates: {advice}")
+        raise NoBatch(f"the arena {arena} has moving obstacles or other robots, which no batch simulates: {ADVICE}")
     if conditions.perception.kind != "map":
-        raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {advice}")
-    if robot.position_dim == 3 and not conditions.wind.calm:
-        raise NoBatch(f"a batch of quadrotors flies in calm air (--wind 0 --gust 0): {advice}")
-    if robot.position_dim == 3 and {"payload_kg", "weak_motor"} & {*conditions.unusual}:
-        raise NoBatch(f"a batch of quadrotors has no payload and no weak motors: {advice}")
+        raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {ADVICE}")

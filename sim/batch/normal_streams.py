@@ -16,13 +16,15 @@ DRAWN = 1024  # numbers that a generator draws at once
 class NormalStreams:
     """The normal numbers of N generators. A row gets the numbers that `cut_normal` would draw from its generator."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, ahead: bool = True) -> None:
+        """ahead: draw many numbers at once. Other code that draws from the generators too needs False."""
         self._generators: list[np.random.Generator | None] = [None] * count
+        self._ahead = ahead
         self._drawn = np.empty((count, DRAWN))
         self._next = np.full(count, DRAWN)
 
     def begin(self, row: int, generator: np.random.Generator) -> None:
-        """Use this generator from now on. No other code may draw from it."""
+        """Use this generator from now on."""
         self._generators[row] = generator
         self._next[row] = DRAWN
 
@@ -42,17 +44,20 @@ class NormalStreams:
     def _take(self, rows: Rows, wanted: NDArray[np.bool_]) -> Array:
         """Return the next numbers of each row, in the places (rows, size) that are wanted."""
         needed = wanted.sum(axis=1)
-        for row in rows[self._next[rows] + needed > DRAWN]:
-            self._refill(row)
+        short = self._next[rows] + needed > DRAWN
+        for row, count in zip(rows[short].tolist(), needed[short].tolist(), strict=True):
+            self._refill(row, count)
         places = self._next[rows, None] + np.cumsum(wanted, axis=1) - 1
         self._next[rows] += needed
         return np.asarray(self._drawn[rows[:, None], np.maximum(places, 0)])
 
-    def _refill(self, row: int) -> None:
-        """Move the unused numbers of a row to its start, and draw the others."""
+    def _refill(self, row: int, needed: int) -> None:
+        """Move the unused numbers of a row to the front, and draw others after them: so that `needed` are there."""
         generator = self._generators[row]
         assert generator is not None, "no episode has begun"
-        left = DRAWN - self._next[row]
-        self._drawn[row, :left] = self._drawn[row, self._next[row] :]
-        self._drawn[row, left:] = generator.standard_normal(DRAWN - left)
-        self._next[row] = 0
+        unused = DRAWN - self._next[row]
+        count = (DRAWN if self._ahead else needed) - unused
+        if unused:
+            self._drawn[row, DRAWN - count - unused : DRAWN - count] = self._drawn[row, self._next[row] :]
+        self._drawn[row, DRAWN - count :] = generator.standard_normal(count)
+        self._next[row] = DRAWN - count - unused

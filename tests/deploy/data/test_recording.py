@@ -14,7 +14,7 @@ from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
-from brakeline.errors import BadData, BadModel
+from brakeline.errors import BadData, BadModel, NoBatch
 from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import Dataset
@@ -22,7 +22,8 @@ from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kind
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import windows
-from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.batch import batch_factory
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.toys import car
@@ -95,6 +96,27 @@ def test_a_recording_ends_with_restless_starts_and_the_rest_of_it_stays_what_it_
     few = replace(data, trajectories=(*steady.trajectories[:8], *restless[:4]), about=data.about | {"restless": "4"})
     assert certify(few, ModelConfig())[0].version == certify(few.steady(), ModelConfig())[0].version
     assert few.steady().digest() != few.digest()
+
+
+@pytest.mark.parametrize(
+    ("robot", "conditions"),
+    [(GROUND, Conditions(NoiseLevels(scale=0.5), payload_kg=0.4)), (QUADROTOR, Conditions())],
+    ids=["ground", "quadrotor"],
+)
+def test_many_robots_at_once_record_what_one_after_the_other_records(robot, conditions, monkeypatch):
+    many = list(collect.record(robot, 2, 5, conditions, restless=1))
+    later = list(collect.record(robot, 2, 5, conditions, first=1, restless=1))
+
+    def refuse(robot, conditions):
+        raise NoBatch("one by one")
+
+    monkeypatch.setattr(batch_factory, "check_vehicles", refuse)
+    singles = list(collect.record(robot, 2, 5, conditions, restless=1))
+    assert [len(t.inputs) for t in many] == [300, 300, 120]
+    for one, other in zip([*many, *later], [*singles, *singles[1:]], strict=True):
+        assert (one.inputs == other.inputs).all() and one.before is other.before is None
+        for name in ("states", "paths", "turned"):
+            assert np.abs(getattr(one, name) - getattr(other, name)).max() < 1e-7, name
 
 
 @pytest.fixture
