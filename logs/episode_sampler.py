@@ -10,8 +10,9 @@ import heapq
 import json
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 
 from brakeline.logs.episode_stats import Figures, kind_of
 from brakeline.logs.episode_view import FEW_TUBES, MOST_TUBES, picture, rows, sketch
@@ -170,17 +171,18 @@ class EpisodeSampler:
         }
 
     def _ended(self, source: ActorBuffer, episode: EpisodeRecord) -> None:
-        """Select the episode if it belongs to one of the groups. Only then is its picture computed."""
+        """Select the episode if it belongs to one of the groups. Only then is its picture computed, once."""
         order, self._count = self._count, self._count + 1
+        pictured = cache(partial(self._picture, episode, order))
         episode.actor_exchanges = source.exchanges
         episode.other_exchanges = self._others(source, episode)
         self.last = replace(episode, actor_exchanges=list(source.exchanges))
         if math.isfinite(episode.closest):
-            self._push(self._nearest, -episode.closest, NEAREST, episode, order)
+            _push(self._nearest, -episode.closest, NEAREST, pictured, order)
         if episode.failsafes:
-            self._push(self._most_failsafes, episode.failsafes, MOST_FAILSAFES, episode, order)
+            _push(self._most_failsafes, episode.failsafes, MOST_FAILSAFES, pictured, order)
         if len(self._collisions) < COLLISIONS and episode.outcome() == "collision":
-            self._collisions.append(self._picture(episode, order))
+            self._collisions.append(pictured())
         if order % self._stride == 0:
             self._spread[order] = self._picture(episode, order, FEW_TUBES)
             if len(self._spread) > SPREAD:
@@ -189,7 +191,7 @@ class EpisodeSampler:
         if order % self._sketch_stride == 0:
             self._sketch(episode, order)
         if episode.number == self.wanted and self.actor in (None, episode.actor):
-            self.requested_episodes.append(self._picture(episode, order) | {"rows": list(rows(episode, self.robot))})
+            self.requested_episodes.append(pictured() | {"rows": list(rows(episode, self.robot))})
 
     def _sketch(self, episode: EpisodeRecord, order: int) -> None:
         """Keep the episode in short. Of too many, keep every second one."""
@@ -206,13 +208,15 @@ class EpisodeSampler:
         names = [] if own is None else [self.label + name for name in own.fleet if name != own.actor]
         return [e for name in names if name in self._sources for e in self._sources[name].exchanges]
 
-    def _push(
-        self, heap: list[tuple[float, int, Figures]], worth: float, most: int, episode: EpisodeRecord, order: int
-    ) -> None:
-        if len(heap) < most:
-            heapq.heappush(heap, (worth, -order, self._picture(episode, order)))
-        elif worth > heap[0][0]:
-            heapq.heapreplace(heap, (worth, -order, self._picture(episode, order)))
-
     def _picture(self, episode: EpisodeRecord, order: int, tubes: int = MOST_TUBES) -> Figures:
         return {"order": order, "until": episode.until, **picture(episode, self.robot, tubes)}
+
+
+def _push(
+    heap: list[tuple[float, int, Figures]], worth: float, most: int, pictured: Callable[[], Figures], order: int
+) -> None:
+    """Add an episode to those that are worth most, if it is one of them."""
+    if len(heap) < most:
+        heapq.heappush(heap, (worth, -order, pictured()))
+    elif worth > heap[0][0]:
+        heapq.heapreplace(heap, (worth, -order, pictured()))
