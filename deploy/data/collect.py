@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,24 +89,22 @@ def _recorded_at_once(robot: RobotWithTask, recipes: Sequence[_Recipe], conditio
     from brakeline.sim.batch.normal_streams import NormalStreams
 
     streams = NormalStreams(len(recipes), ahead=False)  # each generator draws the inputs as well
-    kind = robot.task.arenas["default"]
-    robots = vehicle_batch(robot, len(recipes), kind, conditions, THREADS, streams)
     for row, recipe in enumerate(recipes):
         streams.begin(row, recipe.rng)
-    generators = [recipe.rng for recipe in recipes]
-    rows = np.arange(len(recipes))
-    robots.begin(rows, [empty_arena_at_random(robot, rng) for rng in generators], generators)
-    built = [TrajectoryBuilder(state.copy()) for state in robots.measured]
-    inputs = [recipe.inputs(robot) for recipe in recipes]
-    for k in range(max(recipe.periods for recipe in recipes)):
-        rows = np.array([row for row, recipe in enumerate(recipes) if k < recipe.periods])
-        robots.set_input(rows, np.array([next(inputs[row]) for row in rows.tolist()]))
-        period = robots.finish(rows, robots.advance(rows))
-        for i, row in enumerate(rows.tolist()):
-            recipes[row].check(bool(period.collision[i]))
-            executed = robots.input[row].copy()
-            built[row].add(executed, period.measured[i], period.subsamples[i], float(period.turned[i]))
-    robots.close()
+    kind = robot.task.arenas["default"]
+    with closing(vehicle_batch(robot, len(recipes), kind, conditions, THREADS, streams)) as robots:
+        arenas = [empty_arena_at_random(robot, recipe.rng) for recipe in recipes]
+        robots.begin(np.arange(len(recipes)), arenas, [recipe.rng for recipe in recipes])
+        built = [TrajectoryBuilder(state.copy()) for state in robots.measured]
+        inputs = [recipe.inputs(robot) for recipe in recipes]
+        for k in range(max(recipe.periods for recipe in recipes)):
+            rows = np.array([row for row, recipe in enumerate(recipes) if k < recipe.periods])
+            robots.set_input(rows, np.array([next(inputs[row]) for row in rows.tolist()]))
+            period = robots.finish(rows, robots.advance(rows))
+            for i, row in enumerate(rows.tolist()):
+                recipes[row].check(bool(period.collision[i]))
+                executed = robots.input[row].copy()
+                built[row].add(executed, period.measured[i], period.subsamples[i], float(period.turned[i]))
     return [one.trajectory() for one in built]
 
 
