@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels
+from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels, tube_kernels
 from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
@@ -94,6 +94,7 @@ class QPBuilder:
         whole = np.ascontiguousarray
         W_t, self.M_t = tube.W[moving], whole(tube.M[:, moving])
         self.W_c, self.M_c = whole(tube.W[~moving][:, : self.known]), whole(tube.M[:, ~moving])
+        self._known_sizes = whole(self.W_c.T), whole(self.M_c.T), tube.m_0
         self.W_known, self.W_f = whole(W_t[:, : self.known]), whole(W_t[:, self.known :])
         self.abs_W_f = np.abs(self.W_f)
         atoms = len(W_t)
@@ -131,7 +132,7 @@ class QPBuilder:
         """
         m = self.robot.action_dim
         inputs = self.reachable(z_0[-m:])
-        constant = qp_kernels.known_magnitudes(self.W_c, self.M_c, self.tube.m_0, z_0)
+        constant = tube_kernels.magnitudes(*self._known_sizes, z_0)  # what no free input changes
         atoms = qp_kernels.atom_range(self.W_known, self.W_f, z_0, *inputs)
         parts = constant, self.M_t, *inputs, atoms, self.scale, ROW_TIGHTENING, *self._fixed_rows
         count, A, b = qp_kernels.presolved_rows(rows.gradient, rows.spread, rows.bound, z_0, *parts)

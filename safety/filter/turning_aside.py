@@ -9,7 +9,6 @@ searches for the input that is closest to the proposed speed with that turn. The
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,8 @@ def _turned_aside(search: PlanSearch, stopped: PlanCandidate, committed: Array) 
     if aside is None:
         return stopped
     search.record.reason += turns_aside_to(turn)
-    return replace(aside, kind=ADJUSTED, for_clearance=stopped.for_clearance)
+    aside.kind, aside.for_clearance = ADJUSTED, stopped.for_clearance
+    return aside
 
 
 def turns_aside_to(turn: float) -> str:

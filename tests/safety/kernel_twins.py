@@ -49,11 +49,6 @@ def tightened(gradient, spread, bound, kept_off, too_near, translating, stay, ro
     return slopes, spreads, np.concatenate([np.where(too_near, bound, bound - kept_off), closer @ stay + room])
 
 
-def known_magnitudes(W_c, M_c, m_0, z_0):
-    """`qp_kernels.known_magnitudes`."""
-    return m_0 + M_c @ np.abs(W_c @ z_0)
-
-
 def atom_range(W_known, W_f, z_0, center, radius):
     """`qp_kernels.atom_range`."""
     atom, deviation = np.abs(W_known @ z_0 + W_f @ center), np.abs(W_f) @ radius

@@ -109,7 +109,6 @@ def cases(rng, d):
         "least": (rng.normal(size=30), 0.5),
         "row_slack": (*rows, z, rng.random(MAGNITUDES)),
         "tightened": (*rows, rng.random(20), rng.random(20) < 0.4, rng.random(NZ) < 0.5, z, 1e-6),
-        "known_magnitudes": (W_t.T[:, FREE:], M_t.T, m_0, z[FREE:]),
         "atom_range": (W_t.T[:, FREE:], W_t.T[:, :FREE], z[FREE:], rng.normal(size=FREE), rng.random(FREE)),
         "presolved_rows": presolve,
         "reachable": (low, high, np.arange(1.0, 4.0)[:, None] * slew, before),

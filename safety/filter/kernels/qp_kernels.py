@@ -92,19 +92,6 @@ def reachable(low: Array, high: Array, change: Array, before: Array) -> tuple[Ar
     return center, radius
 
 
-@compiled("f8[::1](f8[:,::1], f8[:,::1], f8[::1], f8[::1])")
-def known_magnitudes(W_c: Array, M_c: Array, m_0: Array, z_0: Array) -> Array:
-    """Return `m_0 + M_c |W_c z_0|` (L+N+1,): the part of the magnitudes that no free input changes."""
-    sizes = m_0.copy()
-    for i in range(len(W_c)):
-        atom = 0.0
-        for j in range(len(z_0)):
-            atom += W_c[i, j] * z_0[j]
-        for k in range(len(sizes)):
-            sizes[k] += M_c[k, i] * abs(atom)
-    return sizes
-
-
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1])")
 def atom_range(W_known: Array, W_f: Array, z_0: Array, center: Array, radius: Array) -> Array:
     """Return the least and the largest |W z| (2, q) over all free inputs within `radius` of `center` (F·m,)."""
