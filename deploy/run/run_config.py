@@ -53,7 +53,7 @@ class RunConfig:
     arena: str = "default"
     """Drive in arenas of this name."""
     backend: Literal["processes", "batch"] = "processes"
-    """Simulate in actor processes, or all robots at once (batch: much faster)."""
+    """Simulate in actor processes, or all robots at once (batch: many more steps a second)."""
     actors: int = 2
     """Run this many actor processes for each robot kind. You may give 0 with --from-logs."""
     robots_per_actor: int = 1

@@ -17,7 +17,7 @@ class NormalStreams:
     """The normal numbers of N generators. A row gets the numbers that `cut_normal` would draw from its generator."""
 
     def __init__(self, count: int, ahead: bool = True) -> None:
-        """ahead: draw many numbers at once. Other code that draws from the generators too needs False."""
+        """ahead: draw many numbers at once. Give False if other code draws from the generators, too."""
         self._generators: list[np.random.Generator | None] = [None] * count
         self._ahead = ahead
         self._drawn = np.empty((count, DRAWN))
