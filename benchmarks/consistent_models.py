@@ -215,10 +215,10 @@ def feature_box(features: Features, v: Array, radius: Array) -> tuple[Array, Arr
     """
     ones, zeros = np.ones((len(v), 1)), np.zeros((len(v), 1))
     center, half = np.hstack([ones, v / features.scale]), np.hstack([zeros, radius / features.scale])
-    c, r = (np.moveaxis(p[:, features.terms], 2, 0) for p in (center, half))  # (3, T, F)
+    c, r = (np.moveaxis(p[:, features.terms], 2, 0) for p in (center, half))  # (4, T, F)
     linear = np.zeros((len(v), len(features.terms), center.shape[1]))
     sizes = np.zeros(c.shape[1:])
-    for slot in range(3):
+    for slot in range(features.terms.shape[1]):
         others = np.prod(np.delete(c, slot, axis=0), axis=0)
         linear[:, np.arange(len(features.terms)), features.terms[:, slot]] += r[slot] * others
         sizes += r[slot] * np.abs(others)

@@ -47,7 +47,7 @@ from brakeline.safety.model.error_bounds import MATRIX_ZONOTOPE
 from brakeline.safety.model.model_config import CBF, DIRECT, FREE, ONE_STEP, PLAN, RECURSION, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.one_step import features_for
-from brakeline.safety.model.one_step_fitting import choose, samples_of
+from brakeline.safety.model.one_step_fitting import Regression, choose, samples_of
 from brakeline.safety.model.windows import displacement, non_overlapping, plan_regressor_map, windows
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
@@ -188,11 +188,13 @@ def ours(recording: Recording, config: ModelConfig) -> tuple[dict[str, float | s
 
 
 def peer(recording: Recording, fit: Callable[[Array, Array, Array], Models]) -> dict[str, float | str]:
-    """Return the row of a set of models, with the monomials of the one-step form."""
+    """Return the row of a set of models, with monomials that are selected as for the one-step form."""
     robot = recording.data.robot
     s = samples_of(recording.data)
-    chosen = choose(robot, s)[0]
-    features = features_for(robot, s.v, chosen.degree, chosen.lags, saturating=False)
+    chosen = choose(robot, s)[0].candidate
+    all_features = features_for(robot, s.v, chosen.degree, chosen.lags)
+    monomials = np.flatnonzero((all_features.terms <= s.v.shape[1]).all(1))  # the peers' boxes have no others
+    features = Regression(robot, all_features.some(monomials), s).fit(chosen).features
     started = process_time()
     noise, phi = Noise.of(features, s), features(s.v)
     tubes = ModelTubes(robot, features, fit(phi, s.y, noise.sizes(s.v)), noise)

@@ -255,9 +255,9 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
     if s.chosen is not None and s.marginal is not None:
         lines += [
             f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap)",
-            f"  predictor: monomials up to degree {s.chosen.degree}, {s.chosen.lags} earlier input, "
-            + ("with" if s.chosen.saturating else "without")
-            + f" saturating features: {s.chosen.features} features; 99 % of "
+            f"  predictor: {s.chosen.features} features, selected from products of up to {s.chosen.degree} variables, "
+            + ("with" if s.chosen.lags else "without")
+            + " the earlier input; 99 % of "
             + ("positions" if s.unit == "m" else "the limits' values")
             + f" within {_error(s)}, out of fold",
         ]

@@ -103,17 +103,19 @@ def envelopes(features: Array, values: Array, inflation: float, typical: Array |
     Args:
         features (T, q), values (T, n): samples, none negative.
         inflation: factor on the bounds.
-        typical (q,): features for which the bounds are tightest; by default the samples' mean.
+        typical (q,) or (n, q): features for which the bounds are tightest; by default the samples' mean.
 
     Returns:
         κ (n, q) and w (n,).
     """
     if not len(values):
         raise ErrorBoundError("no sample to bound")
-    cost = np.append(features.mean(0) if typical is None else typical, 1.0)
+    tight_at = np.broadcast_to(features.mean(0) if typical is None else typical, (values.shape[1], features.shape[1]))
+    costs = np.column_stack([tight_at, np.ones(len(tight_at))])
     rows = np.column_stack([features, np.ones(len(features))])
     farthest = rows.argmax(0)
-    found = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v in values.T]) * inflation
+    each = zip(values.T, costs, strict=True)
+    found = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v, cost in each]) * inflation
     return found[:, :-1], found[:, -1]
 
 

@@ -23,17 +23,20 @@ Index = NDArray[np.int64]
 Predictor = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
 
 TENSOR = "one_step."  # prefix of the names in a file
+FACTORS = 4  # of a feature, at most
 WIDTHS = (0.2, 0.5)  # of saturating features, as shares of the largest recorded difference of input and speed
+SIGN = 0.05  # width of the smooth sign of a speed, as a share of the largest recorded speed
 
 
 @dataclass(frozen=True)
 class Features:
-    """The features φ of one period: products of up to three primitives (see `rollout_kernels`).
+    """The features φ of one period: products of up to four primitives (see `rollout_kernels`).
 
     Attributes:
         scale (v,): units of the variables v = [s; u; input of the period before].
-        saturations (E, 3): [a, b, width] of each primitive tanh((v_a - v_b) / width).
-        terms (F, 3): indices of the primitives in each product. Index 0 is the constant 1.
+        saturations (E, 3): [a, b, width] of each primitive tanh((v_a - v_b) / width), with b = -1 for no v_b.
+        terms (F, 4): indices of the primitives in each product. Index 0 is the constant 1. Files of before have
+            products of three (F, 3).
     """
 
     scale: Array
@@ -43,35 +46,50 @@ class Features:
     def __call__(self, v: Array) -> Array:
         """Return the features (T, F) of variables v (T, v)."""
         columns = [np.ones(len(v)), *(v / self.scale).T]
-        columns += [np.tanh((v[:, int(a)] - v[:, int(b)]) / width) for a, b, width in self.saturations]
-        p = np.stack(columns)
-        return np.asarray((p[self.terms[:, 0]] * p[self.terms[:, 1]] * p[self.terms[:, 2]]).T)
+        for a, b, width in self.saturations:
+            columns.append(np.tanh((v[:, int(a)] - (v[:, int(b)] if b >= 0 else 0.0)) / width))
+        p, (first, *others) = np.stack(columns), self.terms.T
+        products = p[first]
+        for factor in others:
+            products *= p[factor]
+        return np.asarray(products.T)
+
+    def some(self, used: Index) -> Features:
+        """Return these features alone."""
+        return replace(self, terms=self.terms[used])
 
 
-def features_for(robot: Robot, v: Array, degree: int, lags: int, saturating: bool) -> Features:
-    """Return all monomials up to a degree, with saturating features if wanted.
+def features_for(robot: Robot, v: Array, degree: int, lags: int) -> Features:
+    """Return the features from which the fit selects.
+
+    These are all monomials up to a degree, and two kinds that no monomial follows: an autopilot that limits its
+    acceleration answers with the tanh of the difference of an input and the speed that follows it, and what slips or
+    drags depends on the absolute value of a speed, |s| = s · sign s, also as a factor of one more variable.
 
     Args:
         robot: the robot.
         v (T, v): recorded variables. They set the scales.
-        degree: the highest degree of the monomials, 1 to 3.
+        degree: the highest degree of the monomials, 1 to 4.
         lags: 1 to use the input of the period before, 0 to leave it out.
-        saturating: add tanh of the difference of each input and the speed that follows it. An autopilot that limits
-            its acceleration answers like this.
     """
-    count = len(robot.regressor) + robot.action_dim * (1 + lags)
+    measured = len(robot.regressor)
+    count = measured + robot.action_dim * (1 + lags)
     scale = np.abs(v).max(0)
     scale[scale <= 0.0] = 1.0
     rows: list[tuple[float, float, float]] = []
-    if saturating:
-        for i, index in enumerate(robot.follows):
-            if index in robot.regressor:
-                a, b = len(robot.regressor) + i, robot.regressor.index(index)
-                most = float(np.abs(v[:, a] - v[:, b]).max())
-                rows += [(a, b, share * most) for share in WIDTHS if most > 0.0]
-    products = (c for n in range(degree + 1) for c in combinations_with_replacement(range(1, count + 1), n))
-    terms = [(*c, *(0,) * (3 - len(c))) for c in products]
-    terms += [(1 + v.shape[1] + e, 0, 0) for e in range(len(rows))]
+    for i, index in enumerate(robot.follows):
+        if index in robot.regressor:
+            a, b = measured + i, robot.regressor.index(index)
+            most = float(np.abs(v[:, a] - v[:, b]).max())
+            rows += [(a, b, share * most) for share in WIDTHS if most > 0.0]
+    first = 1 + v.shape[1]  # index of the first saturation
+    bent: list[tuple[int, ...]] = [(first + e,) for e in range(len(rows))]
+    for a in range(measured):
+        sign = first + len(rows)
+        rows.append((a, -1.0, SIGN * float(scale[a])))
+        bent += [(1 + a, sign), *((1 + a, other, sign) for other in range(1, count + 1) if degree > 1)]
+    products = [c for n in range(degree + 1) for c in combinations_with_replacement(range(1, count + 1), n)]
+    terms = [(*c, *(0,) * (FACTORS - len(c))) for c in (*products, *bent)]
     return Features(scale, np.array(rows).reshape(-1, 3), np.array(terms, dtype=np.int64))
 
 
@@ -121,11 +139,11 @@ class OneStep:
         f, variables = self.features, len(robot.regressor) + 2 * robot.action_dim
         primitives = 1 + variables + len(f.saturations)
         good = f.scale.shape == (variables,) and (f.scale > 0.0).all() and f.saturations.ndim == 2
-        good = good and f.terms.ndim == 2 and f.terms.shape[1] == 3 and f.saturations.shape[1] == 3
+        good = good and f.terms.ndim == 2 and f.terms.shape[1] in (3, FACTORS) and f.saturations.shape[1] == 3
         good = good and self.C.shape == (robot.state_dim, len(f.terms)) and len(f.terms) > 0
         good = good and f.terms.min() >= 0 and f.terms.max() < primitives
-        pairs = f.saturations[:, :2]
-        good = good and bool((pairs >= 0).all() and (pairs < variables).all() and (f.saturations[:, 2] > 0.0).all())
+        pairs, widths = f.saturations[:, :2], f.saturations[:, 2]
+        good = good and bool((pairs >= [0, -1]).all() and (pairs < variables).all() and (widths > 0.0).all())
         if not good or self.root.shape != (len(f.terms),) * 2 or not (self.weight >= 0.0 and self.start >= 1.0):
             raise BadModel(f"the predictor of one period does not fit {robot.name}")
 
@@ -152,7 +170,8 @@ class OneStep:
         arms = [disc.at for disc in robot.body if disc.arm > 0.0 and heading >= 0]
         others, centers = np.array(robot.regressor, dtype=np.int64), np.array(arms, dtype=float).reshape(len(arms), d)
         whole = np.ascontiguousarray
-        predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(f.terms)
+        terms = np.pad(f.terms, ((0, 0), (0, FACTORS - f.terms.shape[1])))  # with the constant 1
+        predictor = whole(self.C), whole(f.scale), whole(f.saturations), whole(terms)
         return *predictor, others, heading, centers, d, robot.action_dim
 
     def stretch_arguments(self, robot: Robot) -> tuple[Predictor, Array, float]:

@@ -19,6 +19,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import driving_kinds
 from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound
+from brakeline.safety.model.feature_selection import SelectionPath
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
@@ -40,12 +41,18 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 Progress = Callable[[float], None]  # called with the share of the work that is done
-CHOSEN, WEIGHED, SCORED = 0.5, 0.7, 0.95  # shares of the work that are done after each part
+TRIED, CHOSEN, SCORED = 0.4, 0.8, 0.95  # shares of the work that are done after each part
 
 FOLDS = 5
-DEGREES, LAGS, RIDGES = (1, 2, 3), (0, 1), (1e-8, 1e-5, 1e-3)
-FEWEST_PERIODS_A_FEATURE = 10  # of candidates with more features, nothing could be said
-SIMPLER = 1.03  # a simpler candidate wins if its error is at most this factor larger
+DEGREES, LAGS, PENALTIES = (1, 2, 3, 4), (0, 1), (1.0, 3.0)
+MOST_FEATURES, FEWEST_PERIODS_A_FEATURE = 600, 5  # to select from
+RIDGE = 1e-9  # of the fit, as a share of each feature's square: features of which one nearly follows from others
+MOST_AT_ONCE = 10_000  # periods whose features are in memory at once
+GOOD, MOST_GOOD = (
+    1.25,
+    6,
+)  # of candidates with at most this factor of the least error, the best: their sets are compared
+SIMPLER = 1.03  # a simpler candidate wins if its sets are at most this factor wider
 WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
@@ -57,7 +64,8 @@ class Samples:
     """Recorded driving, cut into folds.
 
     Attributes:
-        v (P, v), y (P, n), period_fold (P,): all periods: variables [s; u; input of the period before] and outputs.
+        v (P, v), y (P, n), period_fold (P,), follows (P,): all periods: variables [s; u; input of the period before],
+            outputs, and whether the period follows the one in the row before.
         z (T, nz), after (T, N, n + d·discs), chords (T, N), stops (T,), fold (T,), start (T, 2): all windows of N
             periods that lie in one fold: regressors, outputs after each period, chord deviations [m], the way after the
             window [m] if it ends in a stop, otherwise NaN, trajectory and first period.
@@ -66,6 +74,7 @@ class Samples:
     v: Array
     y: Array
     period_fold: Index
+    follows: NDArray[np.bool_]
     z: Array
     after: Array
     chords: Array
@@ -88,8 +97,8 @@ def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
     for number, t in enumerate(data.trajectories):
         periods = len(t.inputs)
         block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
-        parts.append((*_periods(robot, t), block, *_windows(data, t, number, block)))
-    names = ("v", "y", "period_fold", "z", "after", "chords", "stops", "fold", "start")
+        parts.append((*_periods(robot, t), block, np.arange(periods) > 0, *_windows(data, t, number, block)))
+    names = ("v", "y", "period_fold", "follows", "z", "after", "chords", "stops", "fold", "start")
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples = Samples(**dict(zip(names, columns, strict=True)))
     if len(np.unique(samples.fold)) < folds:
@@ -127,94 +136,172 @@ def _windows(
 
 @dataclass(frozen=True)
 class Candidate:
-    """A family of features, and its out-of-fold error.
+    """A way to fit the predictor, and its out-of-fold error.
 
     Attributes:
+        degree, lags: of the features to select from (`features_for`).
+        penalty: of the selection (`SelectionPath`).
+        instruments: whether the coefficients come from instrumental variables.
         error [m]: the 99 % quantile of the distance between predicted and measured position, over all windows and
             periods, each predicted without its fold. In joint space, of the largest error of a limit's value, in units
             of `Robot.limit_scales`.
-        features: number of features.
+        features: number of selected features.
     """
 
     degree: int
     lags: int
-    saturating: bool
-    ridge: float
-    error: float
-    features: int
+    penalty: float
+    instruments: bool
+    error: float = np.nan
+    features: int = 0
 
 
 @dataclass(frozen=True)
-class _Regression:
-    """Ridge regressions on all folds, or on all but one, from their second moments: gram (K, F, F), cross (K, F, n)."""
+class Choice:
+    """A candidate, and how its sets grow.
 
-    features: Features
-    gram: Array
-    cross: Array
+    Attributes:
+        candidate: the candidate.
+        weight: of the leverage.
+        speeds: whether half-widths grow with the measured speeds.
+        width [m]: geometric mean of the half-widths of calibrated last sets, out of fold: of plans, and of a stop from
+            full speed.
+        full (1, nz): regressors of a stop from full speed.
+    """
 
-    @staticmethod
-    def of(features: Features, s: Samples) -> _Regression:
-        phi, folds = features(s.v), range(int(s.period_fold.max()) + 1)
-        parts = [(phi[s.period_fold == i], s.y[s.period_fold == i]) for i in folds]
-        return _Regression(features, np.array([a.T @ a for a, _ in parts]), np.array([a.T @ b for a, b in parts]))
+    candidate: Candidate
+    weight: float
+    speeds: bool
+    width: float
+    full: Array
 
-    def fit(self, ridge: float, without: int = -1, weight: float = 0.0) -> OneStep:
-        used = [i for i in range(len(self.gram)) if i != without]
-        gram, cross = self.gram[used].sum(0), self.cross[used].sum(0)
-        weights = ridge * np.diag(gram) + 1e-12 * gram[0, 0]
-        weights[0] = 0.0  # not of the constant
-        gram = gram + np.diag(weights)
+
+class Regression:
+    """Fits to all folds, or to all but one, from the second moments of each fold."""
+
+    def __init__(self, robot: Robot, features: Features, s: Samples) -> None:
+        """Take the features to select from, and the recorded driving."""
+        self._robot, self._features, self._s = robot, features, s
+        count, n = len(features.terms), s.y.shape[1]
+        folds = int(s.period_fold.max()) + 1
+        self.folds = range(folds)
+        self._gram, self._cross = np.zeros((folds, count, count)), np.zeros((folds, count, n))
+        for i in self.folds:
+            rows = np.flatnonzero(s.period_fold == i)
+            for some in np.array_split(rows, len(rows) // MOST_AT_ONCE + 1):
+                phi = features(s.v[some])
+                self._gram[i] += phi.T @ phi
+                self._cross[i] += phi.T @ s.y[some]
+        self._paths: dict[int, list[SelectionPath]] = {}
+
+    def fit(self, candidate: Candidate, without: int = -1, weight: float = 0.0) -> OneStep:
+        """Return the predictor that is fitted to all folds but one, with a weight of the leverage."""
+        folds = [i for i in self.folds if i != without]
+        gram, cross = self._gram[folds].sum(0), self._cross[folds].sum(0)
+        chosen = [path.best(candidate.penalty) for path in self._paths_without(without, gram, cross)]
+        used = np.unique(np.concatenate([[0], *chosen]))  # the constant, for an output without features
+        places = [np.searchsorted(used, one) for one in chosen]
+        features, gram, cross = self._features.some(used), gram[np.ix_(used, used)], cross[used]
+        gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12 * gram[0, 0])
+        C = _solved(places, gram, cross)
+        if candidate.instruments:
+            C = self._by_instruments(features, C, places, without)
         root = np.linalg.inv(np.linalg.cholesky(gram))
-        return OneStep(np.linalg.solve(gram, cross).T, self.features, root, weight)
+        return OneStep(C, features, root, weight)
 
-    def quality(self) -> tuple[float, float]:
-        """Return the smallest singular value and the condition number of the scaled features."""
-        gram = self.gram.sum(0)
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(gram / np.outer(scale, scale)), 0.0))
+    def _paths_without(self, without: int, gram: Array, cross: Array) -> list[SelectionPath]:
+        if without not in self._paths:
+            y = self._s.y[self._s.period_fold != without]
+            squares, least = (y**2).sum(0), min(PENALTIES)
+            of_outputs = zip(cross.T, squares, strict=True)
+            self._paths[without] = [SelectionPath.of(gram, c, float(q), len(y), least) for c, q in of_outputs]
+        return self._paths[without]
+
+    def _by_instruments(self, features: Features, C: Array, places: list[Index], without: int) -> Array:
+        """Return the coefficients from instrumental variables.
+
+        Least squares takes measured speeds for true ones, so an error of a speed makes its coefficient too small, and
+        a rollout adds that up. The instruments are the features of the speeds that the period before predicts: they
+        follow the true speeds, and do not know the errors of the measured ones.
+        """
+        s, r = self._s, len(self._robot.regressor)
+        good = s.follows & (s.period_fold != without)
+        good[1:] &= s.period_fold[1:] == s.period_fold[:-1]
+        known = np.flatnonzero(good)
+        mixed, cross = np.zeros((len(features.terms),) * 2), np.zeros((len(features.terms), len(C)))
+        for some in np.array_split(known, len(known) // MOST_AT_ONCE + 1):
+            predicted = features(s.v[some - 1]) @ C[list(self._robot.regressor)].T
+            instruments = features(np.hstack([predicted, s.v[some][:, r:]]))
+            mixed += instruments.T @ features(s.v[some])
+            cross += instruments.T @ s.y[some]
+        return _solved(places, mixed + np.diag(RIDGE * np.abs(np.diag(mixed))), cross)
+
+    def quality(self, one_step: OneStep) -> tuple[float, float]:
+        """Return the smallest singular value and the condition number of the scaled features of a predictor."""
+        phi = one_step.features(self._s.v)
+        scaled = phi / np.sqrt(np.maximum((phi**2).sum(0), 1e-300))
+        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled.T @ scaled), 0.0))
         return float(singular[0]), float(singular[-1] / max(singular[0], 1e-300))
 
-    def out_of_fold(self, robot: Robot, s: Samples, ridge: float) -> Array:
-        """Return the errors (T, N, n + d·discs) of all windows, each predicted without its fold."""
+    def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
+        """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""
         found = np.empty_like(s.after)
-        for i in range(len(self.gram)):
+        for i in self.folds:
             held = s.fold == i
-            found[held] = s.after[held] - self.fit(ridge, without=i).rollouts(robot, s.z[held])
+            found[held] = s.after[held] - self.fit(candidate, without=i).rollouts(self._robot, s.z[held])
         return found
+
+
+def _solved(places: list[Index], gram: Array, cross: Array) -> Array:
+    """Return the coefficients (n, F) of each output, which has only the features at its places."""
+    C = np.zeros((cross.shape[1], len(gram)))
+    for i, used in enumerate(places):
+        try:
+            C[i, used] = np.linalg.solve(gram[np.ix_(used, used)], cross[used, i])
+        except np.linalg.LinAlgError:  # instruments that say nothing: the candidate drops out
+            C[i, used] = np.nan
+    return C
 
 
 def unheard(share: float) -> None:
     """Ignore the progress."""
 
 
-def choose(robot: Robot, s: Samples, progress: Progress = unheard) -> tuple[Candidate, list[Candidate], _Regression]:
-    """Choose degree, lags, saturating features and ridge by the out-of-fold error.
+def choose(
+    robot: Robot, s: Samples, outside: float = RARE, progress: Progress = unheard
+) -> tuple[Choice, list[Candidate], Regression]:
+    """Choose features, fit, and how the sets grow: by the width of the sets that the out-of-fold errors need.
 
     Returns:
-        The choice, all candidates from the best to the worst, and the regression of the choice.
+        The choice, all candidates from the least out-of-fold error to the largest, and the regression of the choice.
     """
-    found: list[tuple[Candidate, _Regression]] = []
+    found: list[tuple[Candidate, Regression]] = []
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
     few_windows = replace(s, z=s.z[some], after=s.after[some], fold=s.fold[some])
-    families = [*product(DEGREES, LAGS, (False, True))]
-    for number, (degree, lags, saturating) in enumerate(families):
-        progress(CHOSEN * number / len(families))
-        features = features_for(robot, s.v, degree, lags, saturating)
-        count = len(features.terms)
-        few = degree > 1 and len(s.v) < FEWEST_PERIODS_A_FEATURE * count
-        if few or (saturating and not len(features.saturations)):
+    families = [*product(DEGREES, LAGS)]
+    for number, (degree, lags) in enumerate(families):
+        progress(TRIED * number / len(families))
+        features = features_for(robot, s.v, degree, lags)
+        if degree > 1 and len(features.terms) > min(MOST_FEATURES, len(s.v) / FEWEST_PERIODS_A_FEATURE):
             continue
-        regression = _Regression.of(features, s)
-        for ridge in RIDGES:
-            off = _distances(robot, regression.out_of_fold(robot, few_windows, ridge))
+        regression = Regression(robot, features, s)
+        for penalty, instruments in product(PENALTIES, (False, True)):
+            candidate = Candidate(degree, lags, penalty, instruments)
+            off = _distances(robot, regression.out_of_fold(candidate, few_windows))
             with np.errstate(invalid="ignore"):
                 error = float(np.quantile(off, QUANTILE))
-            found.append((Candidate(degree, lags, saturating, ridge, error, count), regression))
-    found = [pair for pair in found if np.isfinite(pair[0].error)]
-    least = min(c.error for c, _ in found)
-    good = [pair for pair in found if pair[0].error <= SIMPLER * least]
-    chosen, regression = min(good, key=lambda pair: (pair[0].features, pair[0].error))
-    return chosen, sorted((c for c, _ in found), key=lambda c: c.error), regression
+            count = len(regression.fit(candidate).features.terms)
+            found.append((replace(candidate, error=error, features=count), regression))
+    found = sorted((pair for pair in found if np.isfinite(pair[0].error)), key=lambda pair: pair[0].error)
+    good = [pair for pair in found if pair[0].error <= GOOD * found[0][0].error][:MOST_GOOD]
+    choices = []
+    for number, (candidate, regression) in enumerate(good):
+        progress(TRIED + (CHOSEN - TRIED) * number / len(good))
+        choices.append((_growth(robot, s, regression, candidate, outside), regression))
+    least = min(choice.width for choice, _ in choices)
+    narrow = [pair for pair in choices if pair[0].width <= SIMPLER * least]
+    choice, regression = min(narrow, key=lambda pair: (pair[0].candidate.features, pair[0].width))
+    return choice, [c for c, _ in found], regression
 
 
 def _distances(robot: Robot, errors: Array) -> Array:
@@ -264,16 +351,15 @@ def fit_one_step(
     if robot.feedback:
         raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
     s = samples_of(data.joined())
-    chosen, candidates, regression = choose(robot, s, progress)
-    progress(CHOSEN)
-    weight, speeds = _weight_and_speeds(robot, s, regression, chosen.ridge, model_config.outside)
-    scores, positions, others = _scores(robot, s, regression, chosen.ridge, weight, speeds, progress)
+    choice, candidates, regression = choose(robot, s, model_config.outside, progress)
+    chosen, full = choice.candidate, choice.full
+    scores, positions, others = _scores(robot, s, regression, choice, progress)
     kinds = driving_kinds(robot, s.z, s.start)
     joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
     factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
-    one_step = replace(regression.fit(chosen.ridge, weight=weight), start=factors.start)
+    one_step = replace(regression.fit(chosen, weight=choice.weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords, speeds)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.speeds)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factors.plan)
     first_scale = np.where(np.arange(n) < d, factors.plan, factors.first)
@@ -286,14 +372,16 @@ def fit_one_step(
         replace(model_config, mode=ONE_STEP, windows=FREE, certificate=RESIDUAL),
         steps,
         _stacked(chords),
-        _stopping_distance(data, s, model_config),
+        _stopping_distance(data, s, full, model_config),
         np.stack([known.min(0), known.max(0)]),
         np.eye(s.z.shape[1]),
         data.about | {"data": data.digest(), "periods": str(data.periods)},
         one_step=one_step,
     )
     used, used_first = (factors.shares(part, others, kinds) for part in (scores, positions))
-    return model, Calibration(chosen, tuple(candidates), factors.plan, used, used_first, s, *regression.quality())
+    return model, Calibration(
+        chosen, tuple(candidates), factors.plan, used, used_first, s, *regression.quality(one_step)
+    )
 
 
 def _stacked(bounds: list[ErrorBound]) -> ErrorBound:
@@ -302,7 +390,7 @@ def _stacked(bounds: list[ErrorBound]) -> ErrorBound:
     return ErrorBound(C, bounds[0].W, M, kappa, np.concatenate([one.w for one in bounds]), np.eye(len(bounds)))
 
 
-def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> ErrorBound:
+def _stopping_distance(data: Dataset, s: Samples, full: Array, model_config: ModelConfig) -> ErrorBound:
     """Return the bound of the way after a plan's end, from all windows that end in a stop.
 
     Raises:
@@ -315,17 +403,15 @@ def _stopping_distance(data: Dataset, s: Samples, model_config: ModelConfig) -> 
         shape = Shape(spread, np.full((data.robot.horizon, 1), largest))
     else:
         ways_on = np.repeat(s.stops[ended, None, None], data.robot.horizon, axis=1)
-        shape = Shape.around(data.robot, s.z[ended], ways_on, model_config.inflation)
+        shape = Shape.around(data.robot, s.z[ended], ways_on, full, model_config.inflation)
     return shape.bound(data.robot, data.robot.horizon, slice(1), np.ones(1))
 
 
-def _weight_and_speeds(
-    robot: Robot, s: Samples, regression: _Regression, ridge: float, outside: float
-) -> tuple[float, bool]:
-    """Return the weight of the leverage, and whether half-widths grow with the speeds, for the narrowest sets of plans.
+def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candidate, outside: float) -> Choice:
+    """Choose the weight of the leverage, and whether half-widths grow with the speeds, for the narrowest sets of plans.
 
-    What counts are the last sets, on average of plans and of a stop from full speed. Of several nearly as narrow, take
-    the largest weight. Slopes on the speeds must be worth it.
+    What counts are the last sets, as the geometric mean of plans and of a stop from full speed. Of several nearly as
+    narrow, take the largest weight. Slopes on the speeds must be worth it.
     Without the leverage, one factor widens all sets because some windows at the edge of the data are predicted badly,
     and sets outside of the data are as narrow as within. Minutes of driving may hold few errors at a large speed that
     the inputs do not announce, such as the sway of a boat: then a slope on that speed is mostly noise.
@@ -333,33 +419,31 @@ def _weight_and_speeds(
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, full, pairs = plans_from(robot, z), stop_from_full_speed(robot, z), [*product(WEIGHTS, (True, False))]
-    scores, sums = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
-    for i in range(len(regression.gram)):
-        one_step, held = regression.fit(ridge, i), fold == i
+    plans, full = plans_from(robot, z), stop_from_full_speed(robot, z, regression.fit(candidate))
+    pairs = [*product(WEIGHTS, (True, False))]
+    scores, logs = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
+    for i in regression.folds:
+        one_step, held = regression.fit(candidate, i), fold == i
         off = after - one_step.rollouts(robot, z)[:, -1:][..., used]
         leverages, *of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
         for p, (weight, speeds) in enumerate(pairs):
             errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
-            shape = Shape.around(robot, z[~held], errors[~held], last=True, speeds=speeds, outside=RARE)
+            shape = Shape.around(robot, z[~held], errors[~held], full, last=True, speeds=speeds, outside=RARE)
             scores[p, held] = shape.scores(robot, z[held], errors[held], last=True)
             for some_plans, leverage in zip((plans, full), of_plans, strict=True):
                 wide = shape.widths(robot, some_plans, last=True)[:, 0] * np.sqrt(1.0 + weight * leverage)
-                sums[p] += wide.mean()
-    found = dict(zip(pairs, np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * sums, strict=True))
+                logs[p] += np.log(wide).mean() / (2 * len(regression.folds))
+    with np.errstate(invalid="ignore"):
+        widths = np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * np.exp(logs)
+    found = dict(zip(pairs, np.where(np.isnan(widths), np.inf, widths), strict=True))  # a rollout may diverge
     least = {speeds: min(width for pair, width in found.items() if pair[1] == speeds) for speeds in (True, False)}
     speeds = bool(least[False] > SIMPLER * least[True])
-    return max(w for w in WEIGHTS if found[w, speeds] <= SIMPLER * least[speeds]), speeds
+    weight = max(w for w in WEIGHTS if found[w, speeds] <= SIMPLER * least[speeds])
+    return Choice(candidate, weight, speeds, float(found[weight, speeds]), full)
 
 
 def _scores(
-    robot: Robot,
-    s: Samples,
-    regression: _Regression,
-    ridge: float,
-    weight: float,
-    speeds: bool,
-    progress: Progress,
+    robot: Robot, s: Samples, regression: Regression, choice: Choice, progress: Progress
 ) -> tuple[Array, Array, Array]:
     """Return three scores (T,) of each window, from the folds that it is not in.
 
@@ -369,12 +453,12 @@ def _scores(
     """
     d, scores = robot.position_dim, np.zeros((3, len(s.z)))
     for_plan = [*range(d), *extra_coordinates(robot), -1]
-    for i in range(len(regression.gram)):
-        progress(WEIGHED + (SCORED - WEIGHED) * i / len(regression.gram))
+    for i in regression.folds:
+        progress(CHOSEN + (SCORED - CHOSEN) * i / len(regression.folds))
         held = s.fold == i
-        one_step = regression.fit(ridge, i, weight)
+        one_step = regression.fit(choice.candidate, i, choice.weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], speeds)
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.speeds)
         widths = shape.widths(robot, s.z[held])
         used = shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = used[..., for_plan].max((1, 2))

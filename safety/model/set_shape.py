@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.error_bounds import ErrorBound, envelopes
+from brakeline.safety.model.one_step import OneStep
 from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
 FULL_SPEED = 0.1  # weight of a stop from full speed among the plans for which a shape is tightest
+SETTLED = 3  # plans' lengths after which a robot with constant inputs has settled
 RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
 MOST_TYPICAL = 5_000  # windows from whose starts the typical plans begin: more hardly change their mean
@@ -52,17 +54,21 @@ def plans_from(robot: Robot, z: Array) -> Array:
     return np.asarray(np.vstack(plans) @ plan_regressor_map(robot).T)
 
 
-def stop_from_full_speed(robot: Robot, z: Array) -> Array:
+def stop_from_full_speed(robot: Robot, z: Array, one_step: OneStep) -> Array:
     """Return the regressors (1, nz) of a plan from all inputs at their upper bounds.
 
-    Speeds that follow no input, such as a boat's sway, have the median of the recorded periods z (T, nz).
+    Speeds that follow no input, such as a boat's sway, are those at which the predictor settles with these inputs,
+    within what was recorded in z (T, nz): a boat drifts little, but in a fast turn it drifts a lot.
     """
     high, measured = np.asarray(robot.high()), list(robot.regressor)
-    follows = np.isin(measured, robot.follows)
-    speeds = np.where(
-        follows, robot.state_at_inputs(high)[measured], np.quantile(np.abs(z[:, : len(measured)]), 0.5, 0)
-    )
-    plan = np.concatenate([speeds, high, np.tile(high, robot.free_steps)])
+    follows, known = np.isin(measured, robot.follows), len(measured)
+    speeds, largest = robot.state_at_inputs(high)[measured], np.abs(z[:, :known]).max(0)
+    for _ in range(SETTLED):
+        window = np.concatenate([speeds, np.tile(high, robot.horizon + 1)])
+        after = one_step.rollouts(robot, window[None])[0, -1, measured]
+        after = np.where(np.isfinite(after), np.clip(after, -largest, largest), 0.0)
+        speeds = np.where(follows, speeds, after)
+    plan = np.concatenate([np.where(follows, speeds, np.abs(speeds)), high, np.tile(high, robot.free_steps)])
     return np.asarray(plan[None] @ plan_regressor_map(robot).T)
 
 
@@ -91,12 +97,13 @@ class Shape:
         robot: Robot,
         z: Array,
         errors: Array,
+        full: Array,
         inflation: float = 1.0,
         last: bool = False,
         speeds: bool = True,
         outside: float = 0.0,
     ) -> Shape:
-        """Return the shape that holds the errors (T, N, n') and is tightest, on average, for plans as the filter has.
+        """Return the shape that holds the errors (T, N, n') and is tightest for plans as the filter has (`_tightest`).
 
         Recorded driving holds large inputs until the end of a window, while plans brake. A stop from full speed counts
         as much as `FULL_SPEED` of the recorded plans: such stops are rare, and need the most room.
@@ -105,29 +112,33 @@ class Shape:
             robot: the robot.
             z (T, nz): regressors.
             errors (T, N, n'): errors to hold.
+            full (1, nz): regressors of a stop from full speed.
             inflation: factor on the shape.
             last: the errors (T, 1, n') are those after the last period.
             speeds: whether half-widths grow with the measured speeds too, besides the inputs.
             outside: share of the windows that the shape need not hold: those that most exceed the others' trend. Their
                 errors would decide about all sets, and such a share of windows may leave its sets anyway.
         """
-        shape = Shape._holding(robot, z, errors, inflation, last, speeds)
+        shape = Shape._holding(robot, z, errors, full, inflation, last, speeds)
         if not (dropped := int(outside * len(z))):
             return shape
         held = np.argsort(shape.scores(robot, z, errors, last))[:-dropped]
-        return Shape._holding(robot, z[held], errors[held], inflation, last, speeds)
+        return Shape._holding(robot, z[held], errors[held], full, inflation, last, speeds)
 
     @staticmethod
-    def _holding(robot: Robot, z: Array, errors: Array, inflation: float, last: bool, speeds: bool) -> Shape:
+    def _holding(
+        robot: Robot, z: Array, errors: Array, full: Array, inflation: float, last: bool, speeds: bool
+    ) -> Shape:
         measured, shape = len(robot.regressor), errors.shape[1:]
         used = spread_features(robot, z, last)
-        some = z[:: math.ceil(len(z) / MOST_TYPICAL)]
-        typical = spread_features(robot, plans_from(robot, some), last).mean(1)
-        typical += FULL_SPEED * (spread_features(robot, stop_from_full_speed(robot, z), last)[:, 0] - typical)
+        starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
+        plans = spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
         if not speeds:
-            used[..., :measured] = typical[:, :measured] = 0.0
-        each = zip(used, np.moveaxis(np.abs(errors), 1, 0), typical, strict=True)
-        found = [envelopes(features, values, inflation, some) for features, values, some in each]
+            used[..., :measured] = plans[..., :measured] = 0.0
+        share = np.full(plans.shape[1], (1.0 - FULL_SPEED) / (plans.shape[1] - 1))
+        share[-1] = FULL_SPEED
+        each = zip(used, np.moveaxis(np.abs(errors), 1, 0), plans, strict=True)
+        found = [_tightest(features, values, inflation, some, share) for features, values, some in each]
         slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
         if not speeds:
             slopes[..., :measured] = 0.0
@@ -150,17 +161,29 @@ class Shape:
         return ErrorBound(np.zeros_like(kappa), jumps, M, kappa, w, np.eye(len(w)))
 
 
+def _tightest(features: Array, values: Array, inflation: float, plans: Array, share: Array) -> tuple[Array, Array]:
+    """Return slopes (n', q) and w (n',) that hold the values (T, n') and are tightest for the plans' features (P, q).
+
+    Two linear programs: the first minimises the mean of the half-widths, in which fast plans weigh most; the second the
+    mean of their ratios to those of the first, so that a plan near a stand, where obstacles are close, counts as much.
+    """
+    slopes, w = envelopes(features, values, inflation, share @ plans)
+    widths = plans @ slopes.T + w
+    weights = share[:, None] / np.maximum(widths, 1e-9 * widths.max(0, keepdims=True) + 1e-300)
+    return envelopes(features, values, inflation, (weights / weights.sum(0)).T @ plans)
+
+
 def shares(errors: Array, widths: Array) -> Array:
     """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(errors > 0.0, errors / widths, 0.0)
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, speeds: bool) -> Shape:
+def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full: Array, speeds: bool) -> Shape:
     """Return the shape of all errors but rare ones, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
-    shape = Shape.around(robot, z[some], both, speeds=speeds, outside=RARE)
+    shape = Shape.around(robot, z[some], both, full, speeds=speeds, outside=RARE)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()

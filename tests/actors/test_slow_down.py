@@ -89,13 +89,13 @@ def test_plans_are_counted_one_after_the_other_against_the_sets_as_they_were_ask
 
 
 def test_a_robot_that_changes_drives_slower_until_its_sets_hold_again():
-    """For a while the robot slips; the model set is the right one before and after."""
+    """For a while the robot slips more and more, faster than the widening follows; before and after, its sets hold."""
     model = certified()[0]
     client = InProcess(Filter(replace(model, about=model.about | {"bound_plan": "0.0002"})), accept_bound=1.0)
     rng = np.random.default_rng(5)
     robot, slow, active = Unicycle((0.0, 0.0, 0.0), rng), SlowDown(client.robot, "actor-0"), []
     for period, proposal in enumerate(wandering(rng, 2600)):
-        robot.slip = -0.1 * (900 <= period < 1200)
+        robot.slip = -min(0.002 * 1.03 ** (period - 900), 0.6) * (900 <= period < 1200)
         limited = slow.proposal(proposal)
         answer = client.decide(robot.measure(), limited, [], known_free=True)
         slow.update(client.backup_plan.widening.left, answer.bound)

@@ -56,11 +56,11 @@ def tube_parts(rng, d):
 
 def rollout_parts(rng, d):
     """A predictor of one period for a robot with a heading, two speeds, two inputs and a further disc."""
-    variables, terms = 6, rng.integers(0, 9, (12, 3))
+    variables, terms = 6, rng.integers(0, 9, (12, 4))
     saturations = np.array([[2.0, 0.0, 0.7], [3.0, -1.0, 0.5]])
     arms = rng.normal(size=(1, d))
     others = np.array([d + 1, d + 2])
-    C = 0.3 * rng.normal(size=(d + 3, len(terms)))
+    C = 0.1 * rng.normal(size=(d + 3, len(terms)))  # products of four grow fast
     return C, rng.uniform(0.5, 2.0, variables), saturations, terms, others, d, arms, d, 2
 
 

@@ -212,7 +212,7 @@ def test_a_window_in_a_thousand_does_not_decide_about_the_shape():
     z, errors = random_windows(2000), np.random.default_rng(2).uniform(-1.0, 1.0, (2000, N, 1))
     wild = errors.copy()
     wild[[7, 1400]] *= 50.0
-    tight, loose = Shape.around(ROBOT, z, wild, outside=0.001), Shape.around(ROBOT, z, wild)
+    tight, loose = (Shape.around(ROBOT, z, wild, z[:1], outside=share) for share in (0.001, 0.0))
     assert sorted(np.flatnonzero(tight.scores(ROBOT, z, wild) > 1.0)) == [7, 1400]
     assert (loose.scores(ROBOT, z, wild) <= 1.0 + 1e-9).all()
     assert tight.widths(ROBOT, z).mean() < 0.3 * loose.widths(ROBOT, z).mean()

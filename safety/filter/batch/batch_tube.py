@@ -74,14 +74,14 @@ class RolloutBatch:
         self._others, self._arms, self._weight = others.tolist(), arms.tolist(), one_step.weight
         self._kept = [*range(d), *tube.kept]
         self._C, self._scale, self._root = constant(C), constant(scale[:, None]), constant(one_step.root)
-        self._terms = [constant(terms[:, slot]) for slot in range(3)]
+        self._terms = [constant(slot) for slot in terms.T]
         self._bent = [(int(a), int(b), float(width)) for a, b, width in saturations]
         self._T, self._horizon = constant(tube.inputs_of), tube.horizon
         primitives = 1 + len(scale) + len(saturations)
         # By slot: C times the map from features to the primitive in that slot; the constant 1 has no derivative.
-        chosen = np.arange(1, primitives)[:, None, None] == terms.T[None]  # (P, 3, F)
-        by_slot = C[:, None, None] * chosen  # (n, P, 3, F)
-        self._by_slot = [constant(by_slot[:, :, slot].reshape(-1, len(terms))) for slot in range(3)]
+        chosen = np.arange(1, primitives)[:, None, None] == terms.T[None]  # (P, 4, F)
+        by_slot = C[:, None, None] * chosen  # (n, P, 4, F)
+        self._by_slot = [constant(by_slot[:, :, slot].reshape(-1, len(terms))) for slot in range(4)]
 
     def path(self, z: Array) -> PathBatch:
         """Roll out the plans with regressors z (nz, B)."""
@@ -112,7 +112,7 @@ class RolloutBatch:
             now = r + (k + 1) * m
             primitives = self._primitives(xp.concat([s, window[now : now + m], window[now - m : now]]))
             p = [xp.take(primitives, index, axis=0) for index in self._terms]
-            features = p[0] * p[1] * p[2]
+            features = p[0] * p[1] * p[2] * p[3]
             y = self._C @ features
             row = [y[i] for i in range(self._n)]
             moved = row[:d]
@@ -182,8 +182,8 @@ class RolloutBatch:
         """Return the derivatives (n, V, B) of the outputs y by the variables."""
         xp, n, V = self._xp, self._n, self._scale.shape[0]
         slopes: Array = 0.0
-        for slot in range(3):
-            slopes = slopes + self._by_slot[slot] @ (p[(slot + 1) % 3] * p[(slot + 2) % 3])
+        for slot in range(4):
+            slopes = slopes + self._by_slot[slot] @ (p[slot - 1] * p[slot - 2] * p[slot - 3])
         slopes = xp.reshape(slopes, (n, -1, primitives.shape[1]))
         partial = slopes[:, :V] / self._scale
         for e, (a, b, width) in enumerate(self._bent):

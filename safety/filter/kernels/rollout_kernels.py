@@ -5,7 +5,7 @@ The parts of the predictor, and what else the functions share:
     C (n, F)            outputs of one period, from the features φ
     scale (v,)          units of the variables v = [s; u; input of the period before]
     saturations (E, 3)  [a, b, width]: further primitives tanh((v_a - v_b) / width), with b = -1 for no v_b
-    terms (F, 3)        feature f is the product of the primitives p[terms[f]], p = [1; v / scale; saturations]
+    terms (F, 4)        feature f is the product of the primitives p[terms[f]], p = [1; v / scale; saturations]
     others (r,)         indices in the state of the coordinates s, which are neither position nor heading
     heading             index of the heading in the state, -1 without one
     arms (D, d)         centers of the body's further discs, in the robot's frame
@@ -45,7 +45,7 @@ def _predict(
         away = v[a] - v[b] if b >= 0 else v[a]
         p[1 + len(v) + e] = math.tanh(away / saturations[e, 2])
     for f in range(len(terms)):
-        feature = p[terms[f, 0]] * p[terms[f, 1]] * p[terms[f, 2]]
+        feature = p[terms[f, 0]] * p[terms[f, 1]] * p[terms[f, 2]] * p[terms[f, 3]]
         total[f] += feature
         for i in range(len(y)):
             y[i] += C[i, f] * feature
@@ -57,10 +57,10 @@ def _partials(C: Array, scale: Array, saturations: Array, terms: Index, p: Array
     n, V = partial.shape
     slopes = np.zeros((n, len(p)))
     for f in range(len(terms)):
-        for slot in range(3):
+        for slot in range(4):
             of = terms[f, slot]
             if of > 0:
-                rest = p[terms[f, (slot + 1) % 3]] * p[terms[f, (slot + 2) % 3]]
+                rest = p[terms[f, (slot + 1) % 4]] * p[terms[f, (slot + 2) % 4]] * p[terms[f, (slot + 3) % 4]]
                 for i in range(n):
                     slopes[i, of] += C[i, f] * rest
     for i in range(n):

@@ -35,9 +35,10 @@ def _predict(
             p[1 + len(v) + e, t] = math.tanh(away / saturations[e, 2])
     feature = np.empty(v.shape[1])
     for f in range(len(terms)):
-        first, second, third, sums = p[terms[f, 0]], p[terms[f, 1]], p[terms[f, 2]], total[f]
+        first, second, third, fourth = p[terms[f, 0]], p[terms[f, 1]], p[terms[f, 2]], p[terms[f, 3]]
+        sums = total[f]
         for t in range(len(feature)):
-            feature[t] = first[t] * second[t] * third[t]
+            feature[t] = first[t] * second[t] * third[t] * fourth[t]
             sums[t] += feature[t]
         for i in range(len(y)):
             factor, output = C[i, f], y[i]
