@@ -6,15 +6,20 @@ it is needed, not at the top of a file: Numba takes 0.1 s to load.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import TypeVar, cast
 
 from numba import njit
 
 F = TypeVar("F", bound=Callable[..., object])
 log = logging.getLogger(__name__)
+
+PARTS = ("safety", "sim")  # whose folders `kernels` call each other's functions
+STAMP = "kernels.sha256"  # beside the stored code: which sources it was compiled from
 
 
 def compiled(signature: str | None = None) -> Callable[[F], F]:
@@ -27,12 +32,51 @@ def compiled(signature: str | None = None) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         try:
+            _forget_stale(function)
             return cast(F, njit(signature, cache=True, error_model="numpy")(function))
-        except RuntimeError:  # no folder for the cache
+        except (RuntimeError, OSError):  # no folder for the cache, or none to write in
             _say_that_nothing_is_stored()
             return cast(F, njit(signature, error_model="numpy")(function))
 
     return decorate
+
+
+def _forget_stale(function: Callable[..., object]) -> None:
+    """Delete the stored code of a function's folder if it was compiled from other kernels than those of now.
+
+    Numba compares stored code with its own file alone. A kernel that calls one of another file would go on with what
+    that one was before an upgrade.
+    """
+    folder = Path(function.__code__.co_filename).parent
+    if folder in _checked:
+        return
+    compiled_later = njit(cache=True)(function)
+    if stats := getattr(compiled_later, "stats", None):  # None with NUMBA_DISABLE_JIT=1
+        _forget(Path(stats.cache_path), _sources())
+    _checked.add(folder)
+
+
+_checked: set[Path] = set()  # folders
+
+
+def _forget(stored: Path, sources: str) -> None:
+    """Delete the compiled code in a folder, unless its stamp names these sources."""
+    stamp = stored / STAMP
+    if stamp.exists() and stamp.read_text() == sources:
+        return
+    for code in (*stored.glob("*.nbi"), *stored.glob("*.nbc")):
+        code.unlink(missing_ok=True)  # another process may do the same
+    stamp.write_text(sources)
+
+
+@cache
+def _sources() -> str:
+    """Return a digest of all kernels."""
+    found, here = hashlib.sha256(), Path(__file__).parent
+    for part in PARTS:
+        for path in sorted((here / part).rglob("kernels/*.py")):
+            found.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return found.hexdigest()
 
 
 @cache

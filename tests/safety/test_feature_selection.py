@@ -35,12 +35,12 @@ def test_of_features_that_say_the_same_one_is_taken_and_of_noise_none():
 
 
 def driving(slip, noise, periods=4000):
-    """Return samples of a robot whose speed follows its input, less where the input turns it at speed."""
+    """Return samples of a robot whose speeds follow the inputs, the first one less while it turns."""
     rng = np.random.default_rng(2)
     inputs = np.repeat(rng.uniform(ROBOT.low(), ROBOT.high(), (periods // 4, M)), 4, axis=0)
     speeds = np.zeros((periods + 1, R))
     for k, u in enumerate(inputs):
-        asked = u * [1.0, 1.0 - slip * abs(speeds[k, 0])]
+        asked = u * [1.0 - slip * abs(speeds[k, 1]), 1.0]
         speeds[k + 1] = 0.6 * speeds[k] + 0.4 * asked
     measured = speeds + noise * rng.normal(size=speeds.shape)
     y = np.zeros((periods, ROBOT.state_dim))
@@ -68,5 +68,5 @@ def test_slip_that_grows_with_the_size_of_a_speed_is_a_feature():
     s, speeds, v = driving(slip=0.3, noise=0.001)
     one_step = Regression(ROBOT, features_for(ROBOT, v, 2, 0), s).fit(Candidate(2, 0, 3.0, False))
     off = one_step.features(np.hstack([speeds[:-1], v[:, R:]])) @ one_step.C[list(ROBOT.regressor)].T - speeds[1:]
-    assert np.quantile(np.abs(off[:, 1]), 0.99) < 0.005
-    assert np.count_nonzero(one_step.C[ROBOT.regressor[1]]) <= 6
+    assert np.quantile(np.abs(off[:, 0]), 0.99) < 0.005
+    assert np.count_nonzero(one_step.C[ROBOT.regressor[0]]) <= 8

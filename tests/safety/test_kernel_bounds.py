@@ -62,13 +62,44 @@ def test_no_compiled_kernel_reads_or_writes_outside_its_arrays(tmp_path):
 
 
 def test_code_that_cannot_be_stored_is_compiled_and_a_warning_says_so_once(monkeypatch, caplog):
-    def njit(signature, cache=False, **_):
+    def njit(signature=None, cache=False, **_):
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
         return lambda function: function
 
     compilation._say_that_nothing_is_stored.cache_clear()
     monkeypatch.setattr(compilation, "njit", njit)
-    assert [compilation.compiled("f8(f8)")(abs)(-1.0) for _ in range(3)] == [1.0] * 3
+    assert [compilation.compiled("f8(f8)")(lambda x: -x)(-1.0) for _ in range(3)] == [1.0] * 3
     (record,) = caplog.records
     assert "set NUMBA_CACHE_DIR to a folder in which you may write" in record.getMessage()
+
+
+CALLED = """from brakeline.compilation import compiled
+
+@compiled("f8(f8)")
+def called(x):
+    return {} * x
+"""
+CALLING = """from brakeline import compilation
+
+compilation.__file__ = {!r}
+from called import called
+
+@compilation.compiled("f8(f8)")
+def calling(x):
+    return called(x)
+
+print(calling(1.0))
+"""
+
+
+def test_stored_code_that_calls_a_kernel_of_another_file_is_compiled_again_after_that_file_changed(tmp_path):
+    """Numba compares stored code with its own file alone: after an upgrade, tubes were those of the kernel before."""
+    folder = tmp_path / "safety" / "kernels"
+    folder.mkdir(parents=True)
+    (folder / "calling.py").write_text(CALLING.format(str(tmp_path / "compilation.py")))
+    for factor in ("2.0", "3.0", "3.0"):
+        (folder / "called.py").write_text(CALLED.format(factor))
+        done = subprocess.run([sys.executable, "calling.py"], cwd=folder, capture_output=True, text=True, check=True)
+        assert float(done.stdout) == float(factor)
+    assert (folder / "__pycache__" / compilation.STAMP).exists()
