@@ -26,7 +26,6 @@ from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import Features, OneStep, features_for
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import (
-    MOST_FOR_SHAPE,
     RARE,
     Shape,
     plans_from,
@@ -48,13 +47,11 @@ DEGREES, LAGS, PENALTIES = (1, 2, 3, 4), (0, 1), (1.0, 3.0)
 MOST_FEATURES, FEWEST_PERIODS_A_FEATURE = 600, 5  # to select from
 RIDGE = 1e-9  # of the fit, as a share of each feature's square: features of which one nearly follows from others
 MOST_AT_ONCE = 10_000  # periods whose features are in memory at once
-GOOD, MOST_GOOD = (
-    1.25,
-    6,
-)  # of candidates with at most this factor of the least error, the best: their sets are compared
+GOOD, MOST_GOOD = 1.25, 4  # of candidates up to this factor above the least error, the best: their sets are compared
 SIMPLER = 1.03  # a simpler candidate wins if its sets are at most this factor wider
-WEIGHTS = (3.0, 10.0, 30.0)  # of the leverage
+WEIGHTS = (1.0, 3.0, 10.0, 30.0)  # of the leverage
 MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
+PLANS_EVERY = 4  # from every fourth of these windows, plans whose sets are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
 
@@ -416,10 +413,10 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
     and sets outside of the data are as narrow as within. Minutes of driving may hold few errors at a large speed that
     the inputs do not announce, such as the sway of a boat: then a slope on that speed is mostly noise.
     """
-    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_FOR_SHAPE)).astype(int)
+    some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
-    plans, full = plans_from(robot, z), stop_from_full_speed(robot, z, regression.fit(candidate))
+    plans, full = plans_from(robot, z[::PLANS_EVERY]), stop_from_full_speed(robot, z, regression.fit(candidate))
     pairs = [*product(WEIGHTS, (True, False))]
     scores, logs = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
     for i in regression.folds:
