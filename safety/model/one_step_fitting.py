@@ -33,6 +33,7 @@ from brakeline.safety.model.set_shape import (
     shares,
     spread_features,
     stop_from_full_speed,
+    typical_plans,
 )
 from brakeline.safety.model.windows import displacement, predicted_outputs, way_after_rest, ways
 
@@ -160,7 +161,7 @@ class Choice:
     Attributes:
         candidate: the candidate.
         weight: of the leverage.
-        speeds: whether half-widths grow with the measured speeds.
+        level: with how many of the `spread_features` half-widths do not grow: 0, or the measured speeds.
         width [m]: geometric mean of the half-widths of calibrated last sets, out of fold: of plans, and of a stop from
             full speed.
         full (1, nz): regressors of a stop from full speed.
@@ -168,7 +169,7 @@ class Choice:
 
     candidate: Candidate
     weight: float
-    speeds: bool
+    level: int
     width: float
     full: Array
 
@@ -356,7 +357,7 @@ def fit_one_step(
     factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
     one_step = replace(regression.fit(chosen, weight=choice.weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-    shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.speeds)
+    shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.level)
     n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
     scale = np.full(n, factors.plan)
     first_scale = np.where(np.arange(n) < d, factors.plan, factors.first)
@@ -400,7 +401,9 @@ def _stopping_distance(data: Dataset, s: Samples, full: Array, model_config: Mod
         shape = Shape(spread, np.full((data.robot.horizon, 1), largest))
     else:
         ways_on = np.repeat(s.stops[ended, None, None], data.robot.horizon, axis=1)
-        shape = Shape.around(data.robot, s.z[ended], ways_on, full, model_config.inflation)
+        z = s.z[ended]
+        plans = typical_plans(data.robot, z, full)
+        shape = Shape.around(spread_features(data.robot, z), ways_on, plans, model_config.inflation)
     return shape.bound(data.robot, data.robot.horizon, slice(1), np.ones(1))
 
 
@@ -417,26 +420,28 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
     used = [*range(robot.position_dim)] or [*extra_coordinates(robot)]
     z, after, fold = s.z[some], s.after[some, -1:][..., used], s.fold[some]
     plans, full = plans_from(robot, z[::PLANS_EVERY]), stop_from_full_speed(robot, z, regression.fit(candidate))
-    pairs = [*product(WEIGHTS, (True, False))]
+    spread, *of_plans = (spread_features(robot, one, last=True) for one in (z, plans, full))
+    typical = typical_plans(robot, z, full, last=True)
+    pairs = [*product(WEIGHTS, (0, len(robot.regressor)))]
     scores, logs = np.zeros((len(pairs), len(z))), np.zeros(len(pairs))
     for i in regression.folds:
         one_step, held = regression.fit(candidate, i), fold == i
         off = after - one_step.rollouts(robot, z)[:, -1:][..., used]
-        leverages, *of_plans = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
-        for p, (weight, speeds) in enumerate(pairs):
+        leverages, *theirs = (one_step.leverages(robot, one)[:, -1:] for one in (z, plans, full))
+        for p, (weight, level) in enumerate(pairs):
             errors = off / np.sqrt(1.0 + weight * leverages)[..., None]
-            shape = Shape.around(robot, z[~held], errors[~held], full, last=True, speeds=speeds, outside=RARE)
-            scores[p, held] = shape.scores(robot, z[held], errors[held], last=True)
-            for some_plans, leverage in zip((plans, full), of_plans, strict=True):
-                wide = shape.widths(robot, some_plans, last=True)[:, 0] * np.sqrt(1.0 + weight * leverage)
+            shape = Shape.around(spread[:, ~held], errors[~held], typical, level=level, outside=RARE)
+            scores[p, held] = shape.scores(spread[:, held], errors[held])
+            for some_plans, leverage in zip(of_plans, theirs, strict=True):
+                wide = shape.widths(some_plans)[:, 0] * np.sqrt(1.0 + weight * leverage)
                 logs[p] += np.log(wide).mean() / (2 * len(regression.folds))
     with np.errstate(invalid="ignore"):
         widths = np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * np.exp(logs)
     found = dict(zip(pairs, np.where(np.isnan(widths), np.inf, widths), strict=True))  # a rollout may diverge
-    least = {speeds: min(width for pair, width in found.items() if pair[1] == speeds) for speeds in (True, False)}
-    speeds = bool(least[False] > SIMPLER * least[True])
-    weight = max(w for w in WEIGHTS if found[w, speeds] <= SIMPLER * least[speeds])
-    return Choice(candidate, weight, speeds, float(found[weight, speeds]), full)
+    least = {level: min(width for pair, width in found.items() if pair[1] == level) for _, level in pairs}
+    level = max(level for level, width in least.items() if level == 0 or width <= SIMPLER * least[0])
+    weight = max(w for w in WEIGHTS if found[w, level] <= SIMPLER * least[level])
+    return Choice(candidate, weight, level, float(found[weight, level]), full)
 
 
 def _scores(
@@ -455,8 +460,8 @@ def _scores(
         held = s.fold == i
         one_step = regression.fit(choice.candidate, i, choice.weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
-        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.speeds)
-        widths = shape.widths(robot, s.z[held])
+        shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.level)
+        widths = shape.widths(spread_features(robot, s.z[held]))
         used = shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
         scores[0, held] = used[..., for_plan].max((1, 2))
         scores[1, held] = used[:, 0, :d].max(1, initial=0.0)

@@ -72,6 +72,17 @@ def stop_from_full_speed(robot: Robot, z: Array, one_step: OneStep) -> Array:
     return np.asarray(plan[None] @ plan_regressor_map(robot).T)
 
 
+def typical_plans(robot: Robot, z: Array, full: Array, last: bool = False) -> Array:
+    """Return the `spread_features` (N, P, q) of plans from the starts of windows z (T, nz), and of a fast stop.
+
+    Recorded driving holds large inputs until the end of a window, while plans brake. The stop from full speed, with the
+    regressors `full` (1, nz), is the last one. It counts as much as `FULL_SPEED` of the plans: such stops are rare, and
+    need the most room.
+    """
+    starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
+    return spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
+
+
 @dataclass(frozen=True)
 class Shape:
     """Half-widths of the predicted coordinates after each period, up to a factor: slopes · `spread_features` + w.
@@ -83,66 +94,44 @@ class Shape:
     slopes: Array
     w: Array
 
-    def widths(self, robot: Robot, z: Array, last: bool = False) -> Array:
-        """Return half-widths (T, N, n') for regressors z (T, nz). last: of a shape of the last period alone."""
-        grown = spread_features(robot, z, last) @ np.swapaxes(self.slopes, 1, 2)
+    def widths(self, spread: Array) -> Array:
+        """Return half-widths (T, N, n') for `spread_features` (N, T, q)."""
+        grown = spread @ np.swapaxes(self.slopes, 1, 2)
         return np.ascontiguousarray(np.moveaxis(grown, 0, 1) + self.w)
 
-    def scores(self, robot: Robot, z: Array, errors: Array, last: bool = False) -> Array:
-        """Return the largest ratio (T,) of the errors (T, N, n') to the half-widths."""
-        return np.asarray(shares(np.abs(errors), self.widths(robot, z, last)).max((1, 2)))
+    def scores(self, spread: Array, errors: Array) -> Array:
+        """Return the largest ratio (T,) of the errors (T, N, n') to the half-widths for `spread` (N, T, q)."""
+        return np.asarray(shares(np.abs(errors), self.widths(spread)).max((1, 2)))
 
     @staticmethod
     def around(
-        robot: Robot,
-        z: Array,
-        errors: Array,
-        full: Array,
-        inflation: float = 1.0,
-        last: bool = False,
-        speeds: bool = True,
-        outside: float = 0.0,
+        spread: Array, errors: Array, plans: Array, inflation: float = 1.0, level: int = 0, outside: float = 0.0
     ) -> Shape:
         """Return the shape that holds the errors (T, N, n') and is tightest for plans as the filter has (`_tightest`).
 
-        Recorded driving holds large inputs until the end of a window, while plans brake. A stop from full speed counts
-        as much as `FULL_SPEED` of the recorded plans: such stops are rare, and need the most room.
-
         Args:
-            robot: the robot.
-            z (T, nz): regressors.
+            spread (N, T, q): `spread_features` of the windows of the errors.
             errors (T, N, n'): errors to hold.
-            full (1, nz): regressors of a stop from full speed.
+            plans (N, P, q): features of the plans for which it is tightest: `typical_plans`.
             inflation: factor on the shape.
-            last: the errors (T, 1, n') are those after the last period.
-            speeds: whether half-widths grow with the measured speeds too, besides the inputs.
+            level: number of features, from the first on, with which half-widths do not grow.
             outside: share of the windows that the shape need not hold: those that most exceed the others' trend. Their
                 errors would decide about all sets, and such a share of windows may leave its sets anyway.
         """
-        shape = Shape._holding(robot, z, errors, full, inflation, last, speeds)
-        if not (dropped := int(outside * len(z))):
+        shape = Shape._holding(spread, errors, plans, inflation, level)
+        if not (dropped := int(outside * len(errors))):
             return shape
-        held = np.argsort(shape.scores(robot, z, errors, last))[:-dropped]
-        return Shape._holding(robot, z[held], errors[held], full, inflation, last, speeds)
+        held = np.argsort(shape.scores(spread, errors))[:-dropped]
+        return Shape._holding(spread[:, held], errors[held], plans, inflation, level)
 
     @staticmethod
-    def _holding(
-        robot: Robot, z: Array, errors: Array, full: Array, inflation: float, last: bool, speeds: bool
-    ) -> Shape:
-        measured, shape = len(robot.regressor), errors.shape[1:]
-        used = spread_features(robot, z, last)
-        starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
-        plans = spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
-        if not speeds:
-            used[..., :measured] = plans[..., :measured] = 0.0
+    def _holding(spread: Array, errors: Array, plans: Array, inflation: float, level: int) -> Shape:
         share = np.full(plans.shape[1], (1.0 - FULL_SPEED) / (plans.shape[1] - 1))
         share[-1] = FULL_SPEED
-        each = zip(used, np.moveaxis(np.abs(errors), 1, 0), plans, strict=True)
+        each = zip(spread[..., level:], np.moveaxis(np.abs(errors), 1, 0), plans[..., level:], strict=True)
         found = [_tightest(features, values, inflation, some, share) for features, values, some in each]
-        slopes, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
-        if not speeds:
-            slopes[..., :measured] = 0.0
-        return Shape(slopes.reshape(*shape, -1), w.reshape(shape))
+        grown, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
+        return Shape(np.concatenate([np.zeros((*w.shape, level)), grown], axis=2), w)
 
     def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:
         """Return the error bound of some coordinates after k periods, each times its factor; without a predictor.
@@ -179,11 +168,12 @@ def shares(errors: Array, widths: Array) -> Array:
         return np.where(errors > 0.0, errors / widths, 0.0)
 
 
-def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full: Array, speeds: bool) -> Shape:
+def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full: Array, level: int) -> Shape:
     """Return the shape of all errors but rare ones, and of the chord deviations as a further coordinate."""
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
-    shape = Shape.around(robot, z[some], both, full, speeds=speeds, outside=RARE)
+    plans = typical_plans(robot, z[some], full)
+    shape = Shape.around(spread_features(robot, z[some]), both, plans, level=level, outside=RARE)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()

@@ -22,7 +22,7 @@ from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.one_step_fitting import fit_one_step, samples_of
 from brakeline.safety.model.set_factors import SetFactors
-from brakeline.safety.model.set_shape import Shape, spread_features
+from brakeline.safety.model.set_shape import Shape, spread_features, typical_plans
 from brakeline.safety.model.windows import FREE
 from tests.safety.asked import cylinder
 from tests.safety.test_turning_in_place import ROBOT, record
@@ -205,17 +205,18 @@ def test_the_error_bounds_of_a_shape_have_its_half_widths():
     shape = Shape(rng.uniform(0.0, 1.0, (N, 2, KNOWN + 2 * M)), rng.uniform(0.0, 1.0, (N, 2)))
     for k in range(1, N + 1):
         bound = shape.bound(ROBOT, k, slice(2), np.array([1.0, 3.0]))
-        assert bound.half_widths(z) == pytest.approx(shape.widths(ROBOT, z)[:, k - 1] * [1.0, 3.0])
+        assert bound.half_widths(z) == pytest.approx(shape.widths(spread_features(ROBOT, z))[:, k - 1] * [1.0, 3.0])
 
 
 def test_a_window_in_a_thousand_does_not_decide_about_the_shape():
     z, errors = random_windows(2000), np.random.default_rng(2).uniform(-1.0, 1.0, (2000, N, 1))
     wild = errors.copy()
     wild[[7, 1400]] *= 50.0
-    tight, loose = (Shape.around(ROBOT, z, wild, z[:1], outside=share) for share in (0.001, 0.0))
-    assert sorted(np.flatnonzero(tight.scores(ROBOT, z, wild) > 1.0)) == [7, 1400]
-    assert (loose.scores(ROBOT, z, wild) <= 1.0 + 1e-9).all()
-    assert tight.widths(ROBOT, z).mean() < 0.3 * loose.widths(ROBOT, z).mean()
+    spread, plans = spread_features(ROBOT, z), typical_plans(ROBOT, z, z[:1])
+    tight, loose = (Shape.around(spread, wild, plans, outside=share) for share in (0.001, 0.0))
+    assert sorted(np.flatnonzero(tight.scores(spread, wild) > 1.0)) == [7, 1400]
+    assert (loose.scores(spread, wild) <= 1.0 + 1e-9).all()
+    assert tight.widths(spread).mean() < 0.3 * loose.widths(spread).mean()
 
 
 def test_each_kind_of_driving_has_its_share_outside_and_only_starts_have_a_factor_of_their_own():
