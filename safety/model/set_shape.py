@@ -15,7 +15,7 @@ from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
-FULL_SPEED = 0.1  # weight of a stop from full speed among the plans for which a shape is tightest
+FULL_SPEED = 0.3  # weight of a stop from full speed among the plans for which a shape is tightest
 SETTLED = 3  # plans' lengths after which a robot with constant inputs has settled
 RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
