@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,8 @@ from numba import njit
 F = TypeVar("F", bound=Callable[..., object])
 log = logging.getLogger(__name__)
 
-PARTS = ("safety", "sim")  # whose folders `kernels` call each other's functions
+PARTS = ("safety", "sim")  # packages with folders `kernels`; kernels of one file call those of another
+IMPORTED = re.compile(r"^from brakeline\.([\w.]+) import", re.MULTILINE)
 STAMP = "kernels.sha256"  # beside the stored code: which sources it was compiled from
 
 
@@ -42,10 +44,10 @@ def compiled(signature: str | None = None) -> Callable[[F], F]:
 
 
 def _forget_stale(function: Callable[..., object]) -> None:
-    """Delete the stored code of a function's folder if it was compiled from other kernels than those of now.
+    """Delete the stored code of a function's folder if the kernels have changed since it was stored.
 
-    Numba compares stored code with its own file alone. A kernel that calls one of another file would go on with what
-    that one was before an upgrade.
+    Numba checks only the file of the function itself. If a kernel or a constant of another file changed, for example in
+    an upgrade, Numba would go on with the old one.
     """
     folder = Path(function.__code__.co_filename).parent
     if folder in _checked:
@@ -71,12 +73,14 @@ def _forget(stored: Path, sources: str) -> None:
 
 @cache
 def _sources() -> str:
-    """Return a digest of all kernels."""
-    found, here = hashlib.sha256(), Path(__file__).parent
-    for part in PARTS:
-        for path in sorted((here / part).rglob("kernels/*.py")):
-            found.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return found.hexdigest()
+    """Return a digest of all kernels, and of the modules of ours that they import: their constants are compiled in."""
+    here, digest = Path(__file__).parent, hashlib.sha256()
+    kernels = {path for part in PARTS for path in (here / part).rglob("kernels/*.py")}
+    imports = {name for path in kernels for name in IMPORTED.findall(path.read_text())}
+    imported = {here.joinpath(*name.split(".")).with_suffix(".py") for name in imports}
+    for path in sorted(kernels | {path for path in imported if path.exists()}):
+        digest.update(str(path.relative_to(here)).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 @cache

@@ -1,6 +1,6 @@
 """Measure what minutes of ordinary driving give for four robots: the table in docs/own_log.md.
 
-python examples/own_log/table.py                               # all of it: about half an hour
+python examples/own_log/table.py                               # all of it: about a quarter of an hour
 python examples/own_log/table.py --robots diff --minutes 4 --quick
 
 Each row is a log of its own, the four commands of docs/data.md on it, and the filter with the model set that they give.

@@ -1,9 +1,11 @@
 """Choose few of many features for a least-squares fit: greedily, until another one is not worth its cost.
 
-Minutes of driving determine few coefficients. A cubic in six variables has 84 for each output; a robot needs a few.
+Minutes of driving determine few coefficients. Six variables have 210 products of up to four factors; a robot needs 10
+to 30 of them.
 Each step takes the feature that lowers the sum of squared errors most, given those before (forward selection), by
-sweeping it out of the second moments (Goodnight 1979). What a feature must be worth is a multiple of the Bayesian
-information criterion (Schwarz 1978): n log(sum of squares) + penalty · log(n) · (number of features).
+sweeping it out of the second moments (Goodnight 1979). The number of features is the one with the least
+n log(sum of squares) + penalty · log(n) · (number of features). A penalty of 1 gives the Bayesian information criterion
+(Schwarz 1978; docs/method.md §13).
 """
 
 from __future__ import annotations
@@ -66,12 +68,12 @@ class SelectionPath:
             criterion = samples * np.log(squares[-1]) + penalty * np.log(samples) * len(order)
             if criterion < least:
                 best, least = len(order), criterion
-            elif len(order) > best + PATIENCE:
+            elif len(order) >= best + PATIENCE:
                 break
         return SelectionPath(np.array(order, dtype=np.int64), np.array(squares), samples)
 
     def best(self, penalty: float) -> Index:
-        """Return the indices of the features with the least criterion: the larger the penalty, the fewer."""
+        """Return the indices of the features with the least criterion. A larger penalty never gives more."""
         counts = np.arange(len(self.squares))
         with np.errstate(divide="ignore"):
             criterion = (

@@ -148,19 +148,19 @@ class OneStep:
             raise BadModel(f"the predictor of one period does not fit {robot.name}")
 
     def rollouts(self, robot: Robot, z: Array) -> Array:
-        """Return the outputs (T, N, n + d·discs) for windows z (T, r + N·m), as `predicted_outputs` has them."""
+        """Return the outputs (T, N, n + d·discs) for windows z (T, r + m + N·m), as `predicted_outputs` has them."""
         from brakeline.safety.filter.kernels import window_rollout_kernels
 
         return window_rollout_kernels.rollouts(self.arguments(robot), np.ascontiguousarray(z))
 
     def stretches(self, robot: Robot, z: Array) -> Array:
-        """Return the factors on the sets (T, N) of windows z (T, r + N·m), at least 1: sqrt(1 + weight · leverage)."""
+        """Return the factors sqrt(1 + weight · leverage) on the sets (T, N) of windows z (T, r + m + N·m)."""
         from brakeline.safety.filter.kernels import window_rollout_kernels
 
         return window_rollout_kernels.stretches(*self.stretch_arguments(robot), np.ascontiguousarray(z))
 
     def leverages(self, robot: Robot, z: Array) -> Array:
-        """Return the leverages (T, N) of windows z (T, r + N·m), with which the sets grow."""
+        """Return the leverages (T, N) of windows z (T, r + m + N·m), with which the sets grow."""
         return replace(self, weight=1.0).stretches(robot, z) ** 2 - 1.0
 
     def arguments(self, robot: Robot) -> Predictor:

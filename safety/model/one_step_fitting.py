@@ -46,7 +46,7 @@ TRIED, CHOSEN, SCORED = 0.4, 0.8, 0.95  # shares of the work that are done after
 FOLDS = 5
 DEGREES, LAGS, PENALTIES = (1, 2, 3, 4), (0, 1), (1.0, 3.0)
 MOST_FEATURES, FEWEST_PERIODS_A_FEATURE = 600, 5  # to select from
-RIDGE = 1e-9  # of the fit, as a share of each feature's square: features of which one nearly follows from others
+RIDGE = 1e-9  # of the fit, as a share of each feature's square: for features that nearly depend on each other
 MOST_AT_ONCE = 10_000  # periods whose features are in memory at once
 GOOD, MOST_GOOD = 1.25, 4  # of candidates up to this factor above the least error, the best: their sets are compared
 SIMPLER = 1.03  # a simpler candidate wins if its sets are at most this factor wider
@@ -161,7 +161,7 @@ class Choice:
     Attributes:
         candidate: the candidate.
         weight: of the leverage.
-        level: with how many of the `spread_features` half-widths do not grow: 0, or the measured speeds.
+        level: number of leading `spread_features` without a slope: 0, or all measured speeds.
         width [m]: geometric mean of the half-widths of calibrated last sets, out of fold: of plans, and of a stop from
             full speed.
         full (1, nz): regressors of a stop from full speed.
@@ -220,7 +220,7 @@ class Regression:
 
         Least squares takes measured speeds for true ones, so an error of a speed makes its coefficient too small, and
         a rollout adds that up. The instruments are the features of the speeds that the period before predicts: they
-        follow the true speeds, and do not know the errors of the measured ones.
+        follow the true speeds, and are independent of the errors of the measured ones.
         """
         s, r = self._s, len(self._robot.regressor)
         good = s.follows & (s.period_fold != without)
@@ -268,7 +268,7 @@ def unheard(share: float) -> None:
 def choose(
     robot: Robot, s: Samples, outside: float = RARE, progress: Progress = unheard
 ) -> tuple[Choice, list[Candidate], Regression]:
-    """Choose features, fit, and how the sets grow: by the width of the sets that the out-of-fold errors need.
+    """Choose features, fit, and how the sets grow: of those with the least out-of-fold errors, the narrowest sets.
 
     Returns:
         The choice, all candidates from the least out-of-fold error to the largest, and the regression of the choice.
@@ -315,12 +315,12 @@ class Calibration:
     """How the predictor of one period was chosen, and how far its sets had to be widened.
 
     Attributes:
-        chosen, candidates: the choice, and all candidates from the best to the worst.
+        chosen, candidates: the choice, and all candidates in the order of their out-of-fold errors.
         factor: factor on the final shape of positions and chord deviations, from the out-of-fold scores.
         scores (T,): how much of its sets every window used; above 1, a part of the window is outside.
         first_scores (T,): the same for the predicted state after one period alone.
         samples: the recorded driving.
-        smallest_singular, condition: of the chosen features, each scaled to its root mean square.
+        smallest_singular, condition: of the chosen features, each scaled to unit norm.
     """
 
     chosen: Candidate
@@ -347,7 +347,7 @@ def fit_one_step(
     """
     robot = data.robot
     if robot.feedback:
-        raise ErrorBoundError("what a feedback makes of the state has to be recorded: use mode direct")
+        raise ErrorBoundError("mode one-step does not support robots that stop by feedback: use mode direct")
     s = samples_of(data.joined())
     choice, candidates, regression = choose(robot, s, model_config.outside, progress)
     chosen, full = choice.candidate, choice.full

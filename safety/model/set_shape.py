@@ -20,7 +20,7 @@ SETTLED = 3  # plans' lengths after which a robot with constant inputs has settl
 RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
 MOST_TYPICAL = 5_000  # windows from whose starts the typical plans begin: more hardly change their mean
-CHORD_INFLATION = 1.15  # of the chord deviations' shape, which has no predictor: one factor is for all parts
+CHORD_INFLATION = 1.15  # on the chord deviations' shape, because calibration scales all parts by one factor
 LEAST_CHORD = 0.2  # of the position's half-width: a chord deviation of a millimetre must not widen all sets
 
 
@@ -58,7 +58,7 @@ def stop_from_full_speed(robot: Robot, z: Array, one_step: OneStep) -> Array:
     """Return the regressors (1, nz) of a plan from all inputs at their upper bounds.
 
     Speeds that follow no input, such as a boat's sway, are those at which the predictor settles with these inputs,
-    within what was recorded in z (T, nz): a boat drifts little, but in a fast turn it drifts a lot.
+    within what was recorded in z (T, nz), as absolute values: a boat's sway is small, but not in fast turns.
     """
     high, measured = np.asarray(robot.high()), list(robot.regressor)
     follows, known = np.isin(measured, robot.follows), len(measured)
@@ -76,8 +76,7 @@ def typical_plans(robot: Robot, z: Array, full: Array, last: bool = False) -> Ar
     """Return the `spread_features` (N, P, q) of plans from the starts of windows z (T, nz), and of a fast stop.
 
     Recorded driving holds large inputs until the end of a window, while plans brake. The stop from full speed, with the
-    regressors `full` (1, nz), is the last one. It counts as much as `FULL_SPEED` of the plans: such stops are rare, and
-    need the most room.
+    regressors `full` (1, nz), is the last one. `FULL_SPEED` is its weight: such stops are rare, and need the most room.
     """
     starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
     return spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
@@ -154,7 +153,7 @@ def _tightest(features: Array, values: Array, inflation: float, plans: Array, sh
     """Return slopes (n', q) and w (n',) that hold the values (T, n') and are tightest for the plans' features (P, q).
 
     Two linear programs: the first minimises the mean of the half-widths, in which fast plans weigh most; the second the
-    mean of their ratios to those of the first, so that a plan near a stand, where obstacles are close, counts as much.
+    mean of their ratios to those of the first. So a slow plan counts as much: close to obstacles, a robot is slow.
     """
     slopes, w = envelopes(features, values, inflation, share @ plans)
     widths = plans @ slopes.T + w
