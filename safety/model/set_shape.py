@@ -15,7 +15,9 @@ from brakeline.safety.model.windows import plan_regressor_map
 
 Array = NDArray[np.float64]
 
-FULL_SPEED = 0.3  # weight of a stop from full speed among the plans for which a shape is tightest
+# Weight of a stop from full speed among the plans for which a shape is tightest: of positions, which decide about
+# obstacles, and of the other coordinates, which must hold whatever the inputs do within a period.
+FULL_SPEED, FULL_SPEED_OTHERS = 0.3, 0.1
 SETTLED = 3  # plans' lengths after which a robot with constant inputs has settled
 RARE = 0.001  # share of the windows that do not decide about the shape
 MOST_FOR_SHAPE = 20_000  # windows
@@ -76,7 +78,7 @@ def typical_plans(robot: Robot, z: Array, full: Array, last: bool = False) -> Ar
     """Return the `spread_features` (N, P, q) of plans from the starts of windows z (T, nz), and of a fast stop.
 
     Recorded driving holds large inputs until the end of a window, while plans brake. The stop from full speed, with the
-    regressors `full` (1, nz), is the last one. `FULL_SPEED` is its weight: such stops are rare, and need the most room.
+    regressors `full` (1, nz), is the last one, and has a weight of its own: such stops are rare, and need the most room.
     """
     starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
     return spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
@@ -104,7 +106,13 @@ class Shape:
 
     @staticmethod
     def around(
-        spread: Array, errors: Array, plans: Array, inflation: float = 1.0, level: int = 0, outside: float = 0.0
+        spread: Array,
+        errors: Array,
+        plans: Array,
+        inflation: float = 1.0,
+        level: int = 0,
+        outside: float = 0.0,
+        others: slice = slice(0),
     ) -> Shape:
         """Return the shape that holds the errors (T, N, n') and is tightest for plans as the filter has (`_tightest`).
 
@@ -116,17 +124,20 @@ class Shape:
             level: number of features, from the first on, with which half-widths do not grow.
             outside: share of the windows that the shape need not hold: those that most exceed the others' trend. Their
                 errors would decide about all sets, and such a share of windows may leave its sets anyway.
+            others: the coordinates that are no positions.
         """
-        shape = Shape._holding(spread, errors, plans, inflation, level)
+        shape = Shape._holding(spread, errors, plans, inflation, level, others)
         if not (dropped := int(outside * len(errors))):
             return shape
         held = np.argsort(shape.scores(spread, errors))[:-dropped]
-        return Shape._holding(spread[:, held], errors[held], plans, inflation, level)
+        return Shape._holding(spread[:, held], errors[held], plans, inflation, level, others)
 
     @staticmethod
-    def _holding(spread: Array, errors: Array, plans: Array, inflation: float, level: int) -> Shape:
-        share = np.full(plans.shape[1], (1.0 - FULL_SPEED) / (plans.shape[1] - 1))
-        share[-1] = FULL_SPEED
+    def _holding(spread: Array, errors: Array, plans: Array, inflation: float, level: int, others: slice) -> Shape:
+        fast = np.full(errors.shape[2], FULL_SPEED)
+        fast[others] = FULL_SPEED_OTHERS
+        share = np.tile(((1.0 - fast) / (plans.shape[1] - 1))[:, None], plans.shape[1])
+        share[:, -1] = fast
         each = zip(spread[..., level:], np.moveaxis(np.abs(errors), 1, 0), plans[..., level:], strict=True)
         found = [_tightest(features, values, inflation, some, share) for features, values, some in each]
         grown, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
@@ -152,12 +163,14 @@ class Shape:
 def _tightest(features: Array, values: Array, inflation: float, plans: Array, share: Array) -> tuple[Array, Array]:
     """Return slopes (n', q) and w (n',) that hold the values (T, n') and are tightest for the plans' features (P, q).
 
+    Each coordinate weighs the plans by its share (n', P).
+
     Two linear programs: the first minimises the mean of the half-widths, in which fast plans weigh most; the second the
     mean of their ratios to those of the first. So a slow plan counts as much: close to obstacles, a robot is slow.
     """
     slopes, w = envelopes(features, values, inflation, share @ plans)
     widths = plans @ slopes.T + w
-    weights = share[:, None] / np.maximum(widths, 1e-9 * widths.max(0, keepdims=True) + 1e-300)
+    weights = share.T / np.maximum(widths, 1e-9 * widths.max(0, keepdims=True) + 1e-300)
     return envelopes(features, values, inflation, (weights / weights.sum(0)).T @ plans)
 
 
@@ -172,7 +185,8 @@ def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full
     some = np.linspace(0, len(z) - 1, min(len(z), MOST_FOR_SHAPE)).astype(int)
     both = np.concatenate([errors[some], chords[some, :, None]], axis=2)
     plans = typical_plans(robot, z[some], full)
-    shape = Shape.around(spread_features(robot, z[some]), both, plans, level=level, outside=RARE)
+    others = slice(robot.position_dim, robot.state_dim)
+    shape = Shape.around(spread_features(robot, z[some]), both, plans, level=level, outside=RARE, others=others)
     shape.slopes[:, -1] *= CHORD_INFLATION
     if robot.position_dim:
         least = LEAST_CHORD * shape.w[-1, : robot.position_dim].mean()
