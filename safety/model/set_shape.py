@@ -78,7 +78,7 @@ def typical_plans(robot: Robot, z: Array, full: Array, last: bool = False) -> Ar
     """Return the `spread_features` (N, P, q) of plans from the starts of windows z (T, nz), and of a fast stop.
 
     Recorded driving holds large inputs until the end of a window, while plans brake. The stop from full speed, with the
-    regressors `full` (1, nz), is the last one, and has a weight of its own: such stops are rare, and need the most room.
+    regressors `full` (1, nz), is the last one, with a weight of its own: such stops are rare, and need the most room.
     """
     starts = z[:: math.ceil(len(z) / MOST_TYPICAL)]
     return spread_features(robot, np.vstack([plans_from(robot, starts), full]), last)
