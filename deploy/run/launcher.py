@@ -323,6 +323,7 @@ class Launcher:
 
         If nothing has begun, end all of them at once: they still import, and there is nothing to lose.
         """
+        self._drain()  # the first steps may have come since
         others = [child for child in self.processes if child.spec.kind not in ("actor", "recorder")]
         groups, patience = [self._of("actor"), others, self._of("recorder")], TERMINATION_TIMEOUT
         if not self._begun():

@@ -72,7 +72,7 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path, episodes, n_step):
 
 
 def test_it_learns():
-    learner = Learner(TOY, replace(CONFIG, steps=1000))
+    learner = Learner(TOY, replace(CONFIG, steps=1600))  # sums differ from processor to processor
     actor = finish(learner)
     assert np.mean(actor.rewards[-20:]) > 0.5 * np.mean(actor.rewards[:5])
     policy = policy_weights.decode(learner.weights().file, TOY)
