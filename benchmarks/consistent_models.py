@@ -25,10 +25,10 @@ from scipy.optimize import linprog
 
 from brakeline.compilation import compiled
 from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.model.calibration_samples import Samples
 from brakeline.safety.model.error_bounds import envelopes, least_squares, whitening
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.safety.model.one_step import Features
-from brakeline.safety.model.one_step_fitting import Samples
 
 DIRECTIONS = 300  # recorded φ in whose directions the consistent models are bounded to find the samples that matter
 MOST_EDGES = 10_000  # that a linear program follows

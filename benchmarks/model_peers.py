@@ -42,12 +42,14 @@ from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.methods import Method
+from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import MATRIX_ZONOTOPE
 from brakeline.safety.model.model_config import CBF, DIRECT, FREE, ONE_STEP, PLAN, RECURSION, ModelConfig
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.one_step import features_for
-from brakeline.safety.model.one_step_fitting import Regression, choose, samples_of
+from brakeline.safety.model.one_step_fitting import choose
+from brakeline.safety.model.one_step_regression import Regression
 from brakeline.safety.model.windows import displacement, non_overlapping, plan_regressor_map, windows
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier

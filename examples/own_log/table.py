@@ -26,9 +26,9 @@ from drive import VEHICLES, Simulator, Vehicle
 from numpy.typing import NDArray
 
 from brakeline import BackupPlan, Dataset, Filter, InProcess, ModelSet, Obstacle, Request, Shapes, validate
+from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.driving_kinds import driving_kinds
 from brakeline.safety.model.model_set import extra_coordinates
-from brakeline.safety.model.one_step_fitting import samples_of
 
 Array = NDArray[np.float64]
 

@@ -9,21 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.errors import BadData, ErrorBoundError
+from brakeline.errors import ErrorBoundError
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.calibration_samples import Samples, samples_of
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import driving_kinds
 from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound
-from brakeline.safety.model.feature_selection import SelectionPath
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
-from brakeline.safety.model.one_step import Features, OneStep, features_for
+from brakeline.safety.model.one_step import features_for
+from brakeline.safety.model.one_step_regression import PENALTIES, Candidate, Regression
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import (
     RARE,
@@ -35,7 +35,6 @@ from brakeline.safety.model.set_shape import (
     stop_from_full_speed,
     typical_plans,
 )
-from brakeline.safety.model.windows import displacement, predicted_outputs, way_after_rest, ways
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -43,11 +42,8 @@ Index = NDArray[np.int64]
 Progress = Callable[[float], None]  # called with the share of the work that is done
 TRIED, CHOSEN, SCORED = 0.4, 0.8, 0.95  # shares of the work that are done after each part
 
-FOLDS = 5
-DEGREES, LAGS, PENALTIES = (1, 2, 3, 4), (0, 1), (1.0, 3.0)
+DEGREES, LAGS = (1, 2, 3, 4), (0, 1)
 MOST_FEATURES, FEWEST_PERIODS_A_FEATURE = 600, 5  # to select from
-RIDGE = 1e-9  # of the fit, as a share of each feature's square: for features that nearly depend on each other
-MOST_AT_ONCE = 10_000  # periods whose features are in memory at once
 GOOD, MOST_GOOD = 1.25, 4  # of candidates up to this factor above the least error, the best: their sets are compared
 SIMPLER = 1.03  # a simpler candidate wins if its sets are at most this factor wider
 WEIGHTS = (1.0, 3.0, 10.0, 30.0)  # of the leverage
@@ -55,103 +51,6 @@ MOST_TO_CHOOSE = 10_000  # windows by which candidates are compared
 PLANS_EVERY = 4  # from every fourth of these windows, plans whose sets are compared
 FEWEST_ENDS = 20  # windows that end in a stop, to fit how the way after it depends on the driving before
 QUANTILE = 0.99  # of the out-of-fold errors, by which candidates are compared
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Recorded driving, cut into folds.
-
-    Attributes:
-        v (P, v), y (P, n), period_fold (P,), follows (P,): all periods: variables [s; u; input of the period before],
-            outputs, and whether the period follows the one in the row before.
-        z (T, nz), after (T, N, n + d·discs), chords (T, N), stops (T,), fold (T,), start (T, 2): all windows of N
-            periods that lie in one fold: regressors, outputs after each period, chord deviations [m], the way after the
-            window [m] if it ends in a stop, otherwise NaN, trajectory and first period.
-    """
-
-    v: Array
-    y: Array
-    period_fold: Index
-    follows: NDArray[np.bool_]
-    z: Array
-    after: Array
-    chords: Array
-    stops: Array
-    fold: Index
-    start: Index
-
-
-def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
-    """Cut recorded driving into periods and windows, each with its fold.
-
-    With many trajectories, a fold consists of whole trajectories; otherwise, of one block of each trajectory.
-
-    Raises:
-        BadData: a fold holds no window; the message says how much driving is missing.
-    """
-    robot, N = data.robot, data.robot.horizon
-    whole = len(data.trajectories) >= 4 * folds
-    parts: list[tuple[NDArray[Any], ...]] = []
-    for number, t in enumerate(data.trajectories):
-        periods = len(t.inputs)
-        block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
-        parts.append((*_periods(robot, t), block, np.arange(periods) > 0, *_windows(data, t, number, block)))
-    names = ("v", "y", "period_fold", "follows", "z", "after", "chords", "stops", "fold", "start")
-    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    samples = Samples(**dict(zip(names, columns, strict=True)))
-    if len(np.unique(samples.fold)) < folds:
-        needed = 4 * folds * N * robot.period / 60.0
-        raise BadData(f"too little driving to calibrate with: record at least {needed:.1f} minutes")
-    return samples
-
-
-def _before(robot: Robot, t: Trajectory) -> Array:
-    """Return the input in force at each period's start (T, m)."""
-    first = np.zeros(robot.action_dim) if t.before is None else t.before
-    return np.vstack([first, t.inputs[:-1]])
-
-
-def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
-    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, _before(robot, t)])
-    return v, displacement(robot, t.states[:-1], t.states[1:])
-
-
-def _windows(
-    data: Dataset, t: Trajectory, number: int, block: Index
-) -> tuple[Array, Array, Array, Array, Index, Index]:
-    robot, N = data.robot, data.robot.horizon
-    start = np.arange(max(len(t.inputs) - N + 1, 0))
-    start = start[block[start] == block[start + N - 1]]
-    at = start[:, None] + np.arange(N)
-    measured, inputs = t.states[start][:, list(robot.regressor)], t.inputs[at].reshape(len(at), N * robot.action_dim)
-    z = np.hstack([measured, _before(robot, t)[start], inputs])
-    ends = [displacement(robot, t.states[start], t.states[start + k]) for k in range(1, N + 1)]
-    after = [predicted_outputs(robot, end) for end in ends]
-    chords = (ways(robot, t)[0] + data.chord_deviation)[at]
-    stops = way_after_rest(robot, t)[start + N]
-    return z, np.stack(after, 1), chords, stops, block[start], np.column_stack([np.full(len(start), number), start])
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A way to fit the predictor, and its out-of-fold error.
-
-    Attributes:
-        degree, lags: of the features to select from (`features_for`).
-        penalty: of the selection (`SelectionPath`).
-        instruments: whether the coefficients come from instrumental variables.
-        error [m]: the 99 % quantile of the distance between predicted and measured position, over all windows and
-            periods, each predicted without its fold. In joint space, of the largest error of a limit's value, in units
-            of `Robot.limit_scales`.
-        features: number of selected features.
-    """
-
-    degree: int
-    lags: int
-    penalty: float
-    instruments: bool
-    error: float = np.nan
-    features: int = 0
 
 
 @dataclass(frozen=True)
@@ -172,93 +71,6 @@ class Choice:
     level: int
     width: float
     full: Array
-
-
-class Regression:
-    """Fits to all folds, or to all but one, from the second moments of each fold."""
-
-    def __init__(self, robot: Robot, features: Features, s: Samples) -> None:
-        """Take the features to select from, and the recorded driving."""
-        self._robot, self._features, self._s = robot, features, s
-        count, n = len(features.terms), s.y.shape[1]
-        folds = int(s.period_fold.max()) + 1
-        self.folds = range(folds)
-        self._gram, self._cross = np.zeros((folds, count, count)), np.zeros((folds, count, n))
-        for i in self.folds:
-            rows = np.flatnonzero(s.period_fold == i)
-            for some in np.array_split(rows, len(rows) // MOST_AT_ONCE + 1):
-                phi = features(s.v[some])
-                self._gram[i] += phi.T @ phi
-                self._cross[i] += phi.T @ s.y[some]
-        self._paths: dict[int, list[SelectionPath]] = {}
-
-    def fit(self, candidate: Candidate, without: int = -1, weight: float = 0.0) -> OneStep:
-        """Return the predictor that is fitted to all folds but one, with a weight of the leverage."""
-        folds = [i for i in self.folds if i != without]
-        gram, cross = self._gram[folds].sum(0), self._cross[folds].sum(0)
-        chosen = [path.best(candidate.penalty) for path in self._paths_without(without, gram, cross)]
-        used = np.unique(np.concatenate([[0], *chosen]))  # the constant, for an output without features
-        places = [np.searchsorted(used, one) for one in chosen]
-        features, gram, cross = self._features.some(used), gram[np.ix_(used, used)], cross[used]
-        gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12 * gram[0, 0])
-        C = _solved(places, gram, cross)
-        if candidate.instruments:
-            C = self._by_instruments(features, C, places, without)
-        root = np.linalg.inv(np.linalg.cholesky(gram))
-        return OneStep(C, features, root, weight)
-
-    def _paths_without(self, without: int, gram: Array, cross: Array) -> list[SelectionPath]:
-        if without not in self._paths:
-            y = self._s.y[self._s.period_fold != without]
-            squares, least = (y**2).sum(0), min(PENALTIES)
-            of_outputs = zip(cross.T, squares, strict=True)
-            self._paths[without] = [SelectionPath.of(gram, c, float(q), len(y), least) for c, q in of_outputs]
-        return self._paths[without]
-
-    def _by_instruments(self, features: Features, C: Array, places: list[Index], without: int) -> Array:
-        """Return the coefficients from instrumental variables.
-
-        Least squares takes measured speeds for true ones, so an error of a speed makes its coefficient too small, and
-        a rollout adds that up. The instruments are the features of the speeds that the period before predicts: they
-        follow the true speeds, and are independent of the errors of the measured ones.
-        """
-        s, r = self._s, len(self._robot.regressor)
-        good = s.follows & (s.period_fold != without)
-        good[1:] &= s.period_fold[1:] == s.period_fold[:-1]
-        known = np.flatnonzero(good)
-        mixed, cross = np.zeros((len(features.terms),) * 2), np.zeros((len(features.terms), len(C)))
-        for some in np.array_split(known, len(known) // MOST_AT_ONCE + 1):
-            predicted = features(s.v[some - 1]) @ C[list(self._robot.regressor)].T
-            instruments = features(np.hstack([predicted, s.v[some][:, r:]]))
-            mixed += instruments.T @ features(s.v[some])
-            cross += instruments.T @ s.y[some]
-        return _solved(places, mixed + np.diag(RIDGE * np.abs(np.diag(mixed))), cross)
-
-    def quality(self, one_step: OneStep) -> tuple[float, float]:
-        """Return the smallest singular value and the condition number of the scaled features of a predictor."""
-        phi = one_step.features(self._s.v)
-        scaled = phi / np.sqrt(np.maximum((phi**2).sum(0), 1e-300))
-        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled.T @ scaled), 0.0))
-        return float(singular[0]), float(singular[-1] / max(singular[0], 1e-300))
-
-    def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
-        """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""
-        found = np.empty_like(s.after)
-        for i in self.folds:
-            held = s.fold == i
-            found[held] = s.after[held] - self.fit(candidate, without=i).rollouts(self._robot, s.z[held])
-        return found
-
-
-def _solved(places: list[Index], gram: Array, cross: Array) -> Array:
-    """Return the coefficients (n, F) of each output, which has only the features at its places."""
-    C = np.zeros((cross.shape[1], len(gram)))
-    for i, used in enumerate(places):
-        try:
-            C[i, used] = np.linalg.solve(gram[np.ix_(used, used)], cross[used, i])
-        except np.linalg.LinAlgError:  # instruments that say nothing: the candidate drops out
-            C[i, used] = np.nan
-    return C
 
 
 def unheard(share: float) -> None:

@@ -28,7 +28,8 @@ from brakeline.safety.model.error_causes import (
 )
 from brakeline.safety.model.facet_normals import facet_normals
 from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
-from brakeline.safety.model.one_step_fitting import Calibration, Candidate
+from brakeline.safety.model.one_step_fitting import Calibration
+from brakeline.safety.model.one_step_regression import Candidate
 from brakeline.safety.model.set_shape import shares as shares_of
 from brakeline.safety.model.turning_in_place import inside
 from brakeline.safety.model.windows import (

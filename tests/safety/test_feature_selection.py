@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from brakeline.safety.model.calibration_samples import Samples
 from brakeline.safety.model.feature_selection import SelectionPath
 from brakeline.safety.model.one_step import features_for
-from brakeline.safety.model.one_step_fitting import Candidate, Regression, Samples
+from brakeline.safety.model.one_step_regression import Candidate, Regression
 from tests.safety.test_turning_in_place import ROBOT
 
 R, M = len(ROBOT.regressor), ROBOT.action_dim

@@ -20,10 +20,10 @@ from brakeline.safety.filter.recovery import slow_inputs
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig, ModelSet
-from brakeline.safety.model.one_step_fitting import samples_of
 from brakeline.safety.model.windows import ways
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess

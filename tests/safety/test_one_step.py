@@ -16,11 +16,12 @@ from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, START, driving_kinds
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
-from brakeline.safety.model.one_step_fitting import fit_one_step, samples_of
+from brakeline.safety.model.one_step_fitting import fit_one_step
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import Shape, spread_features, typical_plans
 from brakeline.safety.model.windows import FREE
