@@ -621,6 +621,7 @@ class Decision(_message.Message):
     BOUND_FIELD_NUMBER: _builtins.int
     JUDGES_FIELD_NUMBER: _builtins.int
     SCORE_FIELD_NUMBER: _builtins.int
+    OUTSIDE_SHARE_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
     """rad, of the frame in which its position part is a box"""
@@ -663,6 +664,8 @@ class Decision(_message.Message):
     """the model set can score the last periods: send them with the next request"""
     score: _builtins.float
     """largest ratio of an error to its set, without widening, in the periods of the request"""
+    outside_share: _builtins.float
+    """of such periods, the share that may leave the sets, as asked of the model set"""
     @_builtins.property
     def plan(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """(horizon, inputs); its first row is to be executed now"""
@@ -725,10 +728,11 @@ class Decision(_message.Message):
         bound: _builtins.float | None = ...,
         judges: _builtins.bool = ...,
         score: _builtins.float | None = ...,
+        outside_share: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "score", b"score", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "judges", b"judges", "kind", b"kind", "margin", b"margin", "model", b"model", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "score", b"score", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "judges", b"judges", "kind", b"kind", "margin", b"margin", "model", b"model", "outside_share", b"outside_share", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "score", b"score", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
     _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015

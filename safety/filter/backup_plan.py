@@ -136,6 +136,7 @@ class BackupPlan:
         reservation: Reservation | None = None,
         score: float | None = None,
         judges: bool = False,
+        outside_share: float = 0.0,
     ) -> Array:
         """Commit to the plan of a decision; return the input to execute next.
 
@@ -143,13 +144,14 @@ class BackupPlan:
             plan, model, predicted, verified, plan_tokens, reservation: those of the decision.
             score: the score of the window that ended with the request, if the filter gave one.
             judges: whether the filter can score a window. If not, `past` gives none, and the last period is scored.
+            outside_share: the share of windows that may leave the sets.
         """
         self._judged = judges
         if verified and model != self._scored_by:  # scores are relative to the sets of one model set
             self.widening.forget()
             self._scored_by = model
         elif score is not None:
-            self.widening.judge(score)
+            self.widening.judge(score, outside_share)
         elif not judges and self._compare and self.predicted is not None:
             self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
         self.reservation = reservation

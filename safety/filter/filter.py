@@ -76,6 +76,7 @@ class Filter:
         clearance_margin: distance to obstacles that the QP keeps [m].
         reach: an obstacle farther away than this cannot change a decision [m].
         bound: the share of plans outside their tubes that the model set states.
+        outside_share: see `Decision`.
         start: factor on the sets of a request without past window (see `OneStep.start`).
     """
 
@@ -107,6 +108,7 @@ class Filter:
         self.translating = np.concatenate([np.zeros(robot.regressor_dim, dtype=bool), driven])
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self._score = None if model.one_step is None else WindowScore(model, model.one_step)
+        self.outside_share = 0.0 if model.one_step is None else model.model_config.outside
         self.start = 1.0 if model.one_step is None else model.one_step.start
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
@@ -369,6 +371,7 @@ class Filter:
             reservation=reservation,
             bound=self.bound,
             judges=self.model.one_step is not None,
+            outside_share=self.outside_share,
             score=self.score(request),
         )
 

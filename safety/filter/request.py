@@ -128,6 +128,7 @@ class Decision:
         bound: the largest share of verified plans that leave their tubes, at 99 % confidence. 1 if the model set states
             no bound, None if the method verifies nothing.
         judges: the model set can score a window that has ended; the next request should hold one.
+        outside_share: the share of windows that may leave the sets (`certify --outside`). 0 if `judges` is false.
         score: the largest ratio of an error to its set, without widening, in the request's past window. None without
             such a window, or if the model set cannot score it.
         for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
@@ -157,6 +158,7 @@ class Decision:
     bound: float | None = None
     for_clearance: bool | None = None
     judges: bool = False
+    outside_share: float = 0.0
     score: float | None = None
 
 

@@ -3,6 +3,7 @@
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
+The scores of as many windows as may leave the sets do not count: their owner asked for such sets (`certify --outside`).
 Some model sets predict plans only, so the filter cannot score windows. Then the client scores each period itself.
 """
 
@@ -17,8 +18,24 @@ from brakeline.messaging.robot import Array, Robot
 
 WINDOWS = 600  # last windows whose scores count
 PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets
+ROUNDING = 1e-9  # of a share times `WINDOWS`
 MOST = 1e3  # beyond it nothing is verified anyway, and a request needs a finite factor
-RESERVE = 1.1  # factor on the largest score
+RESERVE = 1.1  # factor on the largest score that counts
+
+
+def widening_factor(scores: Array, outside_share: float) -> Array:
+    """Return the factors (...,) on every set that follow from scores.
+
+    Args:
+        scores (..., WINDOWS): the last scores; 0 where there were fewer.
+        outside_share: the share of windows that may leave the sets. They widen nothing, unless a score is infinite.
+    """
+    largest = scores.max(axis=-1)
+    if left_out := int(outside_share * WINDOWS + ROUNDING):
+        place = WINDOWS - 1 - left_out
+        counting = np.partition(scores, place, axis=-1)[..., place]
+        largest = np.where(np.isfinite(largest), counting, largest)
+    return np.asarray(np.clip(RESERVE * largest, 1.0, MOST))
 
 
 @dataclass(frozen=True)
@@ -37,6 +54,7 @@ class Widening:
 
     Attributes:
         left: of the last `PLANS` windows that do not overlap, whether each left its sets as they were widened.
+        factor: the factor on every set: at least 1.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -46,8 +64,8 @@ class Widening:
 
     def forget(self) -> None:
         """Drop all scores: another model set is in use."""
-        self._scores: deque[tuple[int, float]] = deque()  # falling scores, each the largest since the one before it
-        self._count = 0
+        self._scores, self._count = np.zeros(WINDOWS), 0  # score i stands at i modulo WINDOWS
+        self.factor = 1.0
         self.left: deque[bool] = deque(maxlen=PLANS)
         self._uncounted = 0  # periods since the last window in `left` ended
         self._asked = 1.0  # the factor of the last request
@@ -78,10 +96,13 @@ class Widening:
             return None
         return PastWindow(np.array(self._states), np.array(self._inputs), self._periods < 2 * N)
 
-    def judge(self, score: float) -> None:
-        """Add the score of a window that has ended. A score that is no number counts as infinite."""
+    def judge(self, score: float, outside_share: float = 0.0) -> None:
+        """Add the score of a window that has ended. A score that is no number counts as infinite.
+
+        outside_share: the share of windows that may leave the sets.
+        """
         score = score if score == score else np.inf
-        self._add(score, bool(self._factors) and score > self._factors[0])
+        self._add(score, bool(self._factors) and score > self._factors[0], outside_share)
 
     def judge_period(self, share_used: float) -> None:
         """Add the score of the last period, for a model set that cannot score windows.
@@ -95,20 +116,12 @@ class Widening:
         """
         if self._factors:
             score = share_used * self._factors[-1]
-            self._add(score if score > 1.0 else 0.0, share_used > 1.0)
+            self._add(score if score > 1.0 else 0.0, share_used > 1.0, 0.0)
 
-    def _add(self, score: float, left: bool) -> None:
+    def _add(self, score: float, left: bool, outside_share: float) -> None:
         if self._factors and self._uncounted >= self.robot.horizon:
             self.left.append(left)
             self._uncounted = 0
+        self._scores[self._count % WINDOWS] = score
         self._count += 1
-        while self._scores and self._scores[-1][1] <= score:
-            self._scores.pop()
-        self._scores.append((self._count, score))
-        if self._scores[0][0] <= self._count - WINDOWS:
-            self._scores.popleft()
-
-    @property
-    def factor(self) -> float:
-        """The factor on every set: at least 1."""
-        return min(max(1.0, RESERVE * self._scores[0][1]), MOST) if self._scores else 1.0
+        self.factor = float(widening_factor(self._scores, outside_share))

@@ -155,4 +155,5 @@ def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
         answer.reservation,
         answer.score,
         answer.judges,
+        answer.outside_share,
     )

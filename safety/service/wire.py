@@ -26,6 +26,7 @@ from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision, Request
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
 from brakeline.safety.filter.widening import PastWindow
+from brakeline.safety.model.model_config import MOST_OUTSIDE
 
 KIND_NUMBERS = {ALLOWED: pb.ALLOWED, ADJUSTED: pb.ADJUSTED, FAILSAFE: pb.FAILSAFE, RECOVERING: pb.RECOVERING}
 KIND_NAMES = {number: name for name, number in KIND_NUMBERS.items()}
@@ -213,6 +214,7 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
         queue_ms=queue_ms,
         for_clearance=decision.for_clearance,
         bound=decision.bound,
+        outside_share=decision.outside_share,
         score=decision.score,
         **{name: getattr(decision, name) for name in SAME_FIELDS},
     )
@@ -254,6 +256,8 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         reservation=reservation_of(m.reservation, robot) if m.HasField("reservation") else None,
         for_clearance=m.for_clearance if m.HasField("for_clearance") else None,
         bound=valid_bound(m.bound) if m.HasField("bound") else None,
+        # Of another share nothing is let out: then the largest score counts.
+        outside_share=m.outside_share if 0.0 <= m.outside_share <= MOST_OUTSIDE else 0.0,
         score=max(m.score, 0.0) if m.HasField("score") else None,
     )
 

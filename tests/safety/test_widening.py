@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
-from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening
+from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
+from brakeline.safety.model.model_config import MOST_OUTSIDE
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import decision_of, decision_reply, request_of
@@ -37,6 +41,41 @@ def test_the_factor_is_a_tenth_above_the_largest_recent_score_and_never_below_on
     assert widening.factor == 1.0
     widening.judge(np.nan)
     assert widening.factor == MOST
+
+
+def test_as_many_windows_as_may_leave_the_sets_do_not_widen_them():
+    widening, share = Widening(ROBOT), 0.005
+    for score in (2.0, 1.5, 3.0):  # 0.5 % of 600 windows are three
+        widening.judge(score, share)
+    assert widening.factor == 1.0
+    widening.judge(1.4, share)
+    assert widening.factor == pytest.approx(1.4 * RESERVE)
+    widening.judge(0.1, 0.001)  # not one of 600
+    assert widening.factor == pytest.approx(3.0 * RESERVE)
+    widening.judge(np.nan, share)
+    assert widening.factor == MOST, "a window without a score is no window that may leave its sets"
+
+
+@given(scores=arrays(float, WINDOWS, elements=st.floats(0.0, 50.0)), share=st.floats(0.0, MOST_OUTSIDE))
+def test_no_more_windows_than_may_leave_the_sets_are_beyond_the_factor(scores, share):
+    factor = widening_factor(scores, share)
+    assert factor >= 1.0 and (scores > factor).mean() <= share + 1e-9
+    assert factor <= widening_factor(scores, 0.0)
+
+
+def test_a_share_from_the_network_that_is_none_lets_no_window_out():
+    for share, kept in ((0.01, 0.01), (0.5, 0.0), (-1.0, 0.0), (np.nan, 0.0)):
+        reply = decision_reply(replace(ready().decide(request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS))), 0.0)
+        reply.decision.outside_share = share
+        assert decision_of(reply.decision, ROBOT).outside_share == kept
+
+
+def test_the_filter_says_what_share_its_model_set_lets_out():
+    model = certified()[0]
+    loose = replace(model, model_config=replace(model.model_config, outside=0.02))
+    ask = request(np.zeros(5), np.zeros(2), np.zeros(2), POSTS)
+    assert Filter(loose).decide(ask).outside_share == 0.02
+    assert Filter.load("ground").outside_share == 0.0, "it scores single periods, of which none may be outside"
 
 
 def test_a_window_holds_the_last_periods_without_a_gap():

@@ -57,8 +57,10 @@ class BatchFilter:
                 self._prepared[key] = LaneDecisions(self.safety, xp, device)
             with np.errstate(all="ignore"):  # lanes that overflow are left to the single path
                 decided = self._prepared[key].decide(requests, answers)
-        about = {"bound": self.safety.bound, "judges": self.safety.model.one_step is not None}
-        return completed(self.safety, requests, answers, ~on_host(decided), started, **about)
+        safety = self.safety
+        judges = safety.model.one_step is not None
+        about = {"bound": safety.bound, "judges": judges, "outside_share": safety.outside_share}
+        return completed(safety, requests, answers, ~on_host(decided), started, **about)
 
 
 def completed(
@@ -66,7 +68,7 @@ def completed(
 ) -> DecisionArrays:
     """Let a method decide the rows that are left (B,) one by one, and return all decisions.
 
-    started [ns]: time of the requests; about: `bound` and `judges` of `Decision`.
+    started [ns]: time of the requests; about: `bound`, `judges` and `outside_share` of `Decision`.
     """
     singly, rows = {}, np.flatnonzero(left).tolist()
     if rows:

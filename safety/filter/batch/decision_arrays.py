@@ -68,6 +68,7 @@ class DecisionArrays:
         model: see `Decision`.
         bound: see `Decision`.
         judges: see `Decision`.
+        outside_share: see `Decision`.
         time_ms: time for the whole batch, divided by its rows.
     """
 
@@ -95,6 +96,7 @@ class DecisionArrays:
     model: str
     bound: float | None
     judges: bool
+    outside_share: float
     time_ms: float
 
     def __len__(self) -> int:
@@ -133,6 +135,7 @@ class DecisionArrays:
             for_clearance=bool(self.for_clearance[index]) if adjusted else None,
             bound=self.bound,
             judges=self.judges,
+            outside_share=self.outside_share,
             score=float(self.score[index]) if bool(self.scored[index]) else None,
         )
 

@@ -21,7 +21,7 @@ from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.request_arrays import PastArrays, PredictionArrays, RequestArrays
-from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS
+from brakeline.safety.filter.widening import WINDOWS, widening_factor
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -75,7 +75,7 @@ class BackupPlanBatch:
         self._periods = np.zeros(size, dtype=np.int64)
         self._judged, self._widened = False, np.ones(size)  # factors by which the predicted sets were widened
         self._scores, self._place = np.zeros((size, WINDOWS)), np.zeros(size, dtype=np.int64)
-        self._scored = np.zeros(size, dtype=bool)
+        self._scored, self._outside_share = np.zeros(size, dtype=bool), 0.0
         self.reset(np.ones(size, dtype=bool))
 
     def reset(self, which: Flags) -> None:
@@ -90,7 +90,7 @@ class BackupPlanBatch:
     @property
     def widening(self) -> Array:
         """The factor (B,) on every set of the next decision."""
-        return np.asarray(np.clip(RESERVE * self._scores.max(axis=1), 1.0, MOST))
+        return widening_factor(self._scores, self._outside_share)
 
     def request(
         self, states: Array, actions: Array, obstacles: ObstacleArrays, observations: Observations | None = None
@@ -175,6 +175,7 @@ class BackupPlanBatch:
 
     def _accept(self, states: Array, rows: Flags, answers: DecisionArrays) -> None:
         self._judged, asked = answers.judges, self.widening
+        self._outside_share = answers.outside_share
         first = rows & answers.verified & ~self._scored
         self._scored |= first
         self._judge(rows & ~first & answers.scored, answers.score)

@@ -35,7 +35,7 @@ class RowByRow:
         """Decide on NumPy arrays. Raises BadRequest: a value is missing, not finite, or has the wrong size."""
         started, every = perf_counter_ns(), np.ones(len(requests), dtype=bool)
         answers = blank_answers(self.robot, requests, np, "cpu")
-        return completed(self._method, requests, answers, every, started, bound=None, judges=False)
+        return completed(self._method, requests, answers, every, started, bound=None, judges=False, outside_share=0.0)
 
 
 BatchMethod: TypeAlias = "Filter | RowByRow"  # what `BackupPlanBatch` asks
