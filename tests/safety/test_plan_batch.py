@@ -15,6 +15,7 @@ from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, correction_penalties
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.in_process import InProcess
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
@@ -64,6 +65,16 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
     plans.reset(np.arange(size) == 1)
     assert plans.widening[1] == 1.0
     env.close()
+
+
+def test_a_batch_leaves_out_as_many_scores_as_a_single_plan() -> None:
+    plans, singles, rng = BackupPlanBatch(SAFETY, 3), [Widening(GROUND) for _ in range(3)], np.random.default_rng(1)
+    plans._outside_share = 0.005
+    for scores in rng.exponential(1.0, (WINDOWS + 50, 3)):
+        plans._judge(np.ones(3, dtype=bool), scores)
+        for single, score in zip(singles, scores, strict=True):
+            single.judge(float(score), 0.005)
+        assert plans.widening.tolist() == [single.factor for single in singles]
 
 
 class Broken:
