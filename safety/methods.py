@@ -41,11 +41,12 @@ class Method(Protocol):
         """Return the decision. Raises BadRequest if a value of the request is not valid."""
 
 
-# The module and the class of each rival.
+# The module and the class of each rival, and of CBF the class by the robot's equations.
+UNICYCLE, VELOCITIES = ("unicycle_barrier", "UnicycleBarrier"), ("velocity_barrier", "VelocityBarrier")
 RIVALS = {
     SECAS: ("secas", "Secas"),
     SAILR: ("sailr", "Sailr"),
-    CBF: ("unicycle_barrier", "UnicycleBarrier"),
+    CBF: UNICYCLE,
     PSF: ("predictive_filter", "PredictiveFilter"),
 }
 METHODS = (DDPC, *RIVALS)
@@ -63,7 +64,8 @@ def ready(model: Model) -> Method:
         return Filter(model)
     if model.method not in RIVALS:
         raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
-    module, name = RIVALS[model.method]
+    velocities = model.method == CBF and model.robot.heading is None
+    module, name = VELOCITIES if velocities else RIVALS[model.method]
     method: Method = getattr(import_module(f"brakeline.safety.rivals.{module}"), name)(model)
     return method
 

@@ -1,6 +1,6 @@
 """Make the model that a rival needs before it can filter, and record the cost (`brakeline pretrain`).
 
-SECAS and SAILR train networks. The others know a unicycle by hand, and drive nothing.
+SECAS and SAILR train networks. The others know equations by hand, and drive nothing.
 """
 
 from __future__ import annotations
@@ -22,11 +22,21 @@ from brakeline.safety.rivals.pretrained import Pretrained
 
 @dataclass(frozen=True)
 class BarrierConfig:
-    """Configuration of the control barrier function (safety/rivals/unicycle_barrier.py)."""
+    """Configuration of the control barrier function of a unicycle (safety/rivals/unicycle_barrier.py)."""
 
     ahead: float = 0.05  # m
     rate: float = 2.0  # 1/s, tuned
     margin: float = 0.0  # m
+
+
+@dataclass(frozen=True)
+class VelocityBarrierConfig:
+    """Configuration of the control barrier function of a vehicle that follows velocities (`velocity_barrier.py`)."""
+
+    lag: float = 0.35  # s, the time constant of the velocity
+    deceleration: float = 3.0  # m/s²
+    rate: float = 2.0  # 1/s, tuned
+    margin: float = 0.3  # m
 
 
 @dataclass(frozen=True)
@@ -37,7 +47,7 @@ class PredictiveConfig:
     margin: float = 0.02  # m, tuned
 
 
-RivalConfig = SecasConfig | SailrConfig | BarrierConfig | PredictiveConfig
+RivalConfig = SecasConfig | SailrConfig | BarrierConfig | VelocityBarrierConfig | PredictiveConfig
 Made = tuple[dict[str, Perceptrons], dict[str, float], dict[str, str]]  # networks, settings, about
 CONFIGS: dict[str, type[RivalConfig]] = {SECAS: SecasConfig, SAILR: SailrConfig, CBF: BarrierConfig}
 CONFIGS[PSF] = PredictiveConfig
@@ -45,7 +55,9 @@ CONFIGS[PSF] = PredictiveConfig
 
 def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
     """Return the configuration with the tuned threshold of this robot (deploy/experiments/experiments.md)."""
-    return CONFIGS[method](**getattr(robot.task.rivals, method))
+    velocities = method == CBF and robot.heading is None
+    config = VelocityBarrierConfig if velocities else CONFIGS[method]
+    return config(**getattr(robot.task.rivals, method))
 
 
 def made_by(model: Pretrained, robot: RobotWithTask, config: RivalConfig) -> bool:
@@ -73,12 +85,12 @@ def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: Non
     return Pretrained(robot, method, networks, settings, about, robot.task.rays if method == SECAS else None)
 
 
-def _by_hand(robot: RobotWithTask, config: BarrierConfig | PredictiveConfig) -> Pretrained:
-    """Return the model of a rival that knows a unicycle by hand: settings alone."""
+def _by_hand(robot: RobotWithTask, config: BarrierConfig | VelocityBarrierConfig | PredictiveConfig) -> Pretrained:
+    """Return the model of a rival that knows equations by hand: settings alone."""
     settings = asdict(config)
     about = {"recipe": json.dumps(settings), "samples": "0", "collisions": "0", "seconds": "0"}
     about |= {"error": "nothing was fitted", VERSION: str(robot.task.simulator_version)}
-    return Pretrained(robot, CBF if isinstance(config, BarrierConfig) else PSF, {}, settings, about)
+    return Pretrained(robot, PSF if isinstance(config, PredictiveConfig) else CBF, {}, settings, about)
 
 
 def _secas(robot: RobotWithTask, config: SecasConfig, each: Each) -> Made:

@@ -61,9 +61,9 @@ METHODS: dict[str, ComparedMethod] = {
         robots=BATCHES,
     ),
     CBF: ComparedMethod(
-        *("CBF-QP", CBF, MAP, "a unicycle by hand, without lag", "Ames et al. 2019"),
+        *("CBF-QP", CBF, MAP, "equations by hand: a unicycle, in the air a lag", "Ames et al. 2019; Wang et al. 2017"),
         tuned="rate α [1/s]",
-        robots=UNICYCLES,
+        robots=BATCHES,
     ),
     PSF: ComparedMethod(
         *("PSF", PSF, MAP, "a unicycle by hand, with a lag", "Wabersich and Zeilinger 2021"),

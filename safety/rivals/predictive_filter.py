@@ -25,8 +25,8 @@ from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request
 from brakeline.safety.model.model_config import PSF as PSF
+from brakeline.safety.rivals.model_by_hand import RivalByHand, is_unicycle
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.unicycle import UnicycleRival
 
 SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
 SAMPLES = 4  # of a period
@@ -37,12 +37,12 @@ LATER = 1e-2  # cost of a change of later inputs, beside that of the first one
 STEP = 1e-4  # of an input's range, for derivatives
 
 
-class PredictiveFilter(UnicycleRival):
+class PredictiveFilter(RivalByHand):
     """The filter as a method."""
 
     def __init__(self, model: Pretrained) -> None:
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
-        super().__init__(model, PSF, SETTINGS)
+        super().__init__(model, PSF, SETTINGS, is_unicycle(model.robot), "speed and turn rate")
         robot = self.robot
         self._scale, self._free = robot.high() - robot.low(), robot.horizon - 1
         self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()

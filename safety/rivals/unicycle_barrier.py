@@ -19,19 +19,19 @@ from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import CBF as CBF
+from brakeline.safety.rivals.model_by_hand import RivalByHand, is_unicycle
 from brakeline.safety.rivals.pretrained import Pretrained
-from brakeline.safety.rivals.unicycle import UnicycleRival
 
 TOLERANCE = 1e-6  # of a scaled row: violated by less, it is met
 SETTINGS = ("ahead", "rate", "margin")  # ℓ [m], α [1/s], margin around obstacles [m]
 
 
-class UnicycleBarrier(UnicycleRival):
+class UnicycleBarrier(RivalByHand):
     """The QP as a method."""
 
     def __init__(self, model: Pretrained) -> None:
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
-        super().__init__(model, CBF, SETTINGS)
+        super().__init__(model, CBF, SETTINGS, is_unicycle(model.robot), "speed and turn rate")
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
         """Return the input that is closest to the proposal and meets the barrier's rows; brake if there is none."""
