@@ -68,7 +68,11 @@ class Episode:
 
 
 class LearningCurve:
-    """The learning curves of one robot kind, from its steps in the order of arrival."""
+    """The learning curves of one robot kind, from its steps in the order of arrival.
+
+    Attributes:
+        recorded: number of steps.
+    """
 
     def __init__(self) -> None:
         self.width = FIRST_WIDTH
@@ -80,13 +84,13 @@ class LearningCurve:
         self._stride = 1  # learner messages per point
         self._messages = 0
         self._newest = 0
-        self._steps = 0
+        self.recorded = 0
         self._models: dict[str, int] = {}  # step at which a version of the model set decided first
 
     def step(self, step: pb.Step) -> None:
         now = self._bin()
         now["steps"] += 1
-        self._steps += 1
+        self.recorded += 1
         kind = kind_of(step)
         if kind in COUNTED:
             now[COUNTED[kind]] += 1
@@ -127,7 +131,7 @@ class LearningCurve:
             now["tubes"] += 1
             now.half_width += max(decision.tube_half_width)
         if decision.model and len(self._models) < MOST_MODELS:
-            self._models.setdefault(decision.model, self._steps)
+            self._models.setdefault(decision.model, self.recorded)
 
     def learner(self, metrics: pb.LearnerMetrics) -> None:
         """Add a learner's metrics; of many messages, evenly spaced ones become points."""

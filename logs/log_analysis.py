@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -150,9 +150,22 @@ class RunAnalysis:
             "seconds": metrics.seconds(),
             **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
-            "cuts": cuts_in(log),
+            "cuts": self.damage(),
             "metadata": _metadata(log),
         }
+
+    def damage(self) -> list[str]:
+        """Return what the log lacks, one line each: damage, and steps that a learner had and nobody recorded.
+
+        A count of published messages would miss the latter if an actor ended while no recorder ran.
+        """
+        return [*cuts_in(self.log), *self._unrecorded_steps()]
+
+    def _unrecorded_steps(self) -> Iterator[str]:
+        for robot, metrics in self.metrics.learners.items():
+            recorded = self.training[robot].recorded
+            if (lost := metrics.steps - recorded) > 0:
+                yield f"{lost} of the {metrics.steps} steps that the learner of {robot} had are not in the log"
 
 
 def cuts_in(log: Log) -> list[str]:
@@ -199,7 +212,7 @@ class LogAnalysis:
             "metadata": _common([run["metadata"] for run in rows.values()]),
             "log": [str(path) for log in logs for path in log.paths],
             "segments": [_segment(segment) for log in logs for segment in log.segments],
-            "cuts": [cut for log in logs for cut in cuts_in(log)],
+            "cuts": [line for part in self.parts for line in part.damage()],
             "malformed": sum(log.malformed for log in logs),
             **({} if episode is None else {"episode": episode, "episode_detail": details}),
             **(self._comparison(rows) if len(self.parts) > 1 else {}),

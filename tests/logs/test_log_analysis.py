@@ -147,6 +147,17 @@ def test_missing_segments_and_damage_are_reported(tmp_path: Path) -> None:
     assert figures["topics"]["step/ground/actor-0"]["missing"] > 0
 
 
+@pytest.mark.parametrize("lost", [0, 3])
+def test_steps_that_a_learner_had_and_nobody_recorded_are_missing(tmp_path: Path, lost: int) -> None:
+    """No count of the actor's is in the log: no recorder ran when it ended."""
+    writer = Writer()
+    for k in range(5):
+        writer.put("step/ground/actor-0", pb.Step(robot="ground", actor="actor-0", step=k))
+    writer.put("metrics/ground", pb.LearnerMetrics(robot="ground", steps=5 + lost, limit={"actor-0": 90}))
+    cuts = analyse(writer.write(tmp_path / "run.mcap"))["cuts"]
+    assert cuts == ["3 of the 8 steps that the learner of ground had are not in the log"] * (lost == 3)
+
+
 def test_the_table_of_an_episode_has_the_recorded_values(
     log: Path, figures: dict[str, Any], messages: Messages
 ) -> None:
