@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -14,6 +14,8 @@ from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
+from brakeline.errors import BrakelineError
+from brakeline.learner.learner_config import TD3Config
 
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
@@ -49,7 +51,7 @@ class TrainCommand(RunConfig):
 
     @classmethod
     def defaults(cls, arguments: list[str]) -> Self:
-        """Return the default options: those of the experiment and the backend that `arguments` name.
+        """Return the default options: those of the experiment, the backend and the robot that `arguments` name.
 
         Raises:
             ValueError: there is no such experiment.
@@ -64,7 +66,7 @@ class TrainCommand(RunConfig):
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
         experiment = EXPERIMENTS[name]
         if named["--backend"] == BATCH:
-            experiment = in_batches(experiment)
+            experiment = in_batches(experiment, batch_hidden(arguments))
         return options.settings_from(cls, experiment, experiment=name, steps=0)
 
     def config(self) -> RunConfig:
@@ -105,6 +107,16 @@ class TrainCommand(RunConfig):
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
         return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
+
+
+def batch_hidden(arguments: list[str]) -> tuple[int, ...]:
+    """Return the hidden layers with which a batch of the robot that `arguments` name learns."""
+    from brakeline.messaging.task import robot_with_task
+
+    for word in [*arguments, *RunConfig.robots]:
+        with suppress(BrakelineError):  # another argument, or a file with mistakes, about which the run complains
+            return robot_with_task(word).task.batch_hidden
+    return TD3Config.hidden
 
 
 def train(

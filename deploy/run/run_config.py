@@ -58,7 +58,7 @@ class RunConfig:
     """Run this many actor processes for each robot kind. You may give 0 with --from-logs."""
     robots_per_actor: int = 1
     """Run this many robots in each actor process. They share one request to the safety service. With --backend batch,
-    run this many in all, by default 64."""
+    run this many in all, by default 32."""
     fleet: int = 0
     """Let this many robots of each actor process share one world and avoid each other. 0 gives each robot a world of
     its own."""
@@ -188,7 +188,9 @@ def _check_fleets(config: RunConfig) -> None:
 
 
 # Steps of robots are cheap in a batch, and updates are not: learn more from each update (docs/performance.md).
-BATCH_TD3: dict[str, Any] = {"updates_per_step": 0.25, "actor_rate": 1e-3, "critic_rate": 1e-3}
+BATCH_TD3: dict[str, Any] = {"updates_per_step": 0.25, "actor_rate": 1e-3, "critic_rate": 1e-3, "tau": 0.01}
+BATCH_WARMUP = 500  # steps
+BATCH_ROBOTS = 32
 
 EXPERIMENTS: dict[str, RunConfig] = {
     "default": RunConfig(),
@@ -203,11 +205,15 @@ EXPERIMENTS: dict[str, RunConfig] = {
 }
 
 
-def in_batches(config: RunConfig) -> RunConfig:
-    """Return an experiment with the backend batch: fewer and larger updates, and no pictures of its many robots."""
-    td3 = replace(config.learner.td3, **BATCH_TD3)
+def in_batches(config: RunConfig, hidden: tuple[int, ...] = TD3Config.hidden) -> RunConfig:
+    """Return an experiment with the backend batch: fewer and larger updates, and no pictures of its many robots.
+
+    hidden: of the networks, unless the experiment has other ones (`Task.batch_hidden`).
+    """
+    td3 = replace(config.learner.td3, **BATCH_TD3, warmup=min(config.learner.td3.warmup, BATCH_WARMUP))
+    td3 = replace(td3, hidden=hidden) if td3.hidden == TD3Config.hidden else td3
     learner = replace(config.learner, td3=td3)
-    return replace(config, backend=BATCH, robots_per_actor=64, actors=1, pictures=0.0, learner=learner)
+    return replace(config, backend=BATCH, robots_per_actor=BATCH_ROBOTS, actors=1, pictures=0.0, learner=learner)
 
 
 def encode(config: RunConfig) -> str:
