@@ -134,7 +134,7 @@ class Task:
     reward: Reward = field(default_factory=Reward)
     trajectories: int = 200  # number to record for a model set, 300 periods each
     steps: int = 60_000  # training steps in a comparison
-    batch_hidden: tuple[int, ...] = (256, 256)  # hidden layers with which `train --backend batch` learns
+    batch: dict[str, Any] = field(default_factory=dict)  # settings of TD3 with which `train --backend batch` learns
     at_once: int = 64  # robots that train at once in a comparison, where batches simulate them
     simulator_version: int = 1  # raise it if the motion changes: what an older simulator recorded is recorded again
     turn_aside: bool = False  # the filter turns blocked robots aside (docs/method.md §4)

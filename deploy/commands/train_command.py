@@ -6,7 +6,7 @@ import time
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import tyro
 
@@ -15,7 +15,6 @@ from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
 from brakeline.errors import BrakelineError
-from brakeline.learner.learner_config import TD3Config
 
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
@@ -66,7 +65,7 @@ class TrainCommand(RunConfig):
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
         experiment = EXPERIMENTS[name]
         if named["--backend"] == BATCH:
-            experiment = in_batches(experiment, batch_hidden(arguments))
+            experiment = in_batches(experiment, batch_settings(arguments))
         return options.settings_from(cls, experiment, experiment=name, steps=0)
 
     def config(self) -> RunConfig:
@@ -109,14 +108,15 @@ class TrainCommand(RunConfig):
         return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
 
 
-def batch_hidden(arguments: list[str]) -> tuple[int, ...]:
-    """Return the hidden layers with which a batch of the robot that `arguments` name learns."""
+def batch_settings(arguments: list[str]) -> dict[str, Any]:
+    """Return the settings of TD3 with which a batch of the robot that `arguments` name learns."""
     from brakeline.messaging.task import robot_with_task
 
     for word in [*arguments, *RunConfig.robots]:
         with suppress(BrakelineError):  # another argument, or a file with mistakes, about which the run complains
-            return robot_with_task(word).task.batch_hidden
-    return TD3Config.hidden
+            settings = robot_with_task(word).task.batch
+            return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    return {}
 
 
 def train(

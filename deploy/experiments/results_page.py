@@ -334,7 +334,8 @@ THREATS = """## Threats to validity
   implementation is Stable-Baselines3's.
 - **Own implementations of rivals.** They differ from their authors' versions as `docs/rivals.md` says.
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
-  data and in models by hand: see *Methods*. The models by hand are of a robot that a unicycle describes well.
+  data and in models by hand: see *Methods*. The equations by hand describe these
+  simulated robots well.
 - **Tuning.** Each rival tuned one setting over four values. More tuning may help every method, also ours. Where the
   best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from one seed.
 - **Turning aside.** Our filter turns a blocked robot aside (`docs/method.md`, section 4). The rivals' filters do not;

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
@@ -187,9 +189,6 @@ def _check_fleets(config: RunConfig) -> None:
         check_fleet(robot_with_task(robot), config.arena, config.fleet, config.conditions)
 
 
-# Steps of robots are cheap in a batch, and updates are not: learn more from each update (docs/performance.md).
-BATCH_TD3: dict[str, Any] = {"updates_per_step": 0.25, "actor_rate": 1e-3, "critic_rate": 1e-3, "tau": 0.01}
-BATCH_WARMUP = 500  # steps
 BATCH_ROBOTS = 32
 
 EXPERIMENTS: dict[str, RunConfig] = {
@@ -205,14 +204,20 @@ EXPERIMENTS: dict[str, RunConfig] = {
 }
 
 
-def in_batches(config: RunConfig, hidden: tuple[int, ...] = TD3Config.hidden) -> RunConfig:
-    """Return an experiment with the backend batch: fewer and larger updates, and no pictures of its many robots.
+def in_batches(config: RunConfig, settings: Mapping[str, Any] = MappingProxyType({})) -> RunConfig:
+    """Return an experiment with the backend batch, and without pictures of its many robots.
 
-    hidden: of the networks, unless the experiment has other ones (`Task.batch_hidden`).
+    settings: of TD3, as the robot's task has them (`Task.batch`), in place of those that the experiment leaves as they
+        are by default.
+
+    Raises:
+        ValueError: TD3 has no such setting.
     """
-    td3 = replace(config.learner.td3, **BATCH_TD3, warmup=min(config.learner.td3.warmup, BATCH_WARMUP))
-    td3 = replace(td3, hidden=hidden) if td3.hidden == TD3Config.hidden else td3
-    learner = replace(config.learner, td3=td3)
+    if unknown := settings.keys() - asdict(TD3Config()):
+        raise ValueError(f"[batch] of the robot's task: TD3 has no setting {', '.join(sorted(unknown))}")
+    td3, default = config.learner.td3, TD3Config()
+    own = {name: value for name, value in settings.items() if getattr(td3, name) == getattr(default, name)}
+    learner = replace(config.learner, td3=replace(td3, **own))
     return replace(config, backend=BATCH, robots_per_actor=BATCH_ROBOTS, actors=1, pictures=0.0, learner=learner)
 
 

@@ -186,10 +186,13 @@ def test_all_robots_brake_while_the_filter_fails(monkeypatch: pytest.MonkeyPatch
 def test_the_backend_has_settings_of_its_own_which_options_change() -> None:
     config = TrainCommand.defaults(["ground", "--backend", "batch", "--experiment=debug"])
     assert (config.backend, config.robots_per_actor, config.experiment) == (BATCH, 32, "debug")
-    assert config.learner.td3.updates_per_step < 1.0 and config.learner.td3.hidden == (32, 32)
-    for robot, hidden in (("ground", (128, 128)), ("quadrotor", (256, 256)), ("no such robot", (128, 128))):
+    debug = config.learner.td3
+    assert debug.updates_per_step < 1.0 and (debug.hidden, debug.warmup) == ((32, 32), 200)
+    for robot, hidden, warmup in (("ground", (128, 128), 500), ("quadrotor", (256, 256), 2000), ("?", (128, 128), 500)):
         td3 = TrainCommand.defaults(["--backend", "batch", robot]).learner.td3
-        assert td3.hidden == hidden and td3.warmup == 500
+        assert td3.hidden == hidden and td3.warmup == warmup
+    with pytest.raises(ValueError, match="no setting rate"):
+        in_batches(RunConfig(), {"rate": 1.0, "tau": 0.1})
     assert TrainCommand.defaults(["--backend=batch"]).backend == BATCH
     assert TrainCommand.defaults([]).backend == "processes"
     assert [spec.name for spec in process_specs(in_batches(RunConfig()))] == ["recorder", "learner"]
