@@ -64,10 +64,15 @@ def ready(model: Model) -> Method:
         return Filter(model)
     if model.method not in RIVALS:
         raise BadModel(f"no method is called {model.method!r}; there are: {', '.join(METHODS)}")
-    velocities = model.method == CBF and model.robot.heading is None
+    velocities = model.method == CBF and barrier_of_velocities(model.robot)
     module, name = VELOCITIES if velocities else RIVALS[model.method]
     method: Method = getattr(import_module(f"brakeline.safety.rivals.{module}"), name)(model)
     return method
+
+
+def barrier_of_velocities(robot: Robot) -> bool:
+    """Return whether CBF takes a robot as a vehicle that follows velocities. If not, it takes it as a unicycle."""
+    return robot.heading is None
 
 
 def decode(payload: bytes) -> Model:

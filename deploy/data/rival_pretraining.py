@@ -16,6 +16,7 @@ from brakeline.deploy.data.rival_rollouts import Each, SailrConfig, SecasConfig,
 from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
+from brakeline.safety.methods import barrier_of_velocities
 from brakeline.safety.model.model_config import CBF, PSF, SAILR, SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
 
@@ -55,7 +56,7 @@ CONFIGS[PSF] = PredictiveConfig
 
 def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
     """Return the configuration with the tuned threshold of this robot (deploy/experiments/experiments.md)."""
-    velocities = method == CBF and robot.heading is None
+    velocities = method == CBF and barrier_of_velocities(robot)
     config = VelocityBarrierConfig if velocities else CONFIGS[method]
     return config(**getattr(robot.task.rivals, method))
 

@@ -3,7 +3,7 @@
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
 The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
-The scores of as many windows as may leave the sets do not count: their owner asked for such sets (`certify --outside`).
+`certify --outside` lets a share of the windows leave their sets. So many of the largest scores do not count.
 Some model sets predict plans only, so the filter cannot score windows. Then the client scores each period itself.
 """
 
@@ -28,7 +28,8 @@ def widening_factor(scores: Array, outside_share: float) -> Array:
 
     Args:
         scores (..., WINDOWS): the last scores; 0 where there were fewer.
-        outside_share: the share of windows that may leave the sets. They widen nothing, unless a score is infinite.
+        outside_share: the share of windows that may leave their sets. So many of the largest scores do not count,
+            unless one is infinite.
     """
     largest = scores.max(axis=-1)
     if left_out := int(outside_share * WINDOWS + ROUNDING):

@@ -24,7 +24,7 @@ from brakeline.safety.model.model_config import CBF
 from brakeline.safety.rivals.model_by_hand import RivalByHand, follows_velocities
 from brakeline.safety.rivals.pretrained import Pretrained
 
-TOLERANCE = 1e-6  # of a scaled row: violated by less, it is met
+TOLERANCE = 1e-6  # m/s: a row that is violated by less is met
 SETTINGS = ("lag", "deceleration", "rate", "margin")  # τ [s], a [m/s²], α [1/s], margin around obstacles [m]
 
 
@@ -46,8 +46,8 @@ class VelocityBarrier(RivalByHand):
         # Near an obstacle the speed changes without limit with the distance: there it counts as one period's.
         slowing = deceleration * away / np.maximum(speed, deceleration * robot.period)
         A, b = -n, lag * (rate * (speed + away) + slowing) - away
-        least = float(room.min(initial=math.inf))
-        if not (A @ proposal > b + TOLERANCE).any():
+        least, excess = float(room.min(initial=math.inf)), A @ proposal - b
+        if not (excess > TOLERANCE).any():
             return self.decision(ALLOWED, braking_plan(robot, proposal), least, started)
         before, slew = request.input_in_force, np.asarray(robot.action_slew)
         high, low = np.minimum(robot.high(), before + slew), np.maximum(robot.low(), before - slew)
@@ -56,6 +56,6 @@ class VelocityBarrier(RivalByHand):
         if not solution.found or solution.residual > TOLERANCE:
             return self.braking(request, started, "no input meets the barrier")
         action = robot.clip_input(solution.x, before)
-        reason = f"obstacle {int(room.argmin())} would come near faster than the barrier allows"
+        reason = f"obstacle {int(excess.argmax())} would come near faster than the barrier allows"
         said = {"reason": reason, "iterations": solution.iterations}
         return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **said)
