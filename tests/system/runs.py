@@ -137,8 +137,13 @@ class Run:
         victim = until(lambda: self.children().get(name), f"{name} lives")
         victim.kill()
         until(lambda: self.children().get(name, victim).pid != victim.pid, f"{name} is started again")
-        states = [child.status() for child in psutil.Process(self.popen.pid).children()]
-        assert psutil.STATUS_ZOMBIE not in states
+        until(lambda: not self._zombies(), "the launcher has reaped who ended")
+
+    def _zombies(self) -> bool:
+        try:
+            return any(child.status() == psutil.STATUS_ZOMBIE for child in psutil.Process(self.popen.pid).children())
+        except psutil.NoSuchProcess:  # a child ended in between: look again
+            return True
 
     def end(self, number: signal.Signals | None = None) -> dict[str, Any]:
         """Wait for the end of the run, after a signal if you give one. Returns the printed figures."""
