@@ -58,7 +58,7 @@ class ActorSettings:
     seed: int = 0
     arena: str = "default"
     method: str = "ddpc"
-    penalty: float = 1.0
+    penalty: float | None = None  # for corrections; None: that of the robot's task
     deadline: float = 0.1  # s in which the safety service must answer
     lockstep: bool = False
     practice: float = 0.0  # probability at each step that a robot begins to follow its committed plan to the stop
@@ -149,7 +149,7 @@ class ActorRunner:
             robot,
             env,
             identity,
-            penalty=settings.penalty,
+            penalty=robot.task.reward.correction_penalty if settings.penalty is None else settings.penalty,
             filtered=settings.method != "none",
             ends_on_intervention=settings.method == "sailr",
             continuous=continuous,

@@ -49,6 +49,7 @@ class Reward:
     collision: float = -100.0
     run_into: float = -50.0  # collision while the robot stood
     cut: float = -20.0  # an intervention that ends the episode (SAILR)
+    correction_penalty: float = 1.0  # subtracted for a correction by the whole range of an input; in proportion below
 
 
 @dataclass(frozen=True)

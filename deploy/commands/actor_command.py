@@ -32,8 +32,9 @@ class ActorCommand:
     """Run this many robots that share one world and avoid each other. 0 gives each robot a world of its own."""
     seed: options.Seed = 0
     arena: options.ArenaName = "default"
-    penalty: float = RunConfig.penalty
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input."""
+    penalty: float | None = RunConfig.penalty
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
+    one in the robot's task."""
     deadline: float = RunConfig.deadline
     """Wait this long for an answer of the safety service [s]. Then the robot brakes along its backup plan."""
     policy: str = ""

@@ -66,9 +66,9 @@ class CompareCommand:
     """Run again what has results already."""
     conservatism: bool = True
     """Make also the table of error bounds and modes, with the stored policy."""
-    penalty: float = 1.0
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Give
-    another --results folder if you change it or --td3."""
+    penalty: float | None = None
+    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
+    one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     """Store the tables and figures in this folder."""
@@ -125,13 +125,15 @@ class CompareCommand:
 
         cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
-        given: dict[str, Any] = {"steps": self.steps, "episodes": self.episodes, "robots": self.at_once}
-        changed = {name: value for name, value in given.items() if value is not None}
+        numbers: dict[str, Any] = {"steps": self.steps, "episodes": self.episodes, "robots": self.at_once}
+        changed = {name: value for name, value in numbers.items() if value is not None}
         if few := [name for name, value in changed.items() if value < 1]:
             raise ValueError(f"the number of {few[0]} is at least 1, not {changed[few[0]]}")
+        if self.penalty is not None:
+            changed["penalty"] = self.penalty
         jobs: list[Job] = []
         for cell in cells:
-            own = replace(cell, penalty=self.penalty, td3=learning(self.td3, cell.method))
+            own = replace(cell, td3=learning(self.td3, cell.method))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, UNICYCLES
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
-from brakeline.safety.model.model_config import DDPC, ModelConfig
+from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Backend
@@ -30,6 +30,7 @@ RESULTS, RUNS = Path("results"), Path("runs/compare")
 LEARNING = "learning"
 SEEDS: dict[str, int] = {"batch": 10, "single": 3}  # how many, by backend
 EPISODES = 500  # of each evaluation
+TUNED_AT_1 = (NONE, SECAS, SAILR)  # the tuning of these filters trained with a penalty of 1, or there is no filter
 TIMED = 10  # episodes that time single decisions, where a batch makes the others
 
 Report = Callable[[str], object]
@@ -60,7 +61,7 @@ class CellConfig:
     steps: int
     episodes: int
     arenas: tuple[str, ...] = ("default", "dense")  # for the evaluation; training uses the first
-    penalty: float = 1.0
+    penalty: float = 1.0  # for corrections
     model_config: ModelConfig = field(default_factory=ModelConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     backend: Backend = "single"  # batch: trains and evaluates many robots at once
@@ -146,10 +147,13 @@ def cell_configs(
     """Return the cells of a robot, seed by seed, so that an interrupted comparison has complete seeds."""
     from brakeline.messaging.task import robot_with_task
 
-    task, backend = robot_with_task(robot).task, backend or backend_for(robot, arenas)
+    methods, task, backend = tuple(methods), robot_with_task(robot).task, backend or backend_for(robot, arenas)
     others: dict[str, Any] = {"backend": backend, "robots": task.at_once, "physics": task.simulator_version}
     seeds = range(SEEDS[backend]) if seeds is None else seeds
+    penalties = {
+        name: 1.0 if METHODS[name].filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods
+    }
     return [
-        CellConfig(robot, method, seed, task.steps, EPISODES, arenas, **others)
+        CellConfig(robot, method, seed, task.steps, EPISODES, arenas, penalty=penalties[method], **others)
         for seed, method in itertools.product(seeds, methods)
     ]

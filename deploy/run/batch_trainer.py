@@ -52,7 +52,7 @@ class BatchTrainer:
             safety: the filter; without one, each robot executes what it proposes.
             name: of the process, from which `actor_names` makes the robots' names.
             sink: takes all steps and episodes.
-            options: of `BatchRobots`. The penalty is 1 by default.
+            options: of `BatchRobots`. The penalty defaults to that of the task.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -64,7 +64,7 @@ class BatchTrainer:
         self.actors = actor_names(name, size)
         self._episodes = [self._join(actor) for actor in self.actors]
         self._identities = [ActorIdentity(actor, i, seed) for i, actor in enumerate(self.actors)]
-        options = {"seed_key": seed, "penalty": 1.0} | options
+        options = {"seed_key": seed, "penalty": robot.task.reward.correction_penalty} | options
         self._robots = BatchRobots(robot, self.actors, safety, self._next_episode, **options)
         # A resumed run draws other noise than the interrupted one: it begins with other episodes, too.
         self._rng = np.random.default_rng((seed, EPISODE_STRIDE, learner.steps))

@@ -68,8 +68,9 @@ class RunConfig:
     """Train for this many steps of each robot kind."""
     seed: int = 0
     """Draw everything random in the run from this seed."""
-    penalty: float = 1.0
-    """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range."""
+    penalty: float | None = None
+    """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range. Defaults to
+    the one in the robot's task."""
     deadline: float = 0.1
     """Let an actor wait this long for an answer of the safety service [s]. Then its robot brakes along its backup
     plan."""
