@@ -202,9 +202,8 @@ def test_the_studies_of_a_comparison():
 def test_the_penalty_for_corrections_is_the_tasks_but_for_the_rivals_that_were_tuned_with_1(monkeypatch):
     robot = robot_with_task("quadrotor")
     reward = replace(robot.task.reward, correction_penalty=7.0)
-    monkeypatch.setattr(
-        task_module, "robot_with_task", lambda _: replace(robot, task=replace(robot.task, reward=reward))
-    )
+    changed = replace(robot, task=replace(robot.task, reward=reward))
+    monkeypatch.setattr(task, "robot_with_task", lambda _: changed)
     cells = cell_configs("quadrotor", (*METHODS, "cbf"), (0,), backend="batch")
     assert {cell.method: cell.penalty for cell in cells} == {"ddpc": 7, "cbf": 7, "sailr": 1, "secas": 1, "none": 1}
 
