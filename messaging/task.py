@@ -106,7 +106,7 @@ class LidarLayout:
 
 @dataclass(frozen=True)
 class Rivals:
-    """Settings of the rivals that differ from the defaults, and the margins [m] that SECAS's tuning tries."""
+    """Settings of the rivals that differ from the defaults, and margins [m] for the tuning of SECAS and PSF."""
 
     __pydantic_config__ = _STRICT
     secas: dict[str, float] = field(default_factory=dict)

@@ -42,7 +42,7 @@ class VelocityBarrierConfig:
 
 @dataclass(frozen=True)
 class PredictiveConfig:
-    """Configuration of the predictive safety filter (safety/rivals/predictive_filter.py)."""
+    """Configuration of the predictive safety filter (safety/rivals/predictive_filter.py), by default of a unicycle."""
 
     lag: float = 0.05  # s, the time constant of the speeds
     margin: float = 0.02  # m, tuned

@@ -9,7 +9,8 @@ from typing import Any
 from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS
 
 NONE = "none"
-EVERY, BATCHES, UNICYCLES = "every", "batches", "unicycles"
+EVERY, BATCHES = "every", "batches"
+BY_HAND = "equations by hand: a unicycle, in the air a lag"
 MAP, RAYS, NOTHING = "the arena's map", "the observed rays", "–"
 TD3_LEARNER, SAC_LEARNER = "TD3", "SAC"
 SAC_SETTINGS = {"actor_rate": 3e-3}  # by the tuning that results/README.md lists
@@ -28,8 +29,7 @@ class ComparedMethod:
         learner: TD3 is our own; SAC is Stable-Baselines3's.
         td3: settings of the learner that differ from the others'.
         tuned: the setting that was tuned; empty: none.
-        robots: on which it is compared. EVERY: all. BATCHES: those that batches simulate. UNICYCLES: of these, the ones
-            whose inputs are speed and turn rate.
+        robots: on which it is compared. EVERY: all. BATCHES: those that batches simulate.
     """
 
     label: str
@@ -61,14 +61,14 @@ METHODS: dict[str, ComparedMethod] = {
         robots=BATCHES,
     ),
     CBF: ComparedMethod(
-        *("CBF-QP", CBF, MAP, "equations by hand: a unicycle, in the air a lag", "Ames et al. 2019; Wang et al. 2017"),
+        *("CBF-QP", CBF, MAP, BY_HAND, "Ames et al. 2019; Wang et al. 2017"),
         tuned="rate α [1/s]",
         robots=BATCHES,
     ),
     PSF: ComparedMethod(
-        *("PSF", PSF, MAP, "a unicycle by hand, with a lag", "Wabersich and Zeilinger 2021"),
+        *("PSF", PSF, MAP, BY_HAND, "Wabersich and Zeilinger 2021"),
         tuned="margin [m]",
-        robots=UNICYCLES,
+        robots=BATCHES,
     ),
     "sac": ComparedMethod(
         *("SAC", NONE, NOTHING, NOTHING, "Haarnoja et al. 2018; Stable-Baselines3"),

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, UNICYCLES
+from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
@@ -123,11 +123,7 @@ def learning(td3: TD3Config, method: str) -> TD3Config:
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:
     """Return the methods that are compared on a robot in these arenas."""
-    from brakeline.messaging.task import robot_with_task
-
-    kinds = {EVERY}
-    if backend_for(robot, arenas) == "batch":
-        kinds |= {BATCHES} if robot_with_task(robot).heading is None else {BATCHES, UNICYCLES}
+    kinds = {EVERY, BATCHES} if backend_for(robot, arenas) == "batch" else {EVERY}
     return tuple(name for name, method in METHODS.items() if method.robots in kinds)
 
 

@@ -40,7 +40,7 @@ ORACLE, GREEDY = "astar", "greedy"
 VALUES = {
     SAILR: (0.03, 0.05, 0.08, 0.15),  # η; its authors' is 0.08
     CBF: (0.5, 1.0, 2.0, 4.0),  # α [1/s]
-    PSF: (0.0, 0.01, 0.02, 0.04),  # margin [m]
+    PSF: (0.0, 0.01, 0.02, 0.04),  # margin [m] of a unicycle
 }
 SETTING = {SECAS: "clearance", SAILR: "threshold", CBF: "rate", PSF: "margin"}
 
@@ -59,7 +59,8 @@ class ThresholdTrial:
 
 def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
     """Return the values of a method's setting to try."""
-    return robot.task.rivals.margins if method == SECAS else VALUES[method]
+    in_metres = method == SECAS or (method == PSF and robot.heading is None)  # a vehicle needs more than a unicycle
+    return robot.task.rivals.margins if in_metres else VALUES[method]
 
 
 def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episodes: int) -> ThresholdTrial:

@@ -1,12 +1,14 @@
-"""A predictive safety filter with a unicycle that somebody derived by hand.
+"""A predictive safety filter with equations of motion that somebody derived by hand.
 
 Wabersich and Zeilinger, "A predictive safety filter for learning-based control of constrained nonlinear dynamical
 systems", Automatica 2021: execute the first input, closest to the proposal, of a plan that meets all constraints and
-ends in a safe terminal set. Here the set is standstill, the model a unicycle whose speeds follow their inputs by a
-first-order lag of time constant τ, and the horizon that of the filter:
+ends in a safe terminal set. Here the set is standstill, and the horizon that of the filter. The speeds follow their
+inputs by a first-order lag of time constant τ; the model is a unicycle, or a vehicle whose inputs are velocities:
 
-    min ‖u_0 − r‖²  s.t.  d_i(p(t; u)) >= body + margin  at all samples t,  low <= u_k <= high,  u_{N−1} = 0
-    p' = v (cos θ, sin θ),   θ' = ω,   τ v' = u_v − v,   τ ω' = u_ω − ω
+    min ‖u_0 − r‖²  s.t.  d_i(p(t; u)) >= body + margin  at all samples t,
+                          low <= u_k <= high,  |u_k − u_{k−1}| <= slew,  u_{N−1} = 0
+    p' = v (cos θ, sin θ),   θ' = ω,   τ v' = u_v − v,   τ ω' = u_ω − ω        (unicycle)
+    p' = v,   τ v' = u − v                                                     (velocities)
 
 Sequential quadratic programming solves it: linearise the predicted positions in the inputs, and each distance at its
 closest point; begin at the proposal, else at the last plan, else at standing. Without a solution, the robot follows its
@@ -25,11 +27,12 @@ from brakeline.safety.filter.braking import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Decision, Request
 from brakeline.safety.model.model_config import PSF as PSF
-from brakeline.safety.rivals.model_by_hand import RivalByHand, is_unicycle
+from brakeline.safety.rivals.model_by_hand import RivalByHand, follows_velocities, is_unicycle
 from brakeline.safety.rivals.pretrained import Pretrained
 
 SETTINGS = ("lag", "margin")  # τ [s], margin around obstacles [m]
 SAMPLES = 4  # of a period
+STANDING = 4.0  # time constants after the first zero input until the robot counts as standing
 ITERATIONS = 5  # quadratic programs from one start
 CONVERGED = 1e-4  # of an input's range
 ACCURACY = 1e-4  # m: a constraint violated by less is met
@@ -42,9 +45,12 @@ class PredictiveFilter(RivalByHand):
 
     def __init__(self, model: Pretrained) -> None:
         """Make the method. Raises BadModel if the model is of another method or does not fit the robot."""
-        super().__init__(model, PSF, SETTINGS, is_unicycle(model.robot), "speed and turn rate")
+        fits = is_unicycle(model.robot) or follows_velocities(model.robot)
+        super().__init__(model, PSF, SETTINGS, fits, "speed and turn rate, or velocities")
         robot = self.robot
         self._scale, self._free = robot.high() - robot.low(), robot.horizon - 1
+        stopping = math.ceil(STANDING * self.settings["lag"] / robot.period)
+        self._after = np.zeros((stopping - 1, robot.action_dim))  # inputs after the plan, until the robot stands
         self._cost = np.tile([1.0, *[LATER] * (self._free - 1)], (robot.action_dim, 1)).T.ravel()
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
@@ -62,23 +68,23 @@ class PredictiveFilter(RivalByHand):
         return self.decision(ADJUSTED, plan, self._room(request, plan), started, reason=reason)
 
     def positions(self, state: Array, plans: Array) -> Array:
-        """Return the positions (P, N · SAMPLES, 2) that the nominal model predicts for plans (P, N, 2)."""
+        """Return the positions (P, T, d) that the nominal model predicts for plans (P, N, m) until the robot stands."""
         robot, count = self.robot, len(plans)
+        inputs = np.concatenate([plans, np.tile(self._after, (count, 1, 1))], axis=1)
         dt = robot.period / SAMPLES
         kept = math.exp(-dt / self.settings["lag"])
         lag = (1.0 - kept) * self.settings["lag"] / dt  # share of the old speed in the mean of a sample
         speeds = np.tile(state[robot.speed_indices], (count, 1))
-        heading, place = np.full(count, state[robot.heading or 0]), np.tile(state[:2], (count, 1))
-        path = np.empty((count, robot.horizon, SAMPLES, 2))
-        for k in range(robot.horizon):
-            for i in range(SAMPLES):
-                travelled = dt * (plans[:, k] + (speeds - plans[:, k]) * lag)
-                middle = heading + 0.5 * travelled[:, 1]
-                place = place + travelled[:, :1] * np.column_stack([np.cos(middle), np.sin(middle)])
-                heading = heading + travelled[:, 1]
-                speeds = plans[:, k] + (speeds - plans[:, k]) * kept
-                path[:, k, i] = place
-        return path.reshape(count, -1, 2)
+        travelled = np.empty((count, inputs.shape[1] * SAMPLES, robot.action_dim))
+        for i in range(travelled.shape[1]):
+            u = inputs[:, i // SAMPLES]
+            travelled[:, i] = dt * (u + (speeds - u) * lag)
+            speeds = u + (speeds - u) * kept
+        if robot.heading is not None:
+            turned = travelled[..., 1]
+            middle = state[robot.heading] + np.cumsum(turned, axis=1) - 0.5 * turned
+            travelled = travelled[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+        return state[: robot.position_dim] + np.cumsum(travelled, axis=1)
 
     def _room(self, request: Request, plan: Array) -> float:
         """Return the least distance of a plan to an obstacle, less the margin [m]."""
@@ -87,16 +93,15 @@ class PredictiveFilter(RivalByHand):
         return float(lengths.min(initial=math.inf)) - self.settings["margin"]
 
     def _solve(self, request: Request, proposal: Array, start: Array) -> Array | None:
-        """Return the plan (N, 2) to which the programs converge from a start, if the nominal model is clear on it."""
+        """Return the plan (N, m) to which the programs converge from a start, if the nominal model is clear on it."""
         robot, free = self.robot, self._free
-        bounds = np.concatenate([np.tile(robot.high() / self._scale, free), np.tile(-robot.low() / self._scale, free)])
+        limits, most = self._limits(request.input_in_force)
         wanted = (braking_plan(robot, proposal)[:free] / self._scale).ravel()
-        both = np.vstack([np.eye(len(wanted)), -np.eye(len(wanted))])
         z = (start[:free] / self._scale).ravel()
         for _ in range(ITERATIONS):
             A, b = self._rows(request, z)
             program = QuadraticProgram(
-                self._cost, -self._cost * wanted, np.vstack([A, both]), np.concatenate([b, bounds]), len(both)
+                self._cost, -self._cost * wanted, np.vstack([A, limits]), np.concatenate([b, most]), len(limits)
             )
             solution = solve(program)
             if not solution.found or solution.residual > CONVERGED:
@@ -104,19 +109,32 @@ class PredictiveFilter(RivalByHand):
             moved, z = float(np.abs(solution.x - z).max()), solution.x
             if moved < CONVERGED:
                 break
-        plan = self._plan(z)
+        plan = self._plan(z, request.input_in_force)
         return plan if self._room(request, plan) >= -ACCURACY else None
 
-    def _plan(self, z: Array) -> Array:
-        """Return the plan of scaled free inputs: within the bounds, and zero at the end."""
+    def _limits(self, before: Array) -> tuple[Array, Array]:
+        """Return bounds and slew as rows A z <= b. before: the input in force, which the first one follows."""
+        robot, free, n = self.robot, self._free, self._free * self.robot.action_dim
+        high, low = np.tile(robot.high() / self._scale, free), np.tile(robot.low() / self._scale, free)
+        slew = np.tile(np.asarray(robot.action_slew) / self._scale, free + 1)
+        within, none = np.eye(n), np.zeros((robot.action_dim, n))
+        change = np.vstack([within, none]) - np.vstack([none, within])  # the last input, which is zero, changes too
+        first = np.concatenate([before / self._scale, np.zeros(n)])
+        rows = np.vstack([within, -within, change, -change])
+        most = np.concatenate([high, -low, slew + first, slew - first])
+        return rows[np.isfinite(most)], most[np.isfinite(most)]
+
+    def _plan(self, z: Array, before: Array) -> Array:
+        """Return the plan of scaled free inputs: within the bounds and the first slew, and zero at the end."""
         inputs = np.clip(z.reshape(self._free, -1) * self._scale, self.robot.low(), self.robot.high())
+        inputs[0] = self.robot.clip_input(inputs[0], before)
         return np.vstack([inputs, np.zeros((1, self.robot.action_dim))])
 
     def _rows(self, request: Request, z: Array) -> tuple[Array, Array]:
         """Return the linearised distances as rows A z <= b of unit length, those that the inputs can change."""
         steps = np.vstack([np.zeros_like(z), STEP * np.eye(len(z))])
         path = self.positions(request.state, np.stack([self._unclipped(z + step) for step in steps]))
-        slopes = (path[1:] - path[0]) / STEP  # (free inputs, samples, 2)
+        slopes = (path[1:] - path[0]) / STEP  # (free inputs, samples, d)
         lengths, normals = self.distances(request, path[0])
         rows = -np.einsum("isd,fsd->isf", normals, slopes).reshape(-1, len(z))
         level = (lengths - self.settings["margin"]).ravel() + rows @ z

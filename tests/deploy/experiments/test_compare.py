@@ -192,7 +192,7 @@ def test_the_studies_of_a_comparison():
     assert len({json.dumps(configuration(s)) for s in every}) == 12
     assert len(cell_configs("ground", METHODS)) == 40 and every[0].backend == "batch"
     assert len(cell_configs("ground+tracks", METHODS)) == 12 and cell_configs("quadrotor", METHODS)[0].robots == 16
-    assert compared_on("quadrotor", ("default",)) == (*METHODS, "lagrange", "cbf", "sac", "sac-ddpc")
+    assert compared_on("quadrotor", ("default",)) == (*METHODS, "lagrange", "cbf", "psf", "sac", "sac-ddpc")
     assert compared_on("ground+tracks", ("default",)) == METHODS and set(compared_on("ground", ("default",))) > {"psf"}
     brief = quick(every[0])
     assert GROUND.task.arenas["dense"].step_limit < brief.steps / brief.robots, "episodes end"

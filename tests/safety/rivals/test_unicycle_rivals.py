@@ -14,7 +14,7 @@ from brakeline.safety.model.model_config import CBF, PSF
 from brakeline.safety.rivals.predictive_filter import PredictiveFilter
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.unicycle_barrier import UnicycleBarrier
-from tests.robots import GROUND, QUADROTOR
+from tests.robots import GROUND
 from tests.safety.asked import cylinder, request
 
 BARRIER = UnicycleBarrier(Pretrained(GROUND, CBF, {}, asdict(BarrierConfig(0.05, 1.0, 0.0))))
@@ -94,7 +94,7 @@ def test_what_they_cannot_decide_is_refused_or_braked(method):
     with pytest.raises(BadModel, match=r"without (lag|ahead)"):
         type(method)(replace(method.model, settings={"margin": 0.0, "rate": 1.0}))
     with pytest.raises(BadModel, match="speed and turn rate"):
-        type(method)(replace(method.model, robot=QUADROTOR))
+        type(method)(replace(method.model, robot=replace(GROUND, action_slew=(0.1, 0.1), late=True)))
 
 
 @pytest.mark.parametrize("name", [CBF, PSF])
