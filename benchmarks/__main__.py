@@ -43,6 +43,7 @@ from benchmarks import (
     solvers,
     step_cost,
     training_speed,
+    widening_share,
 )
 from benchmarks.timing import Figures, Words
 from brakeline.logs.stacking_table import StackingTable
@@ -124,6 +125,7 @@ BENCHMARKS = {
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "widths": Benchmark(set_widths, lambda _: set_widths.run(), named=True),
     "changed": Benchmark(changed_robots, lambda _: changed_robots.run(), named=True),
+    "widening": Benchmark(widening_share, lambda _: widening_share.run(), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),
     "limit": Benchmark(service_limit, lambda _: service_limit.run()),
     "growth": Benchmark(growth, lambda _: growth.run(), named=True),
