@@ -73,6 +73,8 @@ class Bench:
     """Drive this many plans of each group in groups."""
     seeds: int = 3
     """Train this many runs of each backend in training."""
+    batch: str = ""
+    """Give these options to the runs with --backend batch in training: other settings of the learner."""
     rate: int = crowd.JUNK
     """Let each sender of crowd send this many junk messages a second."""
     minutes: float = 10.0
@@ -121,7 +123,9 @@ BENCHMARKS = {
     "cuts": Benchmark(link_faults, lambda given: link_faults.run(given.faults, given.seed, given.folder), named=True),
     "crowd": Benchmark(crowd, lambda given: crowd.run(given.rate), named=True),
     "model-peers": Benchmark(model_peers, lambda _: model_peers.run(), named=True),
-    "training": Benchmark(training_speed, lambda given: training_speed.run(given.seeds), named=True),
+    "training": Benchmark(
+        training_speed, lambda given: training_speed.run(given.seeds, given.batch.split()), named=True
+    ),
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "widths": Benchmark(set_widths, lambda _: set_widths.run(), named=True),
     "changed": Benchmark(changed_robots, lambda _: changed_robots.run(), named=True),

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,14 +40,15 @@ class Snapshot:
     clock: float  # s
 
 
-def run(seeds: int) -> Figures:
-    """Return a row for each backend and seed, and the ratios of the backends."""
+def run(seeds: int, batch: Sequence[str]) -> Figures:
+    """Return a row for each backend and seed, and the ratios of the backends. batch: more options for `batch`."""
     figures: Figures = {}
     robot = robot_with_task("ground")
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(seeds):
             for backend in STEPS:  # in turn, so that a change of the machine's load meets both
-                snapshots = trained(Path(folder) / f"{backend}-{seed}", backend, seed)
+                more = batch if backend == "batch" else ()
+                snapshots = trained(Path(folder) / f"{backend}-{seed}", backend, seed, more)
                 figures[f"{backend}, seed {seed}"] = reached(robot, snapshots)
     for what in ("processor s", "clock s"):
         slow, fast = (
@@ -58,11 +60,11 @@ def run(seeds: int) -> Figures:
     return figures
 
 
-def trained(out: Path, backend: str, seed: int) -> list[Snapshot]:
-    """Train, and return the policies of the run."""
+def trained(out: Path, backend: str, seed: int, more: Sequence[str] = ()) -> list[Snapshot]:
+    """Train with more options, and return the policies of the run."""
     command = [sys.executable, "-P", "-m", "brakeline.deploy.cli", "train", "ground", "--backend", backend, "--json"]
     command += ["--seed", str(seed), "--steps", str(STEPS[backend]), "--out", str(out)]
-    command += ["--learner.checkpoint-every", str(EVERY)]
+    command += ["--learner.checkpoint-every", str(EVERY), *more]
     snapshots: list[Snapshot] = []
     started, seen, policy = time.monotonic(), 0, out / "learner" / POLICY
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.model_peers import own_log
+from benchmarks.model_peers import OWN_LOG, own_log
 from benchmarks.timing import Figures
 from brakeline import Dataset, Filter, ModelConfig, Request, Shapes
 from brakeline.deploy.data.importer import import_sources
@@ -57,12 +57,13 @@ def driven(vehicle: Any, minutes: float, seed: int) -> Dataset:
         rows = [",".join((*drive.OTHER_COLUMNS, *vehicle.state, *vehicle.inputs))]
         rows += [",".join(f"{value:.6g}" for value in row) for row in drive.rows(vehicle, minutes, seed)]
         log.write_text("\n".join(rows) + "\n")
-        return import_sources([log], robot_named(str(Path(drive.__file__).parent / "skid.toml"))).data
+        return import_sources([log], robot_named(str(OWN_LOG / "skid.toml"))).data
 
 
 def drive(filter: Filter, widening: Widening, data: Dataset, share: float) -> dict[str, float]:
     """Score all windows of a drive, and return how many left their sets as widened, and the mean widening."""
-    robot, left, starts = filter.robot, [], []  # starts: the factor of each period's request
+    robot, left = filter.robot, []
+    starts: list[float] = []  # the factor of each period's request
     nothing = Shapes.of([], robot.position_dim)
     for trajectory in data.trajectories:
         widening.interrupt()
