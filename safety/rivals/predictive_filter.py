@@ -84,7 +84,8 @@ class PredictiveFilter(RivalByHand):
             turned = travelled[..., 1]
             middle = state[robot.heading] + np.cumsum(turned, axis=1) - 0.5 * turned
             travelled = travelled[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-        return state[: robot.position_dim] + np.cumsum(travelled, axis=1)
+        positions: Array = state[: robot.position_dim] + np.cumsum(travelled, axis=1)
+        return positions
 
     def _room(self, request: Request, plan: Array) -> float:
         """Return the least distance of a plan to an obstacle, less the margin [m]."""
