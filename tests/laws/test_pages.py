@@ -93,7 +93,8 @@ def test_the_pages_have_the_figures_of_the_comparison(name: str, robot: str) -> 
     head = next(k for k, line in enumerate(lines) if line.startswith(f"| {robot}, after {table['steps']:,} steps |"))
     for line, method in zip(lines[head + 2 :], default, strict=False):
         shares = [part[method][f"{what} rate"] for part in (default, dense) for what in ("goal", "collision")]
-        figures = [f"{100 * share['value']:.1f} %" for share in shares] + [f"{training[method]['collisions']:.0f}"]
+        collisions = training[method]["collisions"]
+        figures = [f"{100 * share['value']:.1f} %" for share in shares] + [f"{collisions:.{int(0 < collisions < 1)}f}"]
         steps, periods = training[method]["steps to 90 % goals"]["value"], training[method]["pre-training samples"]
         label, *row = (re.split(r" [*(]", cell)[0].strip() for cell in line.strip("| ").split(" | "))
         assert label == METHODS[method].label and row == [*figures, f"{steps:,.0f}", f"{periods:,}"]
