@@ -9,7 +9,7 @@ those that the model set lets out. A window is outside if it leaves its sets as 
 
 from __future__ import annotations
 
-import sys
+import importlib
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -28,14 +28,14 @@ from brakeline.safety.model.one_step_fitting import fit_one_step
 
 OUTSIDE = 0.015
 RECORDED, DRIVEN = 15.0, 20.0  # minutes
-LATER, TURNS = 1.5, 0.85  # factors on the lags and on the turn rate after the change
+LAG_FACTOR, TURN_FACTOR = 1.5, 0.85  # of the change
 MINUTE = 600  # periods of 0.1 s
 
 
 def run() -> Figures:
     """Return a row for each rule and driving."""
-    own_log()
-    skid = sys.modules["drive"].VEHICLES["skid"]
+    own_log()  # makes drive.py importable
+    skid = importlib.import_module("drive").VEHICLES["skid"]
     changed = replace(skid, rates=lambda s, speed, turn: _slower(skid, s, speed, turn))
     model, _ = fit_one_step(driven(skid, RECORDED, 1), ModelConfig(mode=ONE_STEP, outside=OUTSIDE))
     filter = Filter(model)
@@ -44,14 +44,14 @@ def run() -> Figures:
     for driving, data in (("as recorded", driven(skid, DRIVEN, 3)), ("changed", driven(changed, DRIVEN, 3))):
         for rule, share in (("largest", 0.0), ("let out", OUTSIDE)):
             widening = Widening(filter.robot)
-            drive(filter, widening, before, share)  # so that a change meets a full memory
-            figures[f"{driving}, {rule}"] = drive(filter, widening, data, share)
+            judged(filter, widening, before, share)  # so that a change meets a full memory
+            figures[f"{driving}, {rule}"] = judged(filter, widening, data, share)
     return figures
 
 
 def driven(vehicle: Any, minutes: float, seed: int) -> Dataset:
     """Return a drive of a vehicle, as `brakeline import` reads it."""
-    drive = sys.modules["drive"]
+    drive = importlib.import_module("drive")
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "drive.csv"
         rows = [",".join((*drive.OTHER_COLUMNS, *vehicle.state, *vehicle.inputs))]
@@ -60,7 +60,7 @@ def driven(vehicle: Any, minutes: float, seed: int) -> Dataset:
         return import_sources([log], robot_named(str(OWN_LOG / "skid.toml"))).data
 
 
-def drive(filter: Filter, widening: Widening, data: Dataset, share: float) -> dict[str, float]:
+def judged(filter: Filter, widening: Widening, data: Dataset, share: float) -> dict[str, float]:
     """Score all windows of a drive, and return how many left their sets as widened, and the mean widening."""
     robot, left = filter.robot, []
     starts: list[float] = []  # the factor of each period's request
@@ -90,5 +90,5 @@ def drive(filter: Filter, widening: Widening, data: Dataset, share: float) -> di
 
 def _slower(vehicle: Any, s: Any, speed: Any, turn: Any) -> tuple[Any, ...]:
     """Return the rates of a robot with a payload: it follows its inputs more slowly, and turns less."""
-    *moving, ahead, turning = vehicle.rates(s, speed, TURNS * turn)
-    return *moving, ahead / LATER, turning / LATER
+    *moving, ahead, turning = vehicle.rates(s, speed, TURN_FACTOR * turn)
+    return *moving, ahead / LAG_FACTOR, turning / LAG_FACTOR

@@ -76,7 +76,7 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
             publish,
             arena=config.arena,
             seed=config.seed,
-            **({} if config.penalty is None else {"penalty": config.penalty}),
+            penalty=config.penalty,
             accept_bound=config.accept_bound,
             conditions=config.conditions,
         )

@@ -44,6 +44,7 @@ class BatchTrainer:
         name: str,
         sink: Sink,
         seed: int = 0,
+        penalty: float | None = None,
         **options: Any,
     ) -> None:
         """Let all robots join the learner, and begin their first episodes.
@@ -52,7 +53,8 @@ class BatchTrainer:
             safety: the filter; without one, each robot executes what it proposes.
             name: of the process, from which `actor_names` makes the robots' names.
             sink: takes all steps and episodes.
-            options: of `BatchRobots`. The penalty defaults to that of the task.
+            penalty: for a correction by the whole range of an input; None: that of the robot's task.
+            options: of `BatchRobots`.
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
@@ -64,8 +66,9 @@ class BatchTrainer:
         self.actors = actor_names(name, size)
         self._episodes = [self._join(actor) for actor in self.actors]
         self._identities = [ActorIdentity(actor, i, seed) for i, actor in enumerate(self.actors)]
-        options = {"seed_key": seed, "penalty": robot.task.reward.correction_penalty} | options
-        self._robots = BatchRobots(robot, self.actors, safety, self._next_episode, **options)
+        options = {"seed_key": seed} | options
+        penalty = robot.task.reward.correction_penalty if penalty is None else penalty
+        self._robots = BatchRobots(robot, self.actors, safety, self._next_episode, penalty=penalty, **options)
         # A resumed run draws other noise than the interrupted one: it begins with other episodes, too.
         self._rng = np.random.default_rng((seed, EPISODE_STRIDE, learner.steps))
         self._random = [RandomPolicy(robot, rng) for rng in self._rng.spawn(size)]

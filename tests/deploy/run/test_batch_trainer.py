@@ -138,6 +138,19 @@ def test_in_sailrs_training_an_intervention_ends_the_robots_episode() -> None:
     assert 5 < cut < len(told.steps) / 2
 
 
+def test_a_correction_costs_what_the_task_says_unless_an_option_says_otherwise() -> None:
+    """All runs have the same inputs: random ones, since the learner warms up."""
+
+    def penalties(cost: float, **options: float) -> list[float]:
+        task = replace(GROUND.task, reward=replace(GROUND.task.reward, correction_penalty=cost))
+        learner = Learner(replace(GROUND, task=task), replace(CONFIG, td3=replace(SMALL, warmup=10_000)))
+        return [step.penalty for step in trained(learner, **options)[1].steps]
+
+    once = np.array(penalties(1.0))
+    assert once.any() and penalties(2.0) == pytest.approx(2.0 * once)
+    assert penalties(2.0, penalty=3.0) == pytest.approx(3.0 * once)
+
+
 def test_without_a_filter_each_robot_executes_what_it_proposes() -> None:
     _, told = trained(safety=None, periods=3)
     for step in told.steps:
