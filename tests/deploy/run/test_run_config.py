@@ -66,6 +66,9 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     for name in ("actors", "steps", "replicas", "robots_per_actor"):
         with pytest.raises(ValueError, match="1 or more"):
             RunConfig(**{name: 0})
+    for penalty in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="a penalty is finite and not negative"):
+            RunConfig(penalty=penalty)
     with pytest.raises(ValueError, match="--actors 1"):
         RunConfig(deterministic=True)
     assert RunConfig(deterministic=True, actors=1).learning().lockstep
