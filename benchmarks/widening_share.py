@@ -1,10 +1,11 @@
-"""What it costs that the windows which `certify --outside` lets out widen no sets (docs/method.md §15).
+"""Compare two rules for the scores that widen the sets (docs/method.md §15).
 
     python -m benchmarks widening
 
 A skid steer (examples/own_log) is certified from fifteen minutes of its log, and then drives for twenty more: as it
-was, and after all lags grew by half and it turned 15 % less. The rules: the largest score counts, or the largest after
-those that the model set lets out. A window is outside if it leaves its sets as they were widened at its start.
+was, and after all lags grew by half and it turned 15 % less. `largest`: the largest score counts. `let out`: as many of
+the largest scores as the model set lets out do not count. A window is outside if it leaves its sets, as they were
+widened at its start.
 """
 
 from __future__ import annotations
