@@ -10,7 +10,10 @@ import multiprocessing
 import os
 import signal
 import sys
-from multiprocessing.context import SpawnContext
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 
 PYTHON = (sys.executable, "-P")
 # The environment of a process beside others: two processes with two threads each are slower on two cores.
@@ -18,10 +21,35 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 PR_SET_PDEATHSIG = 1  # of prctl: the signal that a process gets when its parent dies
 
 
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Give -P to the processes of multiprocessing that start meanwhile, and to no other child of this process."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
+
+
+class _Process(SpawnProcess):
+    def start(self) -> None:
+        with _safe_path():
+            super().start()
+
+
+class _Spawning(SpawnContext):
+    Process = _Process
+
+
 def spawning() -> SpawnContext:
     """Return the context that starts new processes. A forked one would share locks of libraries with threads."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # -P for the processes of multiprocessing
-    return multiprocessing.get_context("spawn")
+    with _safe_path():
+        resource_tracker.ensure_running()
+    return _Spawning()
 
 
 def end_with_parent(parent: int, by: signal.Signals = signal.SIGTERM) -> bool:

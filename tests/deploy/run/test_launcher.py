@@ -3,6 +3,8 @@
 import io
 import itertools
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,6 +84,17 @@ def test_processes_do_not_import_modules_of_the_working_directory(tmp_path, monk
     worker.join(60.0)
     assert worker.exitcode == 0
     assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
+
+
+def test_a_worker_does_not_change_how_a_users_own_scripts_start(tmp_path, monkeypatch) -> None:
+    """A script imports its neighbour, also after this process has started a worker, which must not do so."""
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    worker = spawning().Process(target=os.getcwd)
+    worker.start()
+    worker.join(60.0)
+    (tmp_path / "neighbour.py").write_text("")
+    (tmp_path / "script.py").write_text("import neighbour")
+    subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True)
 
 
 def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path) -> None:
