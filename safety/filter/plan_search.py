@@ -1,6 +1,8 @@
 """Search for a verified plan near a proposal (paper, algorithm 2; docs/method.md §4, §13).
 
 The search stops at the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal.
+If a robot chooses several inputs of a plan, the QP's answer may begin with the proposal and go on otherwise than by
+braking. The proposal is then allowed.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Plan
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
-from brakeline.safety.filter.qp import ROW_TIGHTENING, ConstraintRows
+from brakeline.safety.filter.qp import ConstraintRows
 from brakeline.safety.filter.qp_solver import INFEASIBLE, solve
 from brakeline.safety.filter.reachable_tube import RolloutTube
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED
@@ -30,6 +32,7 @@ Array = NDArray[np.float64]
 
 NO_ROWS = np.zeros(0)
 LINEARIZATIONS = 4  # of a rollout, for one decision and starting point
+AS_PROPOSED = 2e-3  # of an input's range: a QP's answer that is so close to the proposal becomes the proposal
 
 
 @dataclass
@@ -189,20 +192,33 @@ class PlanSearch:
             z = self._closest(choice)
             if z is None:
                 return None
+            z, kind = self._as_proposed(z)
             exact = at.constraints
             if not isinstance(safety.tube, RolloutTube):  # the rows hold everywhere
                 if exact.margin(choice, z) < 0.0:
                     return None
                 margin = exact.margin(at.rows, z)
-                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
+                return PlanCandidate(kind, safety.inputs.plan(z), z, margin, True, exact)
             at = self._around(z)
             exact, needed = at.constraints, 0.0
             margin = exact.least(at.slack, z)
             if margin >= 0.0 and with_clearance:
                 needed = exact.least(at.slack - np.where(self._too_near_to_turn(at), 0.0, at.kept_off), z)
             if margin >= 0.0 and needed >= 0.0:
-                return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, exact)
+                return PlanCandidate(kind, safety.inputs.plan(z), z, margin, True, exact)
         return None
+
+    def _as_proposed(self, z: Array) -> tuple[Array, str]:
+        """Return the regressors z of a QP's answer with the proposal as first input, if they are close; and the kind.
+
+        The QP's other terms (`REGULARIZATION`) move its answer away from a proposal that meets the rows. A robot that
+        chooses one input only would get the proposal followed by braking, which the filter has refused already.
+        """
+        m, known = len(self.proposal), len(self.z_0)
+        if len(z) == known + m or self._off(z) > AS_PROPOSED:
+            return z, ADJUSTED
+        free = np.concatenate([self.proposal, z[known + m :]])
+        return np.concatenate([self.z_0, self.safety.inputs.within(free, self.before)]), ALLOWED
 
     def _turned_only(self, adjusted: PlanCandidate | None) -> PlanCandidate | None:
         """Return the proposal without the inputs that move the position, if it is the better candidate.
@@ -266,6 +282,6 @@ class PlanSearch:
 
     def _tightened(self, at: Linearized) -> ConstraintRows:
         rows, too_near = at.rows, self._too_near_to_turn(at)
-        stay, room = self._staying[0], 2.0 * ROW_TIGHTENING
+        stay, room = self._staying[0], 2.0 * self.safety.builder.tightening
         parts = rows.gradient, rows.spread, rows.bound, at.kept_off, too_near, self.safety.translating, stay, room
         return ConstraintRows(*qp_kernels.tightened(*parts))

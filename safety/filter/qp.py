@@ -14,7 +14,9 @@ from brakeline.safety.filter.reachable_tube import Tube
 
 Index = NDArray[np.int64]
 
-ROW_TIGHTENING = 1e-6  # m by which the QP's rows are tighter, so that a rounded answer passes the exact check
+# m by which the QP's rows are tighter: so that a rounded answer passes the exact check, or so that an answer of several
+# inputs passes it with the proposal in place of its first input (`AS_PROPOSED`)
+ROW_TIGHTENING, OF_SEVERAL_INPUTS = 1e-6, 2e-3
 REGULARIZATION = 1e-4  # ε: weight of all other variables; with much less the solver needs thousands of iterations
 ROUNDING = 1e-12  # of a unit row of W: a row with smaller entries for f does not depend on f
 
@@ -88,6 +90,7 @@ class QPBuilder:
         self.tube = tube
         m, steps = robot.action_dim, robot.free_steps - robot.committed_steps
         free = steps * m
+        self.tightening = ROW_TIGHTENING if steps == 1 else OF_SEVERAL_INPUTS
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING
@@ -134,7 +137,7 @@ class QPBuilder:
         inputs = self.reachable(z_0[-m:])
         constant = tube_kernels.magnitudes(*self._known_sizes, z_0)  # what no free input changes
         atoms = qp_kernels.atom_range(self.W_known, self.W_f, z_0, *inputs)
-        parts = constant, self.M_t, *inputs, atoms, self.scale, ROW_TIGHTENING, *self._fixed_rows
+        parts = constant, self.M_t, *inputs, atoms, self.scale, self.tightening, *self._fixed_rows
         count, A, b = qp_kernels.presolved_rows(rows.gradient, rows.spread, rows.bound, z_0, *parts)
         if count < 0:
             return None

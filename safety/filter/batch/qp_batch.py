@@ -46,6 +46,7 @@ class QPBatch:
         self._low, self._high = constant(builder.low[None, :, None]), constant(builder.high[None, :, None])
         self._change = constant(builder.change[..., None])
         self._box, self._slew = constant(builder.box[:, None]), constant(builder.slew[:, None])
+        self._tightening = builder.tightening
         first = np.zeros((self.free, self._m))  # the first free inputs change from the input in force
         first[: self._m] = np.eye(self._m)
         self._first = constant(first[builder.limited])
@@ -109,7 +110,7 @@ class QPBatch:
         atom, deviation = offset + self._W_f @ center, self._abs_W_f @ radius
         least_t = xp.maximum(xp.abs(atom) - deviation, xp.zeros_like(atom))
         most_t = xp.abs(atom) + deviation
-        bound = rows.bound - ROW_TIGHTENING
+        bound = rows.bound - self._tightening
         least, most = xp.zeros_like(bound), xp.zeros_like(bound)
         for j in range(self.free):
             middle, aside = rows.gradient[j] * center[j], xp.abs(rows.gradient[j]) * radius[j]

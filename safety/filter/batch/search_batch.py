@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch, taken
 from brakeline.safety.filter.batch.qp_batch import ROUNDING, QPBatch, RowBatch
-from brakeline.safety.filter.plan_search import LINEARIZATIONS
-from brakeline.safety.filter.qp import ROW_TIGHTENING
+from brakeline.safety.filter.plan_search import AS_PROPOSED, LINEARIZATIONS
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -68,7 +67,7 @@ class SearchBatch:
         self._xp, self._inputs = xp, safety.inputs
         self.constraints = ConstraintBatch(safety.constraints, constant, xp)
         self._qp = QPBatch(safety.builder, self.constraints, constant, xp)
-        self._clearance = safety.clearance_margin
+        self._clearance, self._tightening = safety.clearance_margin, safety.builder.tightening
         self.known, self._free, self._m = safety.builder.known, safety.builder.free, safety.robot.action_dim
         inputs = safety.inputs
         self._low, self._high = constant(inputs.low[:, None]), constant(inputs.high[:, None])
@@ -98,6 +97,16 @@ class SearchBatch:
             before = self.limited(free[k * m : (k + 1) * m], before)
             parts.append(before)
         return self._xp.concat(parts)
+
+    def _as_proposed(self, lanes: LaneBatch, z: Array) -> tuple[Array, Array]:
+        """Return regressors (nz, B), with the proposal as first input where it is close; and unsure lanes (B,)."""
+        xp, known, m = self._xp, self.known, self._m
+        off = (z[known : known + m] - lanes.proposal) / (self._high - self._low)
+        off = xp.sqrt(xp.sum(off * off, axis=0))
+        if z.shape[0] == known + m:
+            return z, xp.zeros_like(off, dtype=xp.bool)
+        with_proposal = self._within(lanes.z_0, xp.concat([lanes.proposal, z[known + m :]]))
+        return xp.where(off <= AS_PROPOSED, with_proposal, z), xp.abs(off - AS_PROPOSED) < ROUNDING
 
     # --- the search ------------------------------------------------------------------------------------------------
 
@@ -134,11 +143,20 @@ class SearchBatch:
                 z, least, solved, unsure, steps = self._solve(part, start, own, with_clearance)
                 found.steps[open_] = found.steps[open_] + steps
                 to = open_[solved]
-                found.z[:, to], found.margin[to], found.adjusted[to] = z[:, solved], least[solved], True
-                found.for_clearance[to] = xp.take(verified, to, axis=0)
+                found.z[:, to], found.margin[to] = z[:, solved], least[solved]
+                changed = self._changed(part, z)[solved]
+                found.adjusted[to], found.allowed[to] = changed, ~changed
+                found.for_clearance[to] = xp.take(verified, to, axis=0) & changed
                 open_ = open_[~solved & ~unsure]
         found.hopeless[open_] = True
         return found
+
+    def _changed(self, lanes: LaneBatch, z: Array) -> Array:
+        """Return which plans (B,) begin with another input than the proposal. One input alone always is another one."""
+        first, xp = z[self.known : self.known + self._m], self._xp
+        if z.shape[0] == self.known + self._m:
+            return xp.ones_like(z[0], dtype=xp.bool)
+        return xp.any(first != lanes.proposal, axis=0)
 
     def _neither_nearer(
         self, lanes: LaneBatch, plan: PlanBatch, stay: Array, verified: Array, found: CandidateBatch
@@ -190,7 +208,7 @@ class SearchBatch:
             return RowBatch(rows.gradient, rows.spread, bound), inside, unsure
         own = xp.take(inside, which, axis=0)
         closer = xp.where(own, xp.take(rows.gradient, which, axis=1) * self._translating, 0.0)
-        most = sum(closer[j] * stay[self.known + j] for j in range(self._free)) + 2.0 * ROW_TIGHTENING
+        most = sum(closer[j] * stay[self.known + j] for j in range(self._free)) + 2.0 * self._tightening
         spread = xp.zeros((rows.spread.shape[0], *own.shape), dtype=bound.dtype, device=bound.device)
         both = xp.concat([rows.gradient, closer], axis=1), xp.concat([rows.spread, spread], axis=1)
         return RowBatch(*both, xp.concat([bound, most])), inside, unsure
@@ -229,7 +247,8 @@ class SearchBatch:
             if not go.shape[0]:
                 break
             index, lanes, stay = index[go], taken(xp, lanes, go), xp.take(stay, go, axis=-1)
-            free = self._within(lanes.z_0, xp.take(f, go, axis=-1))
+            free, close = self._as_proposed(lanes, self._within(lanes.z_0, xp.take(f, go, axis=-1)))
+            unsure[index[close]] = True
             if c.tube.linear:
                 plan = c.moved_to(lanes.scene, taken(xp, plan, go), free)
                 tight = taken(xp, rows, go)
