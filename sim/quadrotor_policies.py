@@ -38,7 +38,7 @@ class QuadrotorAdversary(ScriptedPolicy):
 class StopPrediction:
     """Predicts a setpoint and the stop after it: the vehicle's velocity follows setpoints with a first-order lag.
 
-    The setpoint u holds for a period, then falls to zero as in the robot's plans. Positions are linear in the velocity
+    The setpoint u holds for a period, then falls to zero as at the end of the robot's plans. Positions are linear in the velocity
     v at the start and in u: p + `from_velocity`·v + `from_setpoint`·u, at `times` (K,) [s].
     """
 
@@ -49,8 +49,7 @@ class StopPrediction:
         self._period = robot.period
         fine = 20  # integration steps for each point
         step = robot.period / (self.POINTS * fine)
-        # the share of u in each period of the plan
-        fractions = robot.plan_matrix()[robot.committed_steps * robot.action_dim :: robot.action_dim, -robot.action_dim]
+        fractions = robot.stop_profile()[: robot.horizon - robot.committed_steps, 0]  # of u, in each period
         velocity, offset = np.array([1.0, 0.0]), np.zeros(2)  # coefficients of v and u
         offsets: list[Array] = []
         for fraction in np.repeat(fractions, self.POINTS * fine):

@@ -127,7 +127,7 @@ def test_stop_prediction_agrees_with_the_simulated_quadrotor() -> None:
         vehicle.step(np.clip(0.8 * k, -np.abs(top), np.abs(top)) * np.sign(top))
     predicted = StopPrediction(QUADROTOR)(vehicle.true[:3], vehicle.true[3:6], top[None])[0]
     flown = []
-    for fraction in QUADROTOR.plan_matrix()[::3, 0]:
+    for fraction in QUADROTOR.stop_profile()[:, 0]:
         vehicle.step(top * fraction)
         flown.append(vehicle.true[:3])
     assert predicted[1::2] == pytest.approx(np.array(flown), abs=0.35)
