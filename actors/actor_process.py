@@ -32,7 +32,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Array
-from brakeline.messaging.task import RobotWithTask, robot_with_task
+from brakeline.messaging.task import RobotWithTask, check_penalty, robot_with_task
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.service.client import query_service
@@ -65,6 +65,9 @@ class ActorSettings:
     change: PhysicsChange = field(default_factory=PhysicsChange)
     mavlink: bool = False  # whether to log every frame of simulated quadrotors; a real-time flight always logs them
     steps: int = 0  # steps of each robot whose policy does not learn; 0: no end
+
+    def __post_init__(self) -> None:
+        check_penalty(self.penalty)
 
 
 class EnvironmentFactory(Protocol):

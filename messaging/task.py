@@ -52,6 +52,15 @@ class Reward:
     cut: float = -20.0  # an intervention that ends the episode (SAILR)
     correction_penalty: float = 1.0  # subtracted for a correction by the whole range of an input; in proportion below
 
+    def __post_init__(self) -> None:
+        check_penalty(self.correction_penalty)
+
+
+def check_penalty(penalty: float | None) -> None:
+    """Raise ValueError for a penalty that cannot be subtracted from a reward. None stands for the task's."""
+    if penalty is not None and not 0.0 <= penalty < float("inf"):  # NaN fails too
+        raise ValueError(f"a penalty is finite and not negative: {penalty:g} cannot be subtracted from a reward")
+
 
 @dataclass(frozen=True)
 class MoverKind:

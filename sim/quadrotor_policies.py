@@ -38,8 +38,8 @@ class QuadrotorAdversary(ScriptedPolicy):
 class StopPrediction:
     """Predicts a setpoint and the stop after it: the vehicle's velocity follows setpoints with a first-order lag.
 
-    The setpoint u holds for a period, then falls to zero as at the end of the robot's plans. Positions are linear in the velocity
-    v at the start and in u: p + `from_velocity`·v + `from_setpoint`·u, at `times` (K,) [s].
+    The setpoint u holds for a period, then falls to zero as at the end of the robot's plans. Positions are linear in
+    the velocity v at the start and in u: p + `from_velocity`·v + `from_setpoint`·u, at `times` (K,) [s].
     """
 
     LAG = 0.35  # s, fitted to the quadrotor, whose lag is a cascade of shorter ones

@@ -69,6 +69,11 @@ class CellConfig:
     physics: int = 1  # version of the simulator (`Task.simulator_version`); results of different ones do not compare
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
 
+    def __post_init__(self) -> None:
+        from brakeline.messaging.task import check_penalty
+
+        check_penalty(self.penalty)
+
     @property
     def name(self) -> str:
         """The name of the cell's file."""

@@ -118,10 +118,10 @@ class RunConfig:
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
             )
-        if self.penalty is not None and not 0.0 <= self.penalty < float("inf"):  # NaN fails too
-            raise ValueError(
-                f"a penalty is finite and not negative: {self.penalty:g} cannot be subtracted from a reward"
-            )
+        if self.penalty is not None:
+            from brakeline.messaging.task import check_penalty
+
+            check_penalty(self.penalty)
         if self.adapt and self.method != DDPC:
             raise ValueError(f"--adapt certifies model sets of the method {DDPC}, not of {self.method}")
         if self.backend == BATCH:

@@ -209,6 +209,10 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
     (tmp_path / "a.task.toml").write_text(text.replace("[lidar]", "[radar]"))
     with pytest.raises(UnknownTask, match="radar"):
         read_task(tmp_path / "a.task.toml")
+    for penalty in ("-3.0", "nan", "inf"):
+        (tmp_path / "a.task.toml").write_text(text.replace("[reward]", f"[reward]\ncorrection_penalty = {penalty}"))
+        with pytest.raises(UnknownTask, match="a penalty is finite and not negative"):
+            read_task(tmp_path / "a.task.toml")
 
 
 def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():
