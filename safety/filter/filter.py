@@ -247,12 +247,14 @@ class Filter:
     def _committed(
         self, request: Request, local_map: LocalMap, z_0: Array, record: DecisionRecord, in_domain: bool
     ) -> PlanCandidate:
-        """Return the committed backup plan, or braking that is verified anew, or braking that is not verified.
+        """Return the committed backup plan, or a plan that is verified anew, or one that is not verified.
 
         The committed plan still counts as verified if the measured state is in the predicted set, this model set
         verified the plan or the robot stands, and no obstacle broke its bounds (docs/method.md §4). Otherwise, the
         filter verifies the rest of that plan and then the strongest braking from the new measurement, each followed by
-        the robot's stop rule. Outside the recorded domain it verifies nothing.
+        the robot's stop rule. If neither is verified, the one with the larger margin is executed: a plan that evades an
+        obstacle may need no more than some millimetres, while braking leads straight into it. Outside the recorded
+        domain nothing is verified, but the margins still tell which of the two is better.
         """
         if not record.contained:
             record.reason += "; the measured state was outside the predicted set"
@@ -269,12 +271,15 @@ class Filter:
             return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
         brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
         as_committed[len(z_0) :] = self.inputs.within(chosen, before)
-        for z in (as_committed, brake):
+        candidates = list[PlanCandidate]()
+        for z in (brake, as_committed):
             constraints = self.constraints_for(z, local_map.widening)
             margin = constraints.margin_in(local_map, z)
-            if in_domain and margin >= 0.0:
-                return PlanCandidate(FAILSAFE, self.inputs.plan(z), z, margin, True, constraints)
-        return PlanCandidate(FAILSAFE, self.inputs.plan(brake), brake, margin, False, constraints)
+            verified = in_domain and margin >= 0.0
+            candidates.append(PlanCandidate(FAILSAFE, self.inputs.plan(z), z, margin, verified, constraints))
+        if candidates[-1].verified:
+            return candidates[-1]
+        return max(candidates, key=lambda candidate: np.nan_to_num(candidate.margin, nan=-np.inf))
 
     def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> PlanCandidate | None:
         """Return a slow way out for a robot that stands, or is on such a way, where standing is not verified.
