@@ -333,9 +333,8 @@ class Robot:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def accepts_layout(self, layout: object) -> bool:
-        """Return whether a layout is this robot's, or one that a shipped robot had before."""
-        former = FORMER_LAYOUTS.get(self.name), *BEFORE_OTHER_PLANS.get(self.name, ())
-        return layout == self.layout() or layout in former
+        """Return whether a layout is this robot's, or the one it had before robots were files."""
+        return layout == self.layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
 # Layouts of logs, model sets and policies from before robots were files.
@@ -345,8 +344,6 @@ FORMER_LAYOUTS = {
     "quadrotor": "82b53a84411b2bee",
     "quadrotor-late": "296e1f047a7fcc62",
 }
-# Layouts of shipped robots before their plans changed. A model set of such a robot keeps the plans that it describes.
-BEFORE_OTHER_PLANS = {"quadrotor": ("f3efc9edf106dddb",), "quadrotor-late": ("4cdc6acf7b6e5d4c",)}  # 1 chosen input
 
 
 def shipped_robots() -> tuple[str, ...]:
@@ -384,9 +381,6 @@ def robot_named(name: str) -> Robot:
 def refuse_shipped_name(robot: Robot) -> Robot:
     """Return the robot. Raises UnknownRobot: the robot has the name of a shipped robot but differs from it."""
     name = robot.in_lockstep().name
-    if name not in shipped_robots() or robot.description == (shipped := robot_named(name)).description:
-        return robot
-    other_plan = robot.in_lockstep().layout() in BEFORE_OTHER_PLANS.get(name, ())
-    if not other_plan or robot.accept_bound != shipped.accept_bound:
+    if name in shipped_robots() and robot.description != robot_named(name).description:
         raise UnknownRobot(f"{name} is the name of a robot that comes with the program: choose another")
     return robot

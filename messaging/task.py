@@ -26,7 +26,6 @@ from brakeline.errors import UnknownTask
 from brakeline.extras import missing_extra
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import (
-    BEFORE_OTHER_PLANS,
     FORMER_LAYOUTS,
     REAL_TIME_SUFFIX,
     ROBOTS_FOLDER,
@@ -238,16 +237,12 @@ class RobotWithTask(Robot):
 
     def learning_layout(self) -> str:
         """Return the hash of what an actor and a learner must share: the robot's layout and the observation."""
-        return self._with_observation(self.layout())
-
-    def _with_observation(self, layout: str) -> str:
-        text = json.dumps([layout, *self.task.observed])
+        text = json.dumps([self.layout(), *self.task.observed])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def accepts_learning_layout(self, layout: object) -> bool:
-        """Return whether a layout is this learning layout, or one that a shipped robot had before."""
-        former = [self._with_observation(plan) for plan in BEFORE_OTHER_PLANS.get(self.name, ())]
-        return layout == self.learning_layout() or layout in (FORMER_LAYOUTS.get(self.name), *former)
+        """Return whether a layout is this learning layout, or the one from before robots were files."""
+        return layout == self.learning_layout() or layout == FORMER_LAYOUTS.get(self.name)
 
 
 NO_SPACE = (

@@ -288,8 +288,7 @@ def robot_in(about: dict[str, Any]) -> Robot:
     if "description" not in about:
         if about.get("layout") != FORMER_LAYOUTS.get(name):
             raise UnknownRobot(f"{name}: neither a description nor the layout of a robot known before there were any")
-        robot = robot_named(name)
-        return replace(robot, free_steps=1 + robot.committed_steps)  # all plans had one chosen input then
+        return robot_named(name)
     robot = robot_from_description(parse_json(about["description"]), "the model set's robot")
     robot = robot.in_real_time() if name.endswith(REAL_TIME_SUFFIX) else robot
     if robot.name != name:

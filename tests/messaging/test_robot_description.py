@@ -14,7 +14,7 @@ from brakeline.errors import BadDescription, UnknownRobot, UnknownTask
 from brakeline.messaging.robot import ROBOTS_FOLDER, Disc, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import UNITS, describe, read_robot, robot_from_description
 from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
-from tests.robots import GROUND, QUADROTOR, ROBOTS
+from tests.robots import GROUND, ROBOTS
 
 pytestmark = pytest.mark.fast
 
@@ -187,18 +187,6 @@ def test_nobody_takes_the_name_of_a_robot_that_comes_with_the_program():
     with pytest.raises(UnknownRobot, match="choose another"):
         refuse_shipped_name(robot_from_description(description))
     assert refuse_shipped_name(GROUND) is GROUND
-
-
-def test_a_shipped_robot_with_its_former_plan_is_known_but_not_with_another_limit_of_the_bound():
-    """Logs, model sets and policies from before stay readable. A file cannot loosen which bounds are accepted."""
-    former = replace(QUADROTOR, free_steps=1)
-    assert refuse_shipped_name(former) is former
-    assert QUADROTOR.accepts_layout(former.layout())
-    assert QUADROTOR.in_real_time().accepts_layout(former.in_real_time().layout())
-    assert QUADROTOR.accepts_learning_layout(former.learning_layout())
-    with pytest.raises(UnknownRobot, match="choose another"):
-        refuse_shipped_name(replace(former, accept_bound=0.5))
-    assert robot_named("ground").description == GROUND.description
 
 
 def test_a_task_says_what_is_wrong_in_it(tmp_path):

@@ -25,12 +25,12 @@ from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
-from tests.safety.test_one_step import CONFIG, ROBOT, driven
+from tests.safety.test_one_step import CONFIG, ROBOT, driven, two_inputs
 from tests.safety.test_qp_solver import crowded
 
 SAME = 1e-6
 WORTH = 3 * WORTH_A_BATCH  # of the ground robot
-FORMS = ("ground direct", "ground recursion", "two discs", "one-step", "real time", "quadrotor direct")
+FORMS = ("ground direct", "ground recursion", "two discs", "two inputs", "one-step", "real time", "quadrotor direct")
 LONG = Disc((0.08, 0.02), 0.07), Disc((-0.08, 0.0), 0.09)
 EQUAL = ("kind", "verified", "at_least", "contained", "compared", "for_clearance", "model", "bound", "judges", "reason")
 
@@ -41,6 +41,7 @@ def filters(models, data):
     made = {
         "ground recursion": lambda: Filter(models["residual", "recursion"]),
         "two discs": lambda: Filter(fit_model_set(replace(data, robot=replace(data.robot, body=LONG)), ModelConfig())),
+        "two inputs": two_inputs,
         "one-step": one_step,
         "real time": lambda: Filter(certify(replace(driven(trajectories=3), robot=ROBOT.in_real_time()), CONFIG)[0]),
     }

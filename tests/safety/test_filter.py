@@ -21,7 +21,6 @@ from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
-from tests.safety.test_batch import regressors, scenes
 from tests.safety.unicycle import FIX, Unicycle
 
 
@@ -118,27 +117,6 @@ def test_a_verified_proposal_is_allowed_where_no_input_keeps_the_clearance_margi
         decision = ready.decide(ask)
         assert (decision.kind, decision.for_clearance, decision.verified) == (ALLOWED, None, True)
         assert decision.plan[0] == pytest.approx(ask.action)
-
-
-def test_a_proposal_is_allowed_if_another_verified_plan_than_braking_begins_with_it(monkeypatch):
-    """Two inputs of the quadrotor's plans are chosen: it may evade an obstacle before which it could not stop."""
-    ready = Filter.load("quadrotor")
-    requests = scenes(ready, 1000, crowd=0.8)
-    decisions = [ready.decide(ask) for ask in requests]
-    monkeypatch.setattr(plan_search, "AS_PROPOSED", -1.0)
-    evading = adjusted = 0
-    for ask, decision in zip(requests, decisions, strict=True):
-        proposal = ready.inputs.limited(ask.action, ask.input_in_force)
-        braking = ready.inputs.plan(regressors(ready, ask))
-        if decision.kind != ALLOWED or np.allclose(decision.plan, braking):
-            continue
-        evading += 1
-        assert (decision.plan[0] == proposal).all()
-        assert decision.verified and decision.margin >= 0.0 and decision.reason == ""
-        closest = ready.decide(ask)
-        assert closest.plan[0] == pytest.approx(proposal, abs=2e-3 * 10.0)
-        adjusted += closest.kind == ADJUSTED
-    assert adjusted > 10 > evading - adjusted, "braking after it was verified for few, with too little clearance"
 
 
 @pytest.mark.parametrize(("kind", "count"), [("residual", 80), ("set-membership", 30), ("matrix-zonotope", 30)])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from brakeline.deploy.data.certification import certify
 from brakeline.errors import BadData, BadModel, ErrorBoundError
 from brakeline.messaging.obstacle import Shapes
+from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
 from brakeline.safety.model.calibration_samples import samples_of
@@ -48,13 +49,19 @@ def ready():
     return Filter(certified()[0])
 
 
-def request(state, action, before, obstacles):
-    robot = ROBOT
+@cache
+def two_inputs():
+    """The filter of a robot that chooses two inputs of a plan."""
+    robot = replace(ROBOT, free_steps=2, horizon=ROBOT.horizon + 1)
+    return Filter(certify(replace(driven(trajectories=3), robot=robot), CONFIG)[0])
+
+
+def request(state, action, before, obstacles, robot=ROBOT):
     plan = np.vstack([before * share for share in robot.stop_profile()])
     return Request(np.asarray(state), np.asarray(action), np.asarray(before), plan, Shapes.of(obstacles, 2))
 
 
-def scenes(count, seed=0):
+def scenes(count, seed=0, robot=ROBOT):
     """Requests of a driving robot among three obstacles within a metre."""
     rng = np.random.default_rng(seed)
     for _ in range(count):
@@ -62,7 +69,47 @@ def scenes(count, seed=0):
         state = np.array([0.0, 0.0, rng.uniform(-3, 3), *before])
         angles, away = rng.uniform(-np.pi, np.pi, 3), rng.uniform(0.27, 0.6, 3)
         posts = [cylinder(r * np.cos(a), r * np.sin(a), 0.08) for a, r in zip(angles, away, strict=True)]
-        yield request(state, rng.uniform(ROBOT.low(), ROBOT.high()), before, posts)
+        yield request(state, rng.uniform(ROBOT.low(), ROBOT.high()), before, posts, robot)
+
+
+def test_a_proposal_is_allowed_if_another_verified_plan_than_braking_begins_with_it(monkeypatch):
+    """A robot that chooses two inputs of a plan may evade an obstacle before which it could not stop."""
+    ready = two_inputs()
+    asked = list(scenes(600, robot=ready.robot))
+    decisions = [ready.decide(ask) for ask in asked]
+    monkeypatch.setattr(plan_search, "AS_PROPOSED", -1.0)  # no QP's answer becomes the proposal
+    evading = adjusted = 0
+    for ask, decision in zip(asked, decisions, strict=True):
+        z_0 = np.concatenate([ask.state[list(ROBOT.regressor)], ask.input_in_force])
+        braking = ready.inputs.plan(ready.inputs.regressors(z_0, ask.action))
+        if decision.kind != ALLOWED or np.allclose(decision.plan, braking):
+            continue
+        evading += 1
+        assert (decision.plan[0] == ask.action).all()
+        assert decision.verified and decision.margin >= 0.0 and decision.reason == ""
+        closest = ready.decide(ask)
+        assert closest.plan[0] == pytest.approx(ask.action, abs=2e-3 * 3.0)
+        adjusted += closest.kind == ADJUSTED
+    assert adjusted > 10 > evading - adjusted, "braking after it was verified for few, with too little clearance"
+
+
+def test_where_neither_plan_is_verified_the_one_with_the_larger_margin_is_executed():
+    """A quadrotor that evaded left its set by a little. Braking instead flew it straight into the obstacle."""
+    ready, goes_on, brakes = two_inputs(), 0, 0
+    for proposed in scenes(1500, seed=1, robot=ready.robot):
+        known = np.concatenate([proposed.state[3:], proposed.input_in_force])
+        evading = ready.inputs.plan(np.concatenate([known, proposed.action, 0.8 * proposed.action]))
+        ask = replace(proposed, plan=evading, model="another")  # whose sets this filter does not know
+        decision = ready.decide(ask)
+        if decision.verified or decision.kind != FAILSAFE:
+            continue
+        z_0 = np.concatenate([ask.state[3:], ask.input_in_force])
+        scene = ready.constraints.local_map(ask, z_0, ready.builder.reachable(ask.input_in_force))
+        rest, brake = np.concatenate([z_0, evading[:2].ravel()]), np.concatenate([z_0, np.zeros(4)])
+        margins = [ready.constraints.at(z, scene.widening).margin_in(scene, z) for z in (rest, brake)]
+        assert (decision.plan[:2] == (evading[:2] if margins[0] > margins[1] else 0.0)).all()
+        goes_on, brakes = goes_on + (margins[0] > margins[1]), brakes + (margins[0] <= margins[1])
+    assert goes_on > 3 < brakes, (goes_on, brakes)
 
 
 def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_predictors():
