@@ -48,6 +48,9 @@ class TD3Config:
     """With a cost limit, raise the penalty by this reward for each episode that collides."""
     stored: Stored = "both"
     """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
+    imitation: float = 0.0
+    """Let the actor imitate what the filter executed in place of its proposals, with this weight beside the critic's
+    value."""
     symmetric: bool = True
     """Learn also from the mirror images of a step, if the task is symmetric."""
     warmup: int = 2000
@@ -61,6 +64,8 @@ class TD3Config:
             raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")
         if self.warmup < self.n_step:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
+        if not 0.0 <= self.imitation < float("inf"):
+            raise ValueError(f"imitation must be 0 or a positive weight: {self}")
         if self.multiplier_rate <= 0.0 or not 0.0 <= (self.cost_limit or 0.0) < 1.0:
             raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:

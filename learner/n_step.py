@@ -7,6 +7,8 @@ A step that the safety filter corrected gives two transitions with `Stored` "bot
 penalty, and the proposed action with it. With "executed", the executed action has the penalty. The learner then learns
 nothing about actions that the filter never allows, and the critic's guesses draw the policy to the obstacles.
 
+The executed action of a corrected step that has a penalty is marked as one that the actor may imitate.
+
 A *cut* step (an intervention of SAILR) ends the episode for the learner only. The proposed action gets the lowest
 reward and no value after it (the absorbing MDP of Wagener et al. 2021, section 4). With "both", the action of the
 backup policy is a one-step transition with a value after it.
@@ -85,11 +87,12 @@ class NStepWindows:
         discount = 0.0 if last.terminated or last.cut else self.gamma ** len(moves)
         if first.cut:
             return self._cut(first)
+        end, corrected = (discount, last.next_observation, cost), float(first.penalty > 0.0)
         if self.stored == "executed" or np.array_equal(first.action, first.proposed):
-            return [Transition(first.observation, first.action, reward, discount, last.next_observation, cost)]
+            return [Transition(first.observation, first.action, reward, *end, corrected)]
         return [
-            Transition(first.observation, first.action, reward + first.penalty, discount, last.next_observation, cost),
-            Transition(first.observation, first.proposed, reward, discount, last.next_observation, cost),
+            Transition(first.observation, first.action, reward + first.penalty, *end, corrected),
+            Transition(first.observation, first.proposed, reward, *end),
         ]
 
     def _cut(self, move: ActorStep) -> list[Transition]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from brakeline.learner.checkpoint_state import PartState
 
 Vector = NDArray[np.float32]
-NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost")
+NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost", "imitated")
+ADDED = ("imitated",)  # checkpoints from before do not hold these
 
 
 class Transition(NamedTuple):
@@ -23,10 +24,11 @@ class Transition(NamedTuple):
     discount: float
     next_observation: Vector
     cost: float = 0.0  # c_j is 1 at a collision
+    imitated: float = 0.0  # 1: the filter executed this action in place of the proposal; the actor may imitate it
 
 
 def _widths(observation_dim: int, action_dim: int) -> tuple[int, ...]:
-    return (observation_dim, action_dim, 1, 1, observation_dim, 1)
+    return (observation_dim, action_dim, 1, 1, observation_dim, 1, 1)
 
 
 class Batch:
@@ -37,8 +39,9 @@ class Batch:
         tensors = [torch.zeros(1, size, width) for width in _widths(observation_dim, action_dim)]
         # the same as arrays (batch, width), in the order of `NAMES`
         self.arrays = tuple(tensor[0].numpy() for tensor in tensors)
-        # observation, action, reward, discount, next_observation, cost: tensors (1, batch, width)
-        self.observation, self.action, self.reward, self.discount, self.next_observation, self.cost = tensors
+        # tensors (1, batch, width), in the same order
+        self.observation, self.action, self.reward, self.discount, self.next_observation = tensors[:5]
+        self.cost, self.imitated = tensors[5:]
 
     def __len__(self) -> int:
         return len(self.arrays[0])
@@ -85,5 +88,6 @@ class ReplayBuffer:
         if size > self.capacity or not (0 <= at < size if full else at == size):
             raise ValueError(f"next: {at} with {size} rows")
         for name, array in zip(NAMES, self._arrays, strict=True):
-            array[:size] = state.tensor(name, (size, array.shape[1]), "float32")
+            missing = name in ADDED and name not in state.tensors
+            array[:size] = 0.0 if missing else state.tensor(name, (size, array.shape[1]), "float32")
         self.size, self._next = size, at

@@ -4,11 +4,12 @@ Each coordinate of an action is normalised to [−1, 1]. A transition spans k �
 
     y     = c·(R − λ C) + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
     L_Q   = Σ_i mean (Q_i(s, a) − y)²
-    L_π   = −mean Q_1(s, π(s))                                     every `policy_delay`-th update, then
+    L_π   = −mean Q_1(s, π(s)) + β mean m ‖π(s) − a‖²              every `policy_delay`-th update, then
     θ̄     ← θ̄ + τ (θ − θ̄)
 
 with R = Σ_j γ^j r_j over the k steps, C the same sum of costs, λ their weight (0 unless a multiplier sets it;
-`learner/lagrange.py`), d = γ^k (0 at a true end), and c the reward scale.
+`learner/lagrange.py`), d = γ^k (0 at a true end), and c the reward scale. β is the weight of imitation, and m is 1
+where the filter executed a in place of another proposal.
 """
 
 from __future__ import annotations
@@ -103,6 +104,8 @@ class TD3:
         self.losses.actor = -float(value.mean())
         dvalue = value.fill_(-1.0 / self.config.batch)
         daction = self._first_critic.input_gradient(dvalue, self._action)
+        if (weight := self.config.imitation) > 0.0:
+            daction = daction + (2.0 * weight / self.config.batch) * batch.imitated * (action - batch.action)
         self.actor_adam.step(self.actor.parameter_gradient(daction * (1.0 - action * action)))
 
     def policy_layers(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

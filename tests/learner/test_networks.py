@@ -77,7 +77,7 @@ def test_adam():
 def plain_td3_update(agent: TD3, batch: Batch, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """y, ∂L_Q/∂critics and ∂L_π/∂actor (with the critics as they are) from the formulas in learner/td3.py."""
     config = agent.config
-    s, a, r, d, s2, c = (torch.from_numpy(array) for array in batch.arrays)
+    s, a, r, d, s2, c, m = (torch.from_numpy(array) for array in batch.arrays)
     smoothing = (noise * config.target_noise).clamp(-config.target_noise_clip, config.target_noise_clip)
     target_actor = plain(agent.target_actor, 0, s2, agent.target_actor.parameters)
     x2 = torch.cat([s2, (torch.tanh(target_actor) + smoothing).clamp(-1, 1)], 1)
@@ -90,12 +90,14 @@ def plain_td3_update(agent: TD3, batch: Batch, noise: torch.Tensor) -> tuple[tor
 
     actor = agent.actor.parameters.clone().requires_grad_()
     proposed = torch.tanh(plain(agent.actor, 0, s, actor))
-    (-plain(agent.critics, 0, torch.cat([s, proposed], 1), agent.critics.parameters).mean()).backward()
+    value = plain(agent.critics, 0, torch.cat([s, proposed], 1), agent.critics.parameters).mean()
+    (config.imitation * (m * ((proposed - a) ** 2).sum(1, keepdim=True)).mean() - value).backward()
     return y, critics.grad, actor.grad
 
 
-def test_td3_formulas():
-    agent = TD3(5, 2, replace(SMALL, policy_delay=1), seed=3)
+@pytest.mark.parametrize("imitation", [0.0, 0.7])
+def test_td3_formulas(imitation):
+    agent = TD3(5, 2, replace(SMALL, policy_delay=1, imitation=imitation), seed=3)
     agent.cost_weight = 2.5
     for seed in range(5):  # away from where targets and networks are equal
         agent.update(random_batch(seed))
@@ -137,7 +139,7 @@ def test_learns_a_bandit_in_bfloat16():
     agent, batch, generator = TD3(2, 2, config, seed=0), Batch(64, 2, 2), np.random.default_rng(0)
     for _ in range(700):
         s, a = generator.uniform(-0.8, 0.8, (64, 2)), generator.uniform(-1, 1, (64, 2))
-        for array, value in zip(batch.arrays, (s, a, -((a - s) ** 2).sum(1, keepdims=True), 0.0, s, 0.0), strict=True):
+        for array, value in zip(batch.arrays, (s, a, -((a - s) ** 2).sum(1, keepdims=True), 0.0, s), strict=False):
             array[:] = value
         agent.update(batch)
     action = agent.actor.forward(batch.observation).tanh()

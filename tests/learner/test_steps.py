@@ -129,6 +129,19 @@ def test_the_cost_of_a_window_is_discounted_like_its_reward():
     assert [transition.cost for transition in closed] == pytest.approx([0.81, 0.9, 1.0])
 
 
+@pytest.mark.parametrize("stored", ["executed", "both"])
+def test_only_what_the_filter_executed_in_place_of_a_proposal_is_imitated(stored):
+    """A proposal that the vehicle's slew limits differs from what was executed, but it has no penalty."""
+    other = np.full_like(move(0, 0, 1.0).action, 0.5)
+    corrected = move(0, 0, 1.0)._replace(proposed=other, penalty=2.0)
+    limited = move(0, 1, 1.0)._replace(proposed=other)
+    windows = NStepWindows(1, GAMMA, stored)
+    closed = [transition for each in (corrected, limited) for transition in windows.push("a", each)]
+    imitated = [transition.action for transition in closed if transition.imitated]
+    assert len(imitated) == 1 and np.array_equal(imitated[0], corrected.action)
+    assert len(closed) == (4 if stored == "both" else 2)
+
+
 def test_a_straggler_stands_for_itself():
     windows = NStepWindows(3, GAMMA)
     closed = [t for number in (0, 2, 1) for t in windows.push("a", move(0, number, 1.0 + number))]
@@ -157,6 +170,15 @@ def test_replay_holds_the_newest_also_when_restored(capacity, count):
     if len(stored) < 12:
         assert set(batch.reward.flatten().tolist()) == stored
     assert (batch.observation[0, :, :1] == batch.reward[0]).all() and (batch.action[0] == -batch.reward[0]).all()
+
+
+def test_replay_of_a_checkpoint_from_before_imitation_is_restored():
+    replay, restored, batch = ReplayBuffer(4, 3, 1), ReplayBuffer(4, 3, 1), Batch(2, 3, 1)
+    replay.insert(transition(1.0)._replace(imitated=1.0))
+    tensors = {name: array for name, array in replay.state().tensors.items() if name != "imitated"}
+    restored.restore(PartState(tensors, replay.state().values))
+    restored.sample(np.random.default_rng(0), batch)
+    assert (batch.reward == 1.0).all() and not batch.imitated.any()
 
 
 def test_replay_refuses_what_does_not_fit():
