@@ -117,12 +117,16 @@ class Learner:
         for transition in self._windows.push(step.actor, move):
             self._replay.insert(transition)
         self._limiter.insert()
+        self._weigh_penalties()
         if self._multiplier is not None and (step.terminated or step.truncated):
             self._multiplier.end_episode(step.collision)
             self._td3.cost_weight = self._multiplier.value
         self._episode_ended = step.terminated or step.truncated
         self._ages.append(self._version - step.weights_version)
         return True
+
+    def _weigh_penalties(self) -> None:
+        self._td3.penalty_factor = self.config.td3.penalty_factor(self.steps / self.config.steps)
 
     def join(self, join: pb.Join, asker: str = "") -> pb.JoinReply:
         """Accept an actor, or give the reason for the refusal in `error`.
@@ -331,6 +335,7 @@ class Learner:
             except Exception as error:  # of another version, for instance
                 raise DamagedPart(name, root, f"damaged: {error}") from error
         self._td3.cost_weight = 0.0 if self._multiplier is None else self._multiplier.value
+        self._weigh_penalties()
         self._encode()
         if self._published_updates != self._td3.updates:
             self.publish()

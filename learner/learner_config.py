@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 Precision = Literal["float32", "bfloat16"]
+GROWTH = 1 / 6, 1 / 2  # shares of the training between which penalties grow: first the goals are learned
 Stored = Literal["executed", "both"]  # actions of a corrected step to learn from (`learner/n_step.py`)
 
 
@@ -51,6 +52,8 @@ class TD3Config:
     imitation: float = 0.0
     """Let the actor imitate what the filter executed in place of its proposals, with this weight beside the critic's
     value."""
+    penalty_growth: float = 1.0
+    """Let the penalties for corrections grow to this multiple, in even steps from a sixth to a half of the training."""
     symmetric: bool = True
     """Learn also from the mirror images of a step, if the task is symmetric."""
     warmup: int = 2000
@@ -66,10 +69,21 @@ class TD3Config:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
         if not 0.0 <= self.imitation < float("inf"):
             raise ValueError(f"imitation must be 0 or a positive weight: {self}")
+        if not 1.0 <= self.penalty_growth < float("inf"):
+            raise ValueError(f"penalty_growth must be 1 or more: {self}")
         if self.multiplier_rate <= 0.0 or not 0.0 <= (self.cost_limit or 0.0) < 1.0:
             raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
             raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
+
+    def penalty_factor(self, done: float) -> float:
+        """Return the factor on penalties after a share `done` of the training.
+
+        >>> [TD3Config(penalty_growth=4.0).penalty_factor(done) for done in (0.0, 0.25, 0.5, 1.0)]
+        [1.0, 1.75, 4.0, 4.0]
+        """
+        begin, end = GROWTH
+        return 1.0 + (self.penalty_growth - 1.0) * min(max((done - begin) / (end - begin), 0.0), 1.0)
 
 
 @dataclass(frozen=True)

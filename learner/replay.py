@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from brakeline.learner.checkpoint_state import PartState
 
 Vector = NDArray[np.float32]
-NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost", "imitated")
-ADDED = ("imitated",)  # checkpoints from before do not hold these
+NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost", "penalty", "imitated")
+ADDED = ("penalty", "imitated")  # not in older checkpoints, whose rewards include the penalties
 
 
 class Transition(NamedTuple):
-    """k ≥ 1 steps of an episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), s' after step k, C = Σ_j γ^j c_j."""
+    """k ≥ 1 steps of an episode: s, a, R = Σ_j γ^j r_j, d = γ^k (0 at a true end), and s' after step k.
+
+    C and P are the same sums of costs and of penalties for corrections.
+    """
 
     observation: Vector
     action: Vector  # of the first step, normalised to [−1, 1]
@@ -24,11 +27,12 @@ class Transition(NamedTuple):
     discount: float
     next_observation: Vector
     cost: float = 0.0  # c_j is 1 at a collision
+    penalty: float = 0.0  # for corrections; R is without it
     imitated: float = 0.0  # 1: the filter executed this action in place of the proposal; the actor may imitate it
 
 
 def _widths(observation_dim: int, action_dim: int) -> tuple[int, ...]:
-    return (observation_dim, action_dim, 1, 1, observation_dim, 1, 1)
+    return (observation_dim, action_dim, 1, 1, observation_dim, 1, 1, 1)
 
 
 class Batch:
@@ -41,7 +45,7 @@ class Batch:
         self.arrays = tuple(tensor[0].numpy() for tensor in tensors)
         # tensors (1, batch, width), in the same order
         self.observation, self.action, self.reward, self.discount, self.next_observation = tensors[:5]
-        self.cost, self.imitated = tensors[5:]
+        self.cost, self.penalty, self.imitated = tensors[5:]
 
     def __len__(self) -> int:
         return len(self.arrays[0])

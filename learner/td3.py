@@ -2,14 +2,15 @@
 
 Each coordinate of an action is normalised to [−1, 1]. A transition spans k ≤ n steps (`learner/n_step.py`):
 
-    y     = c·(R − λ C) + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
+    y     = c·(R − f P − λ C) + d · min_i Q̄_i(s', clip(π̄(s') + ε, −1, 1)),   ε = clip(N(0, σ²), −η, η)
     L_Q   = Σ_i mean (Q_i(s, a) − y)²
     L_π   = −mean Q_1(s, π(s)) + β mean m ‖π(s) − a‖²              every `policy_delay`-th update, then
     θ̄     ← θ̄ + τ (θ − θ̄)
 
-with R = Σ_j γ^j r_j over the k steps, C the same sum of costs, λ their weight (0 unless a multiplier sets it;
-`learner/lagrange.py`), d = γ^k (0 at a true end), and c the reward scale. β is the weight of imitation, and m is 1
-where the filter executed a in place of another proposal.
+with R = Σ_j γ^j r_j over the k steps, P and C the same sums of penalties for corrections and of costs, λ the weight of
+costs (0 unless a multiplier sets it; `learner/lagrange.py`), d = γ^k (0 at a true end), and c the reward scale. The
+factor f on penalties may grow during the training. β is the weight of imitation, and m is 1 where the filter executed a
+in place of another proposal.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class TD3:
 
     def __init__(self, observation_dim: int, action_dim: int, config: TD3Config, seed: int) -> None:
         torch.set_num_threads(1)  # more threads than cores make all processes ten times slower
-        # cost_weight: λ
-        self.config, self.updates, self.losses, self.cost_weight = config, 0, Losses(), 0.0
+        self.config, self.updates, self.losses = config, 0, Losses()
+        self.cost_weight, self.penalty_factor = 0.0, 1.0  # λ, f
         self._generator = torch.Generator().manual_seed(seed)
         batch, joint = config.batch, observation_dim + action_dim
         actor_sizes = (observation_dim, *config.hidden, action_dim)
@@ -83,6 +84,7 @@ class TD3:
         torch.mul(value, batch.discount, out=self._target)
         if self.cost_weight:
             self._target.add_(batch.cost, alpha=-config.reward_scale * self.cost_weight)
+        self._target.add_(batch.penalty, alpha=-config.reward_scale * self.penalty_factor)
         return self._target.add_(batch.reward, alpha=config.reward_scale)
 
     def _pair(self, observation: Tensor, action: Tensor) -> Tensor:

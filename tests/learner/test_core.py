@@ -79,12 +79,22 @@ def test_it_learns():
     assert policy(np.array([-1.0, 1.0]))[0] > 1.5 and policy(np.array([1.0, -1.0]))[0] < 0.5
 
 
-def test_a_step_is_read_with_the_reward_less_the_penalty_a_normalised_action_and_its_cut():
+def test_a_step_is_read_with_its_reward_its_penalty_a_normalised_action_and_its_cut():
     learner, _ = started(replace(CONFIG, td3=replace(CONFIG.td3, n_step=1)))
     learner.insert(step(1, reward=2.0, penalty=0.5, action=[1.5]))
-    state = learner._replay.state()
-    assert state.tensors["reward"][0] == 1.5 and state.tensors["action"][0] == 0.5
+    tensors = learner._replay.state().tensors
+    assert [float(tensors[name][0, 0]) for name in ("reward", "penalty", "action")] == [2.0, 0.5, 0.5]
     assert [learner._intake.move(step(2, cut=cut)).cut for cut in (False, True)] == [False, True]
+
+
+def test_penalties_grow_during_the_training_also_those_of_old_steps():
+    td3 = replace(CONFIG.td3, penalty_growth=3.0)
+    learner, _ = started(replace(CONFIG, td3=td3, steps=12))
+    factors = []
+    for index in range(1, 9):
+        learner.insert(step(index))
+        factors.append(learner._td3.penalty_factor)
+    assert factors == pytest.approx([1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0, 3.0])
 
 
 def test_duplicates_and_gaps_are_counted():

@@ -77,12 +77,12 @@ def test_adam():
 def plain_td3_update(agent: TD3, batch: Batch, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """y, ∂L_Q/∂critics and ∂L_π/∂actor (with the critics as they are) from the formulas in learner/td3.py."""
     config = agent.config
-    s, a, r, d, s2, c, m = (torch.from_numpy(array) for array in batch.arrays)
+    s, a, r, d, s2, c, p, m = (torch.from_numpy(array) for array in batch.arrays)
     smoothing = (noise * config.target_noise).clamp(-config.target_noise_clip, config.target_noise_clip)
     target_actor = plain(agent.target_actor, 0, s2, agent.target_actor.parameters)
     x2 = torch.cat([s2, (torch.tanh(target_actor) + smoothing).clamp(-1, 1)], 1)
     values = [plain(agent.target_critics, i, x2, agent.target_critics.parameters) for i in range(2)]
-    y = config.reward_scale * (r - agent.cost_weight * c) + d * torch.minimum(*values)
+    y = config.reward_scale * (r - agent.cost_weight * c - agent.penalty_factor * p) + d * torch.minimum(*values)
 
     critics = agent.critics.parameters.clone().requires_grad_()
     x = torch.cat([s, a], 1)
@@ -98,7 +98,7 @@ def plain_td3_update(agent: TD3, batch: Batch, noise: torch.Tensor) -> tuple[tor
 @pytest.mark.parametrize("imitation", [0.0, 0.7])
 def test_td3_formulas(imitation):
     agent = TD3(5, 2, replace(SMALL, policy_delay=1, imitation=imitation), seed=3)
-    agent.cost_weight = 2.5
+    agent.cost_weight, agent.penalty_factor = 2.5, 1.5
     for seed in range(5):  # away from where targets and networks are equal
         agent.update(random_batch(seed))
     batch = random_batch(9)

@@ -140,6 +140,7 @@ def test_only_what_the_filter_executed_in_place_of_a_proposal_is_imitated(stored
     imitated = [transition.action for transition in closed if transition.imitated]
     assert len(imitated) == 1 and np.array_equal(imitated[0], corrected.action)
     assert len(closed) == (4 if stored == "both" else 2)
+    assert closed[0].penalty == (0.0 if stored == "both" else 2.0)
 
 
 def test_a_straggler_stands_for_itself():
@@ -172,13 +173,13 @@ def test_replay_holds_the_newest_also_when_restored(capacity, count):
     assert (batch.observation[0, :, :1] == batch.reward[0]).all() and (batch.action[0] == -batch.reward[0]).all()
 
 
-def test_replay_of_a_checkpoint_from_before_imitation_is_restored():
+def test_replay_of_a_checkpoint_without_penalties_and_imitation_is_restored():
     replay, restored, batch = ReplayBuffer(4, 3, 1), ReplayBuffer(4, 3, 1), Batch(2, 3, 1)
-    replay.insert(transition(1.0)._replace(imitated=1.0))
-    tensors = {name: array for name, array in replay.state().tensors.items() if name != "imitated"}
+    replay.insert(transition(1.0)._replace(imitated=1.0, penalty=1.0))
+    tensors = {name: array for name, array in replay.state().tensors.items() if name not in ("penalty", "imitated")}
     restored.restore(PartState(tensors, replay.state().values))
     restored.sample(np.random.default_rng(0), batch)
-    assert (batch.reward == 1.0).all() and not batch.imitated.any()
+    assert (batch.reward == 1.0).all() and not batch.imitated.any() and not batch.penalty.any()
 
 
 def test_replay_refuses_what_does_not_fit():
@@ -205,9 +206,9 @@ def test_a_corrected_step_is_two_lessons():
     moves = [ActorStep(0, i, ends[0], ends[0], ends[1], 1.0, 0.25, ends[1], False, i == 1) for i in range(2)]
     windows = NStepWindows(2, 0.5, "both")
     first = windows.push("a", moves[0]) + windows.push("a", moves[1])
-    assert [(*t.action, t.reward) for t in first] == [(0.0, 1.375), (1.0, 1.125), (0.0, 1.0), (1.0, 0.75)]
+    assert [(*t.action, t.reward - t.penalty) for t in first] == [(0.0, 1.375), (1.0, 1.125), (0.0, 1.0), (1.0, 0.75)]
     single = NStepWindows(1, 0.5, "executed").push("a", moves[0])
-    assert [(t.action[0], t.reward) for t in single] == [(0.0, 0.75)]
+    assert [(t.action[0], t.reward - t.penalty) for t in single] == [(0.0, 0.75)]
 
 
 LOWEST = -100.0
@@ -238,7 +239,8 @@ def test_a_cut_ends_the_episode_for_the_learner_with_the_lowest_reward(stored, t
     windows = NStepWindows(3, GAMMA, stored)
     transitions = [t for k in range(steps) for t in windows.push("a", cut_move(k, k == 2, terminated and k == 2))]
     sampled = [
-        (*t.observation, *t.action, round(t.reward, 6), round(t.discount, 6), *t.next_observation) for t in transitions
+        (*t.observation, *t.action, round(t.reward - t.penalty, 6), round(t.discount, 6), *t.next_observation)
+        for t in transitions
     ]
     assert sampled == expected
 

@@ -53,7 +53,7 @@ def test_a_batch_holds_every_image_alike_and_rewards_as_they_were():
     before = [array.copy() for array in batch.arrays]
     SymmetryAugmentation(QUADROTOR, 16).apply(batch)
     observation, action, _, _, after, *_ = batch.arrays
-    assert all(np.array_equal(batch.arrays[i], before[i]) for i in (2, 3, 5, 6)), "reward, discount, cost, imitated"
+    assert all(np.array_equal(batch.arrays[i], before[i]) for i in (2, 3, 5, 6, 7)), "only vectors are turned"
     for row in range(16):
         turn = symmetry_matrices(QUADROTOR)[row % 8]
         assert np.array_equal(observation[row], image(before[0][row], turn).astype(np.float32))
