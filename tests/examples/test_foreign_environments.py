@@ -161,7 +161,8 @@ def test_training_learns_from_executed_and_from_proposed_actions(monkeypatch):
     executed, proposed = stored["action"][0::2], stored["action"][1::2]
     assert len(executed) == len(proposed) == 30
     assert (executed == 0.0).all() and (np.abs(proposed).max(axis=1) > 0.0).all()
-    assert stored["reward"][0::2] == pytest.approx(1.0), "executed actions have no penalty"
-    assert stored["reward"][1::2] == pytest.approx(0.5)
+    net = stored["reward"] - stored["penalty"]
+    assert net[0::2] == pytest.approx(1.0), "executed actions have no penalty"
+    assert net[1::2] == pytest.approx(0.5)
     assert learner.policy is not None and learner.td3.updates > 10
     assert np.abs(learner.propose(np.ones(3))).max() <= 1.0
