@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 Precision = Literal["float32", "bfloat16"]
-GROWTH = 1 / 6, 1 / 2  # shares of the training between which penalties grow: first the goals are learned
+GROWTH_SHARES = 1 / 6, 1 / 2  # shares of the training between which penalties grow: first the goals are learned
 Stored = Literal["executed", "both"]  # actions of a corrected step to learn from (`learner/n_step.py`)
 
 
@@ -50,10 +50,11 @@ class TD3Config:
     stored: Stored = "both"
     """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
     imitation: float = 0.0
-    """Let the actor imitate what the filter executed in place of its proposals, with this weight beside the critic's
-    value."""
+    """Add this weight times the squared distance of the actor's proposals from what the filter executed in their place
+    to the actor's loss."""
     penalty_growth: float = 1.0
-    """Let the penalties for corrections grow to this multiple, in even steps from a sixth to a half of the training."""
+    """Multiply penalties for corrections by a factor that grows linearly from 1 to this, from a sixth to a half of the
+    training."""
     symmetric: bool = True
     """Learn also from the mirror images of a step, if the task is symmetric."""
     warmup: int = 2000
@@ -82,7 +83,7 @@ class TD3Config:
         >>> [TD3Config(penalty_growth=4.0).penalty_factor(done) for done in (0.0, 0.25, 0.5, 1.0)]
         [1.0, 1.75, 4.0, 4.0]
         """
-        begin, end = GROWTH
+        begin, end = GROWTH_SHARES
         return 1.0 + (self.penalty_growth - 1.0) * min(max((done - begin) / (end - begin), 0.0), 1.0)
 
 

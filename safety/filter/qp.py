@@ -14,9 +14,9 @@ from brakeline.safety.filter.reachable_tube import Tube
 
 Index = NDArray[np.int64]
 
-# m by which the QP's rows are tighter: so that a rounded answer passes the exact check, or so that an answer of several
-# inputs passes it with the proposal in place of its first input (`AS_PROPOSED`)
-ROW_TIGHTENING, OF_SEVERAL_INPUTS = 1e-6, 2e-3
+# The QP's rows are tighter by this [m]. If a plan has one chosen input, a rounded answer then passes the exact check.
+# If it has several, an answer also passes with the proposal in place of its first input (`AS_PROPOSED`).
+ROW_TIGHTENING, ROW_TIGHTENING_SEVERAL = 1e-6, 2e-3
 REGULARIZATION = 1e-4  # ε: weight of all other variables; with much less the solver needs thousands of iterations
 ROUNDING = 1e-12  # of a unit row of W: a row with smaller entries for f does not depend on f
 
@@ -90,7 +90,7 @@ class QPBuilder:
         self.tube = tube
         m, steps = robot.action_dim, robot.free_steps - robot.committed_steps
         free = steps * m
-        self.tightening = ROW_TIGHTENING if steps == 1 else OF_SEVERAL_INPUTS
+        self.tightening = ROW_TIGHTENING if steps == 1 else ROW_TIGHTENING_SEVERAL
         self.known = tube.position.shape[2] - free  # length of z_0
         self.free = free
         moving = np.abs(tube.W[:, self.known :]).max(1, initial=0.0) > ROUNDING

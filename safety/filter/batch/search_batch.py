@@ -69,6 +69,7 @@ class SearchBatch:
         self._qp = QPBatch(safety.builder, self.constraints, constant, xp)
         self._clearance, self._tightening = safety.clearance_margin, safety.builder.tightening
         self.known, self._free, self._m = safety.builder.known, safety.builder.free, safety.robot.action_dim
+        self._one_input = self._free == self._m
         inputs = safety.inputs
         self._low, self._high = constant(inputs.low[:, None]), constant(inputs.high[:, None])
         self._slew, self._nothing = constant(inputs.slew[:, None]), constant(inputs.nothing[:, None])
@@ -103,7 +104,7 @@ class SearchBatch:
         xp, known, m = self._xp, self.known, self._m
         off = (z[known : known + m] - lanes.proposal) / (self._high - self._low)
         off = xp.sqrt(xp.sum(off * off, axis=0))
-        if z.shape[0] == known + m:
+        if self._one_input:
             return z, xp.zeros_like(off, dtype=xp.bool)
         with_proposal = self._within(lanes.z_0, xp.concat([lanes.proposal, z[known + m :]]))
         return xp.where(off <= AS_PROPOSED, with_proposal, z), xp.abs(off - AS_PROPOSED) < ROUNDING
@@ -152,9 +153,9 @@ class SearchBatch:
         return found
 
     def _changed(self, lanes: LaneBatch, z: Array) -> Array:
-        """Return which plans (B,) begin with another input than the proposal. One input alone always is another one."""
+        """Return which plans (B,) begin with another input than the proposal: with one chosen input, all do."""
         first, xp = z[self.known : self.known + self._m], self._xp
-        if z.shape[0] == self.known + self._m:
+        if self._one_input:
             return xp.ones_like(z[0], dtype=xp.bool)
         return xp.any(first != lanes.proposal, axis=0)
 
