@@ -69,9 +69,9 @@ class TD3Config:
         if self.warmup < self.n_step:
             raise ValueError(f"warmup {self.warmup} is shorter than n_step {self.n_step}: nothing to sample from")
         if not 0.0 <= self.imitation < float("inf"):
-            raise ValueError(f"imitation must be 0 or a positive weight: {self}")
+            raise ValueError(f"imitation must be 0 or a positive weight, not {self.imitation:g}")
         if not 1.0 <= self.penalty_growth < float("inf"):
-            raise ValueError(f"penalty_growth must be 1 or more: {self}")
+            raise ValueError(f"penalty_growth must be 1 or more, not {self.penalty_growth:g}")
         if self.multiplier_rate <= 0.0 or not 0.0 <= (self.cost_limit or 0.0) < 1.0:
             raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:

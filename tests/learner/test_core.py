@@ -97,6 +97,12 @@ def test_penalties_grow_during_the_training_also_those_of_old_steps():
     assert factors == pytest.approx([1.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0, 3.0])
 
 
+@pytest.mark.parametrize("wrong", [{"penalty_growth": 0.5}, {"imitation": -1.0}, {"imitation": float("nan")}])
+def test_a_weight_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be"):
+        replace(CONFIG.td3, **wrong)
+
+
 def test_duplicates_and_gaps_are_counted():
     learner, _ = started()
     assert [learner.insert(step(index)) for index in (1, 2, 2, 5, 1)] == [True, True, False, True, False]
