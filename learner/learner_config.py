@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 Precision = Literal["float32", "bfloat16"]
@@ -76,6 +77,27 @@ class TD3Config:
             raise ValueError(f"multiplier_rate must be positive and cost_limit in [0, 1): {self}")
         if not 0.0 <= self.gamma <= 1.0 or not 0.0 < self.tau <= 1.0:
             raise ValueError(f"gamma must be in [0, 1] and tau in (0, 1]: {self}")
+
+    def with_settings(self, settings: Mapping[str, Any]) -> TD3Config:
+        """Return these settings, with `settings` in place of those that have their default value.
+
+        >>> TD3Config(tau=0.01).with_settings({"tau": 0.02, "imitation": 1.0}).tau
+        0.01
+
+        Raises:
+            ValueError: TD3 has no such setting, or not with this value.
+        """
+        default = TD3Config()
+        if unknown := settings.keys() - asdict(default):
+            raise ValueError(f"TD3 has no setting {', '.join(sorted(unknown))}")
+        own: dict[str, Any] = {}
+        for name, value in settings.items():
+            if getattr(self, name) == getattr(default, name):
+                own[name] = tuple(value) if isinstance(value, list) else value
+        try:
+            return replace(self, **own)
+        except TypeError as error:  # text in place of a number
+            raise ValueError(f"{own}: {error}") from error
 
     def penalty_factor(self, done: float) -> float:
         """Return the factor on penalties after a share `done` of the training.

@@ -144,7 +144,8 @@ class Task:
     reward: Reward = field(default_factory=Reward)
     trajectories: int = 200  # number to record for a model set, 300 periods each
     steps: int = 60_000  # training steps in a comparison
-    batch: dict[str, Any] = field(default_factory=dict)  # settings of TD3 with which `train --backend batch` learns
+    learner: dict[str, Any] = field(default_factory=dict)  # settings of TD3 for this task, in place of the defaults
+    batch: dict[str, Any] = field(default_factory=dict)  # more of them for `train --backend batch`
     at_once: int = 64  # robots that train at once in a comparison, where batches simulate them
     simulator_version: int = 1  # raise it if the motion changes: what an older simulator recorded is recorded again
     turn_aside: bool = False  # the filter turns blocked robots aside (docs/method.md §4)

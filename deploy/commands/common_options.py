@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 import tyro
 
 from brakeline.actors.actor_settings import FlightSettings
+from brakeline.errors import BrakelineError
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import (
     Conditions,
@@ -27,6 +29,7 @@ from brakeline.sim.sim_conditions import (
 
 if TYPE_CHECKING:
     from brakeline.deploy.run.run_config import RunConfig
+    from brakeline.learner.learner_config import LearnerConfig
     from brakeline.messaging.bus import BusSettings
     from brakeline.sim.arena import Arena
 
@@ -241,6 +244,32 @@ def settings_from(kind: type[T], options: object, **values: Any) -> T:
     """Return settings of a dataclass `kind`: the fields that the options have too, and `values`, which come first."""
     shared = {item.name for item in fields(cast("type[Any]", kind)) if hasattr(options, item.name)}
     return kind(**{name: getattr(options, name) for name in shared} | values)
+
+
+def task_learner(learner: LearnerConfig, arguments: list[str], batch: bool = False) -> LearnerConfig:
+    """Return the learner's settings, with those of the tasks of the robots that `arguments` name.
+
+    Several robots share the settings that all their tasks have.
+
+    Args:
+        batch: the learner trains with the backend batch, for which a task may have settings of its own.
+
+    Raises:
+        ValueError: TD3 has no such setting.
+    """
+    from brakeline.messaging.task import Task, robot_with_task
+
+    tasks: list[Task] = []
+    for word in arguments:
+        with suppress(BrakelineError):  # another argument, or a file with mistakes, about which the run complains
+            tasks.append(robot_with_task(word).task)
+    tasks = tasks or [robot_with_task("ground").task]
+    first, *others = [task.learner | (task.batch if batch else {}) for task in tasks]
+    shared = {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
+    try:
+        return replace(learner, td3=learner.td3.with_settings(shared))
+    except ValueError as error:
+        raise ValueError(f"[learner] or [batch] of the robot's task: {error}") from error
 
 
 def default_keys() -> Path | None:

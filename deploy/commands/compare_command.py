@@ -122,6 +122,7 @@ class CompareCommand:
 
     def _jobs(self, robot: str) -> list[Job]:
         from brakeline.deploy.experiments.conservatism import Conservatism
+        from brakeline.messaging.task import robot_with_task
 
         cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
@@ -132,8 +133,9 @@ class CompareCommand:
         if self.penalty is not None:
             changed["penalty"] = self.penalty
         jobs: list[Job] = []
+        task = robot_with_task(robot).task
         for cell in cells:
-            own = replace(cell, td3=learning(self.td3, cell.method))
+            own = replace(cell, td3=learning(self.td3, cell.method, task))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
-from brakeline.deploy.commands.common_options import BusOptions, Robot, Seed, Unprefixed
+from brakeline.deploy.commands.common_options import BusOptions, Robot, Seed, Unprefixed, task_learner
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.messaging.task import address
@@ -29,6 +30,11 @@ class LearnerCommand:
     steps: int = 100_000
     """Train for this many steps."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
+
+    @classmethod
+    def defaults(cls, arguments: list[str]) -> Self:
+        """Return the default options, with the settings of the learner that the task of the named robot has."""
+        return cls(learner=task_learner(RunConfig().learner, arguments))
 
     def run(self) -> int:
         """Learn until the last step, SIGINT or SIGTERM. Returns the exit status."""

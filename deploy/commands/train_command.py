@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import tyro
 
@@ -14,7 +14,6 @@ from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.progress import under_way
 from brakeline.deploy.run.run_config import BATCH, EXPERIMENTS, RunConfig, in_batches, load
-from brakeline.errors import BrakelineError
 
 STOPPED = 130  # exit status: the user stopped the run before its last step
 
@@ -50,10 +49,10 @@ class TrainCommand(RunConfig):
 
     @classmethod
     def defaults(cls, arguments: list[str]) -> Self:
-        """Return the default options: those of the experiment, the backend and the robot that `arguments` name.
+        """Return the default options: those of the experiment, the backend and the robots that `arguments` name.
 
         Raises:
-            ValueError: there is no such experiment.
+            ValueError: there is no such experiment, or a robot's task has a setting that TD3 does not have.
         """
         named = {"--experiment": cls.experiment, "--backend": cls.backend}
         for flag, value in zip(arguments, [*arguments[1:], ""], strict=False):
@@ -65,8 +64,9 @@ class TrainCommand(RunConfig):
             raise ValueError(f"no experiment is called {name!r}; there are: {', '.join(EXPERIMENTS)}")
         experiment = EXPERIMENTS[name]
         if named["--backend"] == BATCH:
-            experiment = in_batches(experiment, batch_settings(arguments))
-        return options.settings_from(cls, experiment, experiment=name, steps=0)
+            experiment = in_batches(experiment)
+        learner = options.task_learner(experiment.learner, arguments, batch=experiment.backend == BATCH)
+        return options.settings_from(cls, experiment, experiment=name, steps=0, learner=learner)
 
     def config(self) -> RunConfig:
         """Return the run's configuration. Raises ValueError if options contradict each other."""
@@ -106,17 +106,6 @@ class TrainCommand(RunConfig):
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()
         return train(self.config(), folder, self.resume is not None, self.meeting, self.json, self.verbose, self.watch)
-
-
-def batch_settings(arguments: list[str]) -> dict[str, Any]:
-    """Return the settings of TD3 with which a batch of the robot that `arguments` name learns."""
-    from brakeline.messaging.task import robot_with_task
-
-    for word in [*arguments, *RunConfig.robots]:
-        with suppress(BrakelineError):  # another argument, or a file with mistakes, about which the run complains
-            settings = robot_with_task(word).task.batch
-            return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-    return {}
 
 
 def train(

@@ -18,13 +18,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, TD3_LEARNER
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Backend
+    from brakeline.messaging.task import Task
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
 LEARNING = "learning"
@@ -116,14 +117,17 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, method: str) -> TD3Config:
-    """Return the learner's settings, with those of the method in place of the defaults.
+def learning(td3: TD3Config, method: str, task: Task) -> TD3Config:
+    """Return the learner's settings, with those of the method and of the robot's task in place of the defaults.
+
+    The task's are for TD3 behind a filter that was not tuned without them.
 
     A batch keeps an update for each step. With an update for every fourth one, as `train --backend batch` makes, TD3
     without a filter stood still after 60,000 steps (seed 0); with one for each it reached 493 of 500 goals.
     """
-    default, own = TD3Config(), METHODS[method].td3
-    return replace(td3, **{name: value for name, value in own.items() if getattr(td3, name) == getattr(default, name)})
+    compared = METHODS[method]
+    with_task = compared.filter not in TUNED_AT_1 and compared.learner == TD3_LEARNER
+    return td3.with_settings({**(task.learner if with_task else {}), **compared.td3})
 
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:

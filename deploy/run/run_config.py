@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import tyro
@@ -209,21 +207,9 @@ EXPERIMENTS: dict[str, RunConfig] = {
 }
 
 
-def in_batches(config: RunConfig, settings: Mapping[str, Any] = MappingProxyType({})) -> RunConfig:
-    """Return an experiment with the backend batch, and without pictures of its many robots.
-
-    settings: of TD3, as the robot's task has them (`Task.batch`), in place of those that the experiment leaves as they
-        are by default.
-
-    Raises:
-        ValueError: TD3 has no such setting.
-    """
-    if unknown := settings.keys() - asdict(TD3Config()):
-        raise ValueError(f"[batch] of the robot's task: TD3 has no setting {', '.join(sorted(unknown))}")
-    td3, default = config.learner.td3, TD3Config()
-    own = {name: value for name, value in settings.items() if getattr(td3, name) == getattr(default, name)}
-    learner = replace(config.learner, td3=replace(td3, **own))
-    return replace(config, backend=BATCH, robots_per_actor=BATCH_ROBOTS, actors=1, pictures=0.0, learner=learner)
+def in_batches(config: RunConfig) -> RunConfig:
+    """Return an experiment with the backend batch, and without pictures of its many robots."""
+    return replace(config, backend=BATCH, robots_per_actor=BATCH_ROBOTS, actors=1, pictures=0.0)
 
 
 def encode(config: RunConfig) -> str:

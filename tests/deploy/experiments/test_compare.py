@@ -10,6 +10,7 @@ import pytest
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments import bootstrap
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
+from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
     TrialConfig,
@@ -255,9 +256,19 @@ def test_steps_of_several_actors_are_rows_in_the_order_in_which_their_episodes_b
 def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_none():
     assert backend_for("ground", ("default", "dense")) == backend_for("quadrotor", ("default", "dense")) == "batch"
     assert backend_for("ground", ("default", "walkers")) == backend_for("ground+tracks", ("default",)) == "single"
+    task = robot_with_task("ground").task
     given = replace(TD3Config(), updates_per_step=0.5)
-    assert learning(given, "none") == given and learning(TD3Config(), "none").updates_per_step == 1.0
-    assert given.cost_limit is None and learning(given, "lagrange").cost_limit is not None
+    assert learning(given, "none", task) == given and learning(TD3Config(), "none", task).updates_per_step == 1.0
+    assert given.cost_limit is None and learning(given, "lagrange", task).cost_limit is not None
+
+
+def test_methods_behind_a_filter_that_was_tuned_with_them_have_the_learner_of_the_task():
+    task = robot_with_task("quadrotor").task
+    assert task.learner["imitation"] > 0.0
+    for method in METHODS:
+        used = learning(TD3Config(), method, task)
+        assert (used.imitation > 0.0) == (method in ("ddpc", "cbf", "psf")), method
+    assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():

@@ -17,6 +17,7 @@ from brakeline.deploy.experiments.results_page import RobotResults, page, stored
 from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuning, best_learner, tuning_jobs
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
+from brakeline.messaging.task import robot_with_task
 
 # Of 100 episodes, by run; in `dense` 10 fewer.
 GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80), "sac": (90,), "lagrange": (90,)}
@@ -53,7 +54,7 @@ def store(folder) -> None:
     folder.mkdir(exist_ok=True, parents=True)
     for method, runs in GOALS.items():
         for cell, goals in zip(cell_configs("ground", (method,), range(len(runs))), runs, strict=True):
-            own = replace(cell, physics=2, td3=learning(TD3Config(), method))
+            own = replace(cell, physics=2, td3=learning(TD3Config(), method, robot_with_task("ground").task))
             hit = 0 if method == "ddpc" else 2
             training = evaluation(90, 3 * hit) | {"steps": 60_000}
             trials = {f"trained-{method}-default": evaluation(goals, hit)}

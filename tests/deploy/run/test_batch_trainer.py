@@ -1,5 +1,6 @@
 """Training from a batch: repeatable by its seed, every step filtered and told, resumed without losses."""
 
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.actor_settings import PhysicsChange
+from brakeline.deploy.commands.learner_command import LearnerCommand
 from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.run.processes import process_specs
@@ -18,6 +20,7 @@ from brakeline.errors import BadRequest, NoBatch
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
@@ -204,11 +207,30 @@ def test_the_backend_has_settings_of_its_own_which_options_change() -> None:
     for robot, hidden, warmup in (("ground", (128, 128), 500), ("quadrotor", (256, 256), 2000), ("?", (128, 128), 500)):
         td3 = TrainCommand.defaults(["--backend", "batch", robot]).learner.td3
         assert td3.hidden == hidden and td3.warmup == warmup
-    with pytest.raises(ValueError, match="no setting rate"):
-        in_batches(RunConfig(), {"rate": 1.0, "tau": 0.1})
     assert TrainCommand.defaults(["--backend=batch"]).backend == BATCH
     assert TrainCommand.defaults([]).backend == "processes"
     assert [spec.name for spec in process_specs(in_batches(RunConfig()))] == ["recorder", "learner"]
+
+
+def test_a_task_has_settings_for_its_learner_which_options_change(tmp_path: Path) -> None:
+    def imitation(*words: str) -> float:
+        return TrainCommand.defaults(list(words)).learner.td3.imitation
+
+    task = robot_with_task("quadrotor").task.learner
+    assert imitation("quadrotor") == imitation("--backend", "batch", "quadrotor") == task["imitation"] > 0.0
+    assert LearnerCommand.defaults(["quadrotor"]).learner.td3.penalty_growth == task["penalty_growth"] > 1.0
+    assert imitation() == imitation("ground") == LearnerCommand.defaults([]).learner.td3.imitation == 0.0
+    assert imitation("quadrotor", "ground") == 0.0  # only one of the tasks asks for it
+    shutil.copy(ROBOTS_FOLDER / "ground.toml", tmp_path)
+    shipped = (ROBOTS_FOLDER / "ground.task.toml").read_text()
+    for wrong, said in (
+        ("rate = 1.0", "no setting rate"),
+        ("imitation = -1", "imitation"),
+        ("tau = 'x'", "'tau': 'x'"),
+    ):
+        (tmp_path / "ground.task.toml").write_text(f"{shipped}[learner]\n{wrong}\n")
+        with pytest.raises(ValueError, match=said):
+            imitation(str(tmp_path / "ground.toml"))
 
 
 @pytest.mark.parametrize(
