@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data import model_store, rival_pretraining
-from brakeline.deploy.experiments import bootstrap
+from brakeline.deploy.experiments import bootstrap, compared_methods
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
-from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
     TrialConfig,
@@ -265,7 +264,7 @@ def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_no
 def test_methods_behind_a_filter_that_was_tuned_with_them_have_the_learner_of_the_task():
     task = robot_with_task("quadrotor").task
     assert task.learner["imitation"] > 0.0
-    for method in METHODS:
+    for method in compared_methods.METHODS:
         used = learning(TD3Config(), method, task)
         assert (used.imitation > 0.0) == (method in ("ddpc", "cbf", "psf")), method
     assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
