@@ -6,6 +6,7 @@ score of a run is its share of goals in an evaluation; its task is the arena.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -25,6 +26,7 @@ from brakeline.deploy.experiments.tuning_trials import (
 )
 from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
+from brakeline.learner.learner_config import TD3Config
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
 from brakeline.messaging.robot import Array
@@ -56,10 +58,16 @@ def stored_cells(results: Path, robot: str) -> list[Result]:
                 "ones away"
             )
     for method in METHODS:
-        models = [cell["model"] for cell in cells if cell["study"]["method"] == method and cell["model"]]
-        if len({str(model["settings"]) for model in models if "settings" in model}) > 1:
+        if len({_settings(cell) for cell in cells if cell["study"]["method"] == method}) > 1:
             raise ResultError(f"{results / robot}: {method} has cells of several settings: run the older again")
     return cells
+
+
+def _settings(cell: Result) -> str:
+    """Return the settings of a cell's filter and learner, with the defaults that its version did not have yet."""
+    study = cell["study"]
+    td3 = {name: value for name, value in study["td3"].items() if value != getattr(DEFAULTS, name, None)}
+    return json.dumps([(cell["model"] or {}).get("settings"), study.get("penalty", 1.0), td3], sort_keys=True)
 
 
 class RobotResults:
@@ -167,11 +175,27 @@ def _setup(robot: RobotWithTask, found: RobotResults) -> str:
             + (f"{study['robots']} robots at once" if batch else "one robot"),
         ),
         ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
+        *_further_settings(found),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])
 
 
+def _further_settings(found: RobotResults) -> list[tuple[str, str]]:
+    """Return a row for the methods whose learner takes corrections into account beyond the penalty."""
+    methods: dict[str, list[str]] = {}
+    for name, cells in found.cells.items():
+        td3 = cells[0]["study"]["td3"]
+        values = [(setting, td3.get(setting, getattr(DEFAULTS, setting))) for setting in OF_CORRECTIONS]
+        if text := ", ".join(
+            f"{setting} {value:g}" for setting, value in values if value != getattr(DEFAULTS, setting)
+        ):
+            methods.setdefault(text, []).append(METHODS[name].label)
+    return [(f"learner of {', '.join(labels)}", f"also {text}") for text, labels in methods.items()]
+
+
+DEFAULTS = TD3Config()
+OF_CORRECTIONS = ("penalty_growth", "imitation")
 LEARNER = ("hidden", "batch", "gamma", "n_step", "tau", "actor_rate", "critic_rate", "updates_per_step", "warmup")
 
 
@@ -324,8 +348,9 @@ greedy policy. Of the values that cost A* no goal, the best has the fewest colli
 most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own and 120
 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin of ours
 follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map: it was
-chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0 (`docs/results_quadrotor.md`). All learners share
-TD3's settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
+chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from trainings of
+ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share
+TD3's other settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 

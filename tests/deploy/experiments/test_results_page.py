@@ -92,6 +92,20 @@ def test_cells_of_two_simulators_and_of_two_settings_of_a_rival_are_not_mixed(re
         stored_cells(results, "ground")
 
 
+def test_cells_of_two_learners_are_not_mixed_and_the_page_names_their_settings(results):
+    grown = {"penalty_growth": 4.0, "imitation": 1.0}
+    for path in (results / "ground").glob("ddpc-s*.json"):
+        change(path, lambda cell: cell["study"]["td3"].update(grown))
+    text = page(results, ["ground"])
+    assert "| learner of ours | also penalty_growth 4, imitation 1 |" in text
+    for name in grown:  # as in a version that did not have these settings yet
+        change(results / "ground" / "none-s0.json", lambda cell, name=name: cell["study"]["td3"].pop(name))
+    assert page(results, ["ground"]) == text
+    change(results / "ground" / "ddpc-s0.json", lambda cell: cell["study"]["td3"].update(imitation=0.5))
+    with pytest.raises(ResultError, match="ddpc has cells of several settings"):
+        stored_cells(results, "ground")
+
+
 def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
     assert CompareCommand(("ground",), table=True, results=results, quiet=True).run() == 0
     assert (results / "README.md").read_text() == page(results, ["ground"])
