@@ -280,11 +280,17 @@ class Launcher:
             latest.symlink_to(folder.name)
 
     def _start_recorder(self, process: Process, show: Callable[[], Any]) -> None:
-        """Start the recorder and wait until it listens, so that the log misses no message, not even the launcher's."""
-        recorder = self.processes[0]
+        """Start the recorder and wait until it listens, so that the log misses no message, not even the launcher's.
+
+        The other processes import meanwhile.
+        """
+        recorder, *others = self.processes
         deadline = time.monotonic() + RECORDER_TIMEOUT
         while not process.stop.is_set() and time.monotonic() < deadline:
             recorder.supervise()
+            for child in others:
+                if child.popen is None and not self._must_wait(child):
+                    child.start(held=True)
             self._drain()
             show()
             known = self.metrics.processes.get("recorder")
@@ -295,6 +301,9 @@ class Launcher:
             if not process.stop.is_set():
                 said = last_line(self.folder / "logs" / "recorder.log")
                 log.error("no recorder, so the run starts without a log: %s", said)
+        if not process.stop.is_set():
+            for child in others:
+                child.release()
 
     def _drain(self, seconds: float = PERIOD) -> None:
         """Take in the received messages, for at most so long: a flood must not keep the launcher from its processes."""

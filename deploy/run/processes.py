@@ -16,6 +16,7 @@ from brakeline.messaging.structured_text import parse_json
 
 CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 CERTIFIER = "certify.adapt"  # name of the process that certifies anew; its certificate is that of `certify`
+HELD = "held"  # word on the command line of a process that begins when its standard input ends
 UNFINISHED = 75  # exit status of a process that was asked to end before its work was done
 
 
@@ -24,7 +25,7 @@ class ProcessSpec:
     """A process of a run."""
 
     name: str
-    kind: str  # key of `run_process.MAIN_FUNCTIONS`
+    kind: str  # key of `run_process.PROCESSES`
     robot: str = ""  # name or path of the robot, as in the configuration
     number: int = 0  # of an actor's first robot, or of an autopilot
     nice: int = 0  # the safety of robots comes before learning

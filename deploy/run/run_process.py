@@ -1,7 +1,10 @@
-"""Run one process of a launched run: `python -m brakeline.deploy.run.run_process RUN_FOLDER PROCESS`.
+"""Run one process of a launched run: `python -m brakeline.deploy.run.run_process [held] RUN_FOLDER PROCESS`.
 
 The process takes its settings from the run's saved configuration, so that all processes of a run agree. You can also
 start each process alone, with `brakeline safety`, `learner`, `actor` or `recorder`.
+
+With the word `held`, the process imports all that it needs, and begins when its standard input ends. So
+processes import while the recorder starts, and still publish nothing that it would miss.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from pathlib import Path
 from brakeline.deploy.interpreter import end_with_parent
 from brakeline.deploy.run.processes import (
     CONFIG,
+    HELD,
     LOG,
     UNFINISHED,
     ProcessSpec,
@@ -33,7 +37,10 @@ from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 PRACTICE = 0.01  # of a run that certifies anew: a model set needs stops
 
 
-def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+Work = Callable[[], bool]  # returns True when it is done, False when a signal ended it
+
+
+def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.log_contents import attachments, derive_entries, metadata
     from brakeline.logs import recorder
     from brakeline.logs.recorded_robots import RecordedRobots
@@ -42,11 +49,10 @@ def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettin
     derive = derive_entries(config.pictures, robots)
     files = attachments(config, folder)
     settings = recorder.LogSettings(folder / LOG, metadata(config, folder), files, derive, config.rotation)
-    recorder.main(bus, settings, spec.name)
-    return False
+    return endless(partial(recorder.main, bus, settings, spec.name))
 
 
-def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.run_keys import KEYS
     from brakeline.deploy.run.run_models import model_in_run
     from brakeline.safety.service.server import SafetySettings, main
@@ -57,18 +63,17 @@ def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings
     trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
     models = tuple(model_in_run(config, folder, robot, trust) for robot in robots)
     accepted = config.accept_bound
-    main(SafetySettings(bus, models, folder, spec.name, limits, accepted, secrets=folder / KEYS))
-    return False
+    settings = SafetySettings(bus, models, folder, spec.name, limits, accepted, secrets=folder / KEYS)
+    return endless(partial(main, settings))
 
 
-def _certifier(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _certifier(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.adaptation_process import CertifierSettings, main
 
-    main(CertifierSettings(bus, config.robots, folder, config.accept_bound, spec.name))
-    return False
+    return endless(partial(main, CertifierSettings(bus, config.robots, folder, config.accept_bound, spec.name)))
 
 
-def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.learner.checkpoint import CHECKPOINT, exists, latest
 
     out = folder / spec.name
@@ -77,13 +82,13 @@ def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetting
     if config.backend == BATCH:
         from brakeline.deploy.run.batch_process import main as train_in_batches
 
-        return train_in_batches(bus, config, folder, spec, resume)
+        return partial(train_in_batches, bus, config, folder, spec, resume)
     from brakeline.learner.learner_process import LearnerSettings, main
 
-    return main(LearnerSettings(bus, spec.robot, out, resume, spec.name, config.learning()))
+    return partial(main, LearnerSettings(bus, spec.robot, out, resume, spec.name, config.learning()))
 
 
-def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.actors.actor_process import ActorSettings, run
     from brakeline.deploy.commands.common_options import settings_from
     from brakeline.deploy.policy_loading import policy_named
@@ -108,45 +113,51 @@ def _actor(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings)
         from brakeline.deploy.quadrotor_vehicles import flight_arena
 
         arena = flight_arena(config.arena, config.seed, robot_with_task(spec.robot))
-        return flight.run(settings, config.flights[spec.number], arena, propose, config.conditions)
+        return partial(flight.run, settings, config.flights[spec.number], arena, propose, config.conditions)
     worlds = partial(fleet_world, conditions=config.conditions)
-    return run(settings, partial(environment, conditions=config.conditions), propose, worlds)
+    return partial(run, settings, partial(environment, conditions=config.conditions), propose, worlds)
 
 
-def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.quadrotor_vehicles import changes_of
     from brakeline.deploy.run.autopilot_run import AutopilotSettings, fly
 
     assert config.autopilot is not None
     flight = config.flights[spec.number]
-    stats = fly(
-        AutopilotSettings(
-            url=flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
-            rules=config.autopilot.rules,
-            arena=config.arena,
-            seed=config.seed,
-            airborne=True,
-            at_once=True,
-            setpoint_timeout=config.autopilot.setpoint_timeout,
-            noise=config.conditions.flight_noise,
-            wind=config.conditions.wind,
-            changes=changes_of(config.conditions),
-            truth=f"127.0.0.1:{flight.truth}",
-        )
+    settings = AutopilotSettings(
+        url=flight.url.replace("udpin:0.0.0.0", "udpout:127.0.0.1").replace("udpin", "udpout"),
+        rules=config.autopilot.rules,
+        arena=config.arena,
+        seed=config.seed,
+        airborne=True,
+        at_once=True,
+        setpoint_timeout=config.autopilot.setpoint_timeout,
+        noise=config.conditions.flight_noise,
+        wind=config.conditions.wind,
+        changes=changes_of(config.conditions),
+        truth=f"127.0.0.1:{flight.truth}",
     )
-    print(stats, file=sys.stderr)
-    return False
+    return endless(lambda: print(fly(settings), file=sys.stderr))
 
 
-def _feeder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> bool:
+def _feeder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.log_feed import FeederSettings, main
 
-    return main(FeederSettings(bus, config.from_logs, spec.robot, spec.name, config.actors == 0))
+    return partial(main, FeederSettings(bus, config.from_logs, spec.robot, spec.name, config.actors == 0))
 
 
-# Each function returns True when its work is done, False when a signal ended it. The work of a recorder, of a safety
-# service and of a certifier is never done.
-MAIN_FUNCTIONS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], bool]] = {
+def endless(run: Callable[[], object]) -> Work:
+    """Return work that is never done: that of a recorder, a safety service, a certifier or an autopilot."""
+
+    def work() -> bool:
+        run()
+        return False
+
+    return work
+
+
+# Each function imports what a process needs, and returns its work.
+PROCESSES: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], Work]] = {
     "recorder": _recorder,
     "safety": _safety,
     "certifier": _certifier,
@@ -159,7 +170,7 @@ MAIN_FUNCTIONS: dict[str, Callable[[ProcessSpec, Path, RunConfig, BusSettings], 
 
 def main() -> int:
     """Run the process that the command line names, until its work is done or its launcher ends. Returns the status."""
-    folder, name = Path(sys.argv[1]), sys.argv[2]
+    folder, name, held = Path(sys.argv[-2]), sys.argv[-1], HELD in sys.argv[1:-2]
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if not end_with_parent(launcher_pid(folder)):
         return UNFINISHED
@@ -169,7 +180,10 @@ def main() -> int:
         os.nice(spec.nice)
     try:
         bus = replace(client_settings(folder), metrics=metrics_address(folder, number))
-        done = MAIN_FUNCTIONS[spec.kind](spec, folder, config, bus)
+        work = PROCESSES[spec.kind](spec, folder, config, bus)
+        if held:
+            sys.stdin.read()
+        done = work()
     except BusError as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1

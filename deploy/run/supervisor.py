@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, PYTHON
-from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
+from brakeline.deploy.run.processes import HELD, UNFINISHED, ProcessSpec
 from brakeline.errors import LaunchError
 
 log = logging.getLogger("brakeline.launcher")
 
+RUN_PROCESS = (*PYTHON, "-m", "brakeline.deploy.run.run_process")
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s from a failure to the restart; doubles with each failure in a row
 HEALTHY_AFTER = 20.0  # s after its first sign of life at which a process counts as healthy
 START_ALLOWANCE = 60.0  # s from the start of a process that gives no sign of life: imports are slow on a busy machine
@@ -36,22 +37,31 @@ class SupervisedProcess:
     next_start: float = 0.0
     finished: bool = False  # it ended with status 0: its work is done
 
-    def start(self) -> None:
-        """Start the process. Its output goes to logs/NAME.log in the run's folder."""
+    def start(self, held: bool = False) -> None:
+        """Start the process. Its output goes to logs/NAME.log in the run's folder.
+
+        Args:
+            held: let it only import; it begins after `release`.
+        """
         logs = self.folder / "logs"
         logs.mkdir(exist_ok=True)
         # MuJoCo draws nothing; looking for a display would start another process.
         environment = os.environ | ONE_THREAD | {"MUJOCO_GL": "disable"}
         with (logs / f"{self.spec.name}.log").open("ab") as errors:
             self.popen = subprocess.Popen(
-                [*PYTHON, "-m", "brakeline.deploy.run.run_process", str(self.folder), self.spec.name],
-                stdin=subprocess.DEVNULL,
+                [*RUN_PROCESS, *([HELD] if held else []), str(self.folder), self.spec.name],
+                stdin=subprocess.PIPE if held else subprocess.DEVNULL,
                 stdout=errors,
                 stderr=errors,
                 env=environment,
                 start_new_session=True,  # ^C reaches only the launcher, which ends the processes in order
             )
         self.started, self.first_sign_of_life = time.monotonic(), None
+
+    def release(self) -> None:
+        """Let a process that was started as `held` begin."""
+        if self.popen is not None and self.popen.stdin is not None:
+            self.popen.stdin.close()
 
     @property
     def alive(self) -> bool:

@@ -2,9 +2,12 @@
 
 import io
 import itertools
+import json
 import os
+import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +28,7 @@ from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.topics import EPISODE, EXCHANGE, HEALTH, LOG, STEP, Topic
+from tests.waiting import PATIENCE, until
 
 
 @pytest.fixture
@@ -84,6 +88,26 @@ def test_processes_do_not_import_modules_of_the_working_directory(tmp_path, monk
     worker.join(60.0)
     assert worker.exitcode == 0
     assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
+
+
+def test_a_held_process_imports_and_does_not_connect_before_it_is_released(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(encode(EXPERIMENTS["debug"]))
+    with socket.create_server(("127.0.0.1", 0)) as bus:
+        endpoint = f"tcp/127.0.0.1:{bus.getsockname()[1]}"
+        (tmp_path / "endpoint").write_text(json.dumps({"endpoint": endpoint, "pid": os.getpid()}))
+        child = SupervisedProcess(ProcessSpec("recorder", "recorder"), tmp_path)
+        child.start(held=True)
+        assert child.popen is not None
+        call, read = Path(f"/proc/{child.popen.pid}/syscall"), ("0", "63")  # numbers of `read`: x86-64, ARM
+        until(lambda: call.read_text().startswith(tuple(f"{one} 0x0 " for one in read)), "it reads its input")
+        bus.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            bus.accept()
+        child.release()
+        bus.settimeout(PATIENCE)
+        bus.accept()[0].close()
+        child.terminate()
+        child.end(time.monotonic() + PATIENCE)
 
 
 def test_a_worker_does_not_change_how_a_users_own_scripts_start(tmp_path, monkeypatch) -> None:

@@ -22,7 +22,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 class Failing(SupervisedProcess):
     """Ends with 1 at once; by the clock, when the test says."""
 
-    def start(self) -> None:
+    def start(self, held: bool = False) -> None:
         self.popen = subprocess.Popen([sys.executable, "-c", "raise SystemExit(1)"])
         self.popen.wait()
         self.started, self.first_sign_of_life = supervisor.time.monotonic(), None
