@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task import RobotWithTask, arena_kind
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
-from brakeline.sim.arena_generator import arena_kind, draw_arena
+from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.navigation_env import DrawArena, NavigationEnv
 from brakeline.sim.sim_conditions import Conditions

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from brakeline.errors import UnknownTask
+from brakeline.errors import UnknownName, UnknownTask
 from brakeline.extras import missing_extra
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import (
@@ -293,6 +293,15 @@ def needs_task(robot: Robot) -> RobotWithTask:
             f"{robot.name} has no task: write its observation, rewards and arenas to {robot.kind}.task.toml"
         )
     return robot
+
+
+def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
+    """Return the kind of a robot's arena. Raises UnknownName: the robot has no arena of this name."""
+    kinds = robot.task.arenas
+    if name not in kinds:
+        names = ", ".join(sorted(kinds)) or "none"
+        raise UnknownName(f"no arena is called {name!r}; there are: {names} ({robot.kind})")
+    return kinds[name]
 
 
 def task_path(name: str) -> Path:

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from brakeline.errors import NoArena, UnknownName
+from brakeline.errors import NoArena
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask
+from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask, arena_kind
 from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
 from brakeline.sim.grid_planner import nearest_distances
 from brakeline.sim.traffic import Crowd
@@ -28,15 +28,6 @@ MOVER_GAP = 0.1  # m, least distance of a moving obstacle to static ones at the 
 # Of k obstacles in the plane
 Candidates = tuple[Array, Array, Array]  # positions (k, 2), sizes (k, 1 or 2), yaws (k,)
 Outlines = tuple[Array, Array, Array, Array]  # as of `Shapes`: center (k, 2), axes (k, 2, 2), half (k, 2), rho (k,)
-
-
-def arena_kind(robot: RobotWithTask, name: str) -> ArenaKind:
-    """Return the kind of a robot's arena. Raises UnknownName: the robot has no arena of this name."""
-    kinds = robot.task.arenas
-    if name not in kinds:
-        names = ", ".join(sorted(kinds)) or "none"
-        raise UnknownName(f"no arena is called {name!r}; there are: {names} ({robot.kind})")
-    return kinds[name]
 
 
 def draw_arena(name: str, rng: np.random.Generator, robot: RobotWithTask) -> Arena:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from brakeline.errors import NoFleet
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task import RobotWithTask, arena_kind
 from brakeline.sim.arena import Arena, same_room
-from brakeline.sim.arena_generator import arena_kind, draw_fleet
+from brakeline.sim.arena_generator import draw_fleet
 from brakeline.sim.floor_physics import place_base
 from brakeline.sim.ground_robot import GROUND, MODEL, SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, TurtleBot, changes_of, prefix
 from brakeline.sim.mujoco_obstacles import add_obstacles

@@ -110,7 +110,7 @@ class CampaignCommand:
         """Check the names of a cell, and make the model set that it needs."""
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.policy_loading import policy_named
-        from brakeline.sim.arena_generator import arena_kind
+        from brakeline.messaging.task import arena_kind
 
         arena_kind(robot, cell.arena)
         policy_named(cell.policy, robot, 0)

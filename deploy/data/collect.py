@@ -59,7 +59,7 @@ def record(
     Raises:
         RuntimeError: the robot touched something.
     """
-    from brakeline.sim.batch.batch_factory import check_vehicles  # brings the simulators
+    from brakeline.sim.batch.batch_support import check_vehicles
 
     keys = [(seed, k) for k in range(trajectories)] + [(seed, k, 1) for k in range(restless)]
     recipes = [_Recipe(k, np.random.default_rng(keys[k]), k >= trajectories) for k in range(first, len(keys))]

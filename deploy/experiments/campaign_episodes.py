@@ -29,7 +29,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 from brakeline.messaging.topics import EPISODE
 from brakeline.safety.methods import Model
-from brakeline.sim.batch.batch_env import check_batch
+from brakeline.sim.batch.batch_support import check_batch
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.scripted_policies import Policy, scripted
 

@@ -106,7 +106,7 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     """Return the backend of a robot's cells: batch, where the robot and all arenas allow it."""
     from brakeline.errors import NoBatch
     from brakeline.messaging.task import robot_with_task
-    from brakeline.sim.batch.batch_env import check_batch
+    from brakeline.sim.batch.batch_support import check_batch
     from brakeline.sim.sim_conditions import Conditions
 
     try:

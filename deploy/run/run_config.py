@@ -145,10 +145,9 @@ class RunConfig:
 def _check_arenas(robots: tuple[str, ...], arena: str) -> None:
     """Check that the robots and their arena exist. Raises ValueError.
 
-    The caller skips the default robot and arena, so that `train --help` does not import the simulator.
+    The caller skips the default robot and arena, so that the experiments of this module cost no time.
     """
-    from brakeline.messaging.task import robot_with_task
-    from brakeline.sim.arena_generator import arena_kind
+    from brakeline.messaging.task import arena_kind, robot_with_task
 
     kinds = [robot_with_task(robot) for robot in robots]
     for robot in kinds:
@@ -178,7 +177,7 @@ def _check_batch(config: RunConfig) -> None:
     if config.robots_per_actor > MOST_IN_BATCH:
         raise ValueError(f"--backend batch simulates at most {MOST_IN_BATCH} robots: lower --robots-per-actor")
     from brakeline.messaging.task import robot_with_task
-    from brakeline.sim.batch.batch_env import check_batch
+    from brakeline.sim.batch.batch_support import check_batch
 
     check_batch(robot_with_task(config.robots[0]), config.arena, config.conditions)
 

@@ -18,6 +18,7 @@ log = logging.getLogger("brakeline.bus")
 SHARED: dict[str, object] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
     "scouting/multicast/enabled": False,
+    "scouting/delay": 0,  # ms for which a router waits for others to be found, by default 500: nothing looks for them
     # With shared memory, queries were lost silently when a receiver stalled.
     "transport/shared_memory/enabled": False,
     # With the default of 1 ms, one query in 1000 was lost on two busy cores, and large messages on busy links.

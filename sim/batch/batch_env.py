@@ -14,21 +14,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from brakeline.errors import BadInput, NoBatch
+from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
+from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
-from brakeline.sim.arena_generator import arena_kind, draw_arena
-from brakeline.sim.batch.batch_factory import ADVICE, check_vehicles, vehicle_batch
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.batch.batch_factory import vehicle_batch
+from brakeline.sim.batch.batch_support import check_batch
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.observation_batch import GroundObservationBatch, ObservationBatch, QuadrotorObservationBatch
 from brakeline.sim.batch.vehicle_batch import PeriodBatch
 from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.navigation_env import OBSERVED_LIMIT
 from brakeline.sim.sim_conditions import Conditions
-
-# The code of the observations of batches, by the robots' dimension.
-OBSERVED = {2: "brakeline.sim.observations:GroundObservation", 3: "brakeline.sim.observations:QuadrotorObservation"}
 
 Infos = dict[str, Any]
 Flags = NDArray[np.bool_]
@@ -263,20 +261,3 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "speed": self._observations.speeds(period.true),
             "episode_seed": self._seeds[rows],
         }
-
-
-def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> None:
-    """Check that many robots can be simulated at once.
-
-    Raises:
-        NoBatch: this robot, arena or perception can only be simulated one by one.
-        UnknownName: the robot has no arena of this name.
-    """
-    kind = arena_kind(robot, arena)
-    check_vehicles(robot, conditions)
-    if robot.task.senses != OBSERVED[robot.position_dim]:
-        raise NoBatch(f"{robot.name} with the task {robot.task.name} is not observed in batches: {ADVICE}")
-    if kind.movers is not None or kind.ring is not None:
-        raise NoBatch(f"the arena {arena} has moving obstacles or other robots, which no batch simulates: {ADVICE}")
-    if conditions.perception.kind != "map":
-        raise NoBatch(f"a batch perceives by the map, not by scans (--perception map): {ADVICE}")

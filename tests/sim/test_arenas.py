@@ -15,9 +15,9 @@ from scipy.ndimage import label
 from brakeline.errors import UnknownName
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task import RobotWithTask, arena_kind
 from brakeline.sim.arena import Arena, room_boundary
-from brakeline.sim.arena_generator import arena_kind, draw_arena, goal_sequence
+from brakeline.sim.arena_generator import draw_arena, goal_sequence
 from brakeline.sim.grid_planner import Routes
 from brakeline.sim.kernels.arena_kernels import connected, first_fitting, nearest_distances
 from tests.arenas import staged_arena

@@ -22,7 +22,7 @@ from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kind
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import windows
-from brakeline.sim.batch import batch_factory
+from brakeline.sim.batch import batch_support
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels
 from tests.accepting import BOUND
 from tests.robots import GROUND, QUADROTOR
@@ -110,7 +110,7 @@ def test_many_robots_at_once_record_what_one_after_the_other_records(robot, cond
     def refuse(robot, conditions):
         raise NoBatch("one by one")
 
-    monkeypatch.setattr(batch_factory, "check_vehicles", refuse)
+    monkeypatch.setattr(batch_support, "check_vehicles", refuse)
     singles = list(collect.record(robot, 2, 5, conditions, restless=1))
     assert [len(t.inputs) for t in many] == [300, 300, 120]
     for one, other in zip([*many, *later], [*singles, *singles[1:]], strict=True):
