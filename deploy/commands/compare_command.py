@@ -69,6 +69,9 @@ class CompareCommand:
     penalty: float | None = None
     """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
     one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
+    task_settings: bool = True
+    """Behind our filter, CBF-QP and PSF, learn with the settings that the robot's task has for the learner, unless --td3
+    has others."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     """Store the tables and figures in this folder."""
@@ -133,9 +136,9 @@ class CompareCommand:
         if self.penalty is not None:
             changed["penalty"] = self.penalty
         jobs: list[Job] = []
-        task = robot_with_task(robot).task
+        settings = robot_with_task(robot).task.learner if self.task_settings else {}
         for cell in cells:
-            own = replace(cell, td3=learning(self.td3, cell.method, task))
+            own = replace(cell, td3=learning(self.td3, cell.method, settings))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
             jobs.append(Conservatism(robot))

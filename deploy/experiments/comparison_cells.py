@@ -13,7 +13,7 @@ runs/compare/<robot>/<cell>/               logs and policy of a cell (not in git
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
 
 if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Backend
-    from brakeline.messaging.task import Task
 
 RESULTS, RUNS = Path("results"), Path("runs/compare")
 LEARNING = "learning"
@@ -117,17 +116,17 @@ def backend_for(robot: str, arenas: Iterable[str]) -> Backend:
     return "batch"
 
 
-def learning(td3: TD3Config, method: str, task: Task) -> TD3Config:
+def learning(td3: TD3Config, method: str, settings: Mapping[str, Any]) -> TD3Config:
     """Return the learner's settings, with those of the method and of the robot's task in place of the defaults.
 
-    The task's are for TD3 behind a filter that was not tuned without them.
+    settings: `Task.learner`, for TD3 behind a filter that was not tuned without them.
 
     A batch keeps an update for each step. With an update for every fourth one, as `train --backend batch` makes, TD3
     without a filter stood still after 60,000 steps (seed 0); with one for each it reached 493 of 500 goals.
     """
     compared = METHODS[method]
     with_task = compared.filter not in TUNED_AT_1 and compared.learner == TD3_LEARNER
-    return td3.with_settings({**(task.learner if with_task else {}), **compared.td3})
+    return td3.with_settings({**(settings if with_task else {}), **compared.td3})
 
 
 def compared_on(robot: str, arenas: Iterable[str]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments import bootstrap, compared_methods
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
@@ -255,19 +256,24 @@ def test_steps_of_several_actors_are_rows_in_the_order_in_which_their_episodes_b
 def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_none():
     assert backend_for("ground", ("default", "dense")) == backend_for("quadrotor", ("default", "dense")) == "batch"
     assert backend_for("ground", ("default", "walkers")) == backend_for("ground+tracks", ("default",)) == "single"
-    task = robot_with_task("ground").task
+    task = robot_with_task("ground").task.learner
     given = replace(TD3Config(), updates_per_step=0.5)
     assert learning(given, "none", task) == given and learning(TD3Config(), "none", task).updates_per_step == 1.0
     assert given.cost_limit is None and learning(given, "lagrange", task).cost_limit is not None
 
 
 def test_methods_behind_a_filter_that_was_tuned_with_them_have_the_learner_of_the_task():
-    task = robot_with_task("quadrotor").task
-    assert task.learner["imitation"] > 0.0
+    task = robot_with_task("quadrotor").task.learner
+    assert task["imitation"] > 0.0
     for method in compared_methods.METHODS:
         used = learning(TD3Config(), method, task)
         assert (used.imitation > 0.0) == (method in ("ddpc", "cbf", "psf")), method
     assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
+    for wanted in (True, False):
+        (job,) = CompareCommand(
+            ("quadrotor",), (0,), methods=("ddpc",), conservatism=False, task_settings=wanted
+        )._jobs("quadrotor")
+        assert (job.td3.imitation > 0.0) == wanted
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():
