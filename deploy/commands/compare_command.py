@@ -70,7 +70,7 @@ class CompareCommand:
     """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
     one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     task_settings: bool = True
-    """Behind our filter, CBF-QP and PSF, learn with the settings that the robot's task has for the learner, unless --td3
+    """Behind our filter, CBF-QP and PSF, learn with the settings that the task has for the learner, unless --td3
     has others."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
