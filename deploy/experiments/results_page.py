@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
 from brakeline.deploy.experiments.tuning_trials import (
     SETTINGS,
@@ -161,13 +161,14 @@ def _setup(robot: RobotWithTask, found: RobotResults) -> str:
     )
     errors = ", ".join(f"{name}: {most:g}" for name, most in zip(robot.state, robot.measurement_bound, strict=True))
     arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in found.arenas)
+    rewards = {name: value for name, value in asdict(task.reward).items() if name != "correction_penalty"}
     rows = [
         ("inputs", low_high),
         ("period, horizon", f"{robot.period:g} s, {robot.horizon} periods"),
         ("measured state, largest error", errors),
         ("observation", f"{rays}, {len(task.observation)} others"),
         ("arenas", arenas),
-        ("reward", ", ".join(f"{name} {value:g}" for name, value in asdict(task.reward).items())),
+        ("reward", ", ".join(f"{name} {value:g}" for name, value in rewards.items())),
         ("simulator", f"MuJoCo, version {study.get('physics', 1)} of the robot's simulator"),
         (
             "training",
@@ -175,23 +176,23 @@ def _setup(robot: RobotWithTask, found: RobotResults) -> str:
             + (f"{study['robots']} robots at once" if batch else "one robot"),
         ),
         ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
-        *_further_settings(found),
+        *_correction_settings(found),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])
 
 
-def _further_settings(found: RobotResults) -> list[tuple[str, str]]:
-    """Return a row for the methods whose learner takes corrections into account beyond the penalty."""
+def _correction_settings(found: RobotResults) -> list[tuple[str, str]]:
+    """Return what a correction costs the learners of the methods with a filter, a row for each setting."""
     methods: dict[str, list[str]] = {}
     for name, cells in found.cells.items():
-        td3 = cells[0]["study"]["td3"]
-        values = [(setting, td3.get(setting, getattr(DEFAULTS, setting))) for setting in OF_CORRECTIONS]
-        if text := ", ".join(
-            f"{setting} {value:g}" for setting, value in values if value != getattr(DEFAULTS, setting)
-        ):
-            methods.setdefault(text, []).append(METHODS[name].label)
-    return [(f"learner of {', '.join(labels)}", f"also {text}") for text, labels in methods.items()]
+        if METHODS[name].filter != NONE:
+            study = cells[0]["study"]
+            values = {"penalty for corrections": study.get("penalty", 1.0)}
+            values |= {setting: study["td3"].get(setting, getattr(DEFAULTS, setting)) for setting in OF_CORRECTIONS}
+            changed = (f"{what} {value:g}" for what, value in values.items() if value != getattr(DEFAULTS, what, None))
+            methods.setdefault(", ".join(changed), []).append(METHODS[name].label)
+    return [(f"learner of {', '.join(labels)}", text) for text, labels in methods.items()]
 
 
 DEFAULTS = TD3Config()

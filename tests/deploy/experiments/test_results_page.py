@@ -97,7 +97,7 @@ def test_cells_of_two_learners_are_not_mixed_and_the_page_names_their_settings(r
     for path in (results / "ground").glob("ddpc-s*.json"):
         change(path, lambda cell: cell["study"]["td3"].update(grown))
     text = page(results, ["ground"])
-    assert "| learner of ours | also penalty_growth 4, imitation 1 |" in text
+    assert "| learner of ours | penalty for corrections 1, penalty_growth 4, imitation 1 |" in text
     for name in grown:  # as in a version that did not have these settings yet
         change(results / "ground" / "none-s0.json", lambda cell, name=name: cell["study"]["td3"].pop(name))
     assert page(results, ["ground"]) == text
