@@ -49,13 +49,13 @@ class TD3Config:
     multiplier_rate: float = 10.0
     """With a cost limit, raise the penalty by this reward for each episode that collides."""
     stored: Stored = "both"
-    """Of a corrected step, learn from the executed action, or from both the proposed and the executed one."""
+    """Learn from the executed action of a corrected step, or from both the proposed and the executed action."""
     imitation: float = 0.0
-    """Add this weight times the squared distance of the actor's proposals from what the filter executed in their place
-    to the actor's loss."""
+    """For corrected steps, add this weight times the squared distance between the actor's proposal and the executed
+    action to the actor's loss."""
     penalty_growth: float = 1.0
-    """Multiply penalties for corrections by a factor that grows linearly from 1 to this, from a sixth to a half of the
-    training."""
+    """Multiply penalties for corrections by a factor that grows linearly from 1 to this value, between one sixth and
+    one half of the training."""
     symmetric: bool = True
     """Learn also from the mirror images of a step, if the task is symmetric."""
     warmup: int = 2000
@@ -111,13 +111,14 @@ class TD3Config:
 
 @dataclass(frozen=True)
 class LearnerConfig:
-    """Settings of a learner."""
+    """Configure the learner and its algorithm (TD3)."""
 
     td3: TD3Config = field(default_factory=TD3Config)
     seed: int = 0
-    """Draw weights and batches from this seed."""
+    """Draw weights and batches from this seed. `train` and `learner` ignore this option: give --seed instead."""
     steps: int = 100_000
-    """Learn from this many steps. In lockstep the last episode is completed."""
+    """Learn from this many steps, and in lockstep to the end of the last episode. `train` and `learner` ignore this
+    option: give --steps instead."""
     capacity: int = 200_000
     """Keep this many of the newest steps in the replay buffer."""
     window: int = 16
@@ -129,7 +130,8 @@ class LearnerConfig:
     checkpoint_every: int = 10_000
     """Write a checkpoint after this many steps."""
     lockstep: bool = False
-    """Learn with one actor, and with window 1, ahead 0 and publish_every 1, so that the run can be repeated exactly."""
+    """Learn with one actor, and with window 1, ahead 0 and publish-every 1, so that you can repeat the run exactly.
+    `train` ignores this option: give --deterministic instead."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.capacity, self.window, self.publish_every, self.checkpoint_every) < 1 or self.ahead < 0:

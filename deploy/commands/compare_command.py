@@ -59,19 +59,19 @@ class CompareCommand:
     """
     engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     tune: bool = False
-    """Try four values of one setting of each rival instead, and write what came of them for the results page."""
+    """Do not compare: try four values of one setting of each rival, and store the results for the results page."""
     table: bool = False
-    """Run nothing: write tables, figures and the results page (README.md) from the stored cells."""
+    """Run nothing: write tables, figures and the results page (README.md) from the stored results."""
     again: bool = False
     """Run again what has results already."""
     conservatism: bool = True
-    """Make also the table of error bounds and modes, with the stored policy."""
+    """Also make the table of error bounds and modes, with the stored policy."""
     penalty: float | None = None
     """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
     one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     task_settings: bool = True
-    """Behind our filter, CBF-QP and PSF, learn with the settings that the task has for the learner, unless --td3
-    has others."""
+    """Train TD3 behind our filter, CBF-QP and PSF with the learner settings of the robot's task, such as the
+    quadrotor's penalty growth and imitation. A --td3 option with another value than its default replaces the task's."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     """Store the tables and figures in this folder."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-from brakeline.deploy.commands.common_options import BusOptions, Robot, Seed, Unprefixed, task_learner
+from brakeline.deploy.commands.common_options import BusOptions, Robot, Unprefixed, task_learner
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.messaging.task import address
@@ -26,7 +26,8 @@ class LearnerCommand:
     """Resume from the checkpoint in the folder if there is one. Use it if a supervisor restarts the process."""
     name: str = "learner"
     """Give the learner this name on the bus."""
-    seed: Seed = 0
+    seed: int = 0
+    """Draw weights and batches from this seed."""
     steps: int = 100_000
     """Train for this many steps."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
