@@ -70,8 +70,8 @@ class CompareCommand:
     """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
     one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     task_settings: bool = True
-    """Train TD3 behind our filter, CBF-QP and PSF with the learner settings of the robot's task, such as the
-    quadrotor's penalty growth and imitation. A --td3 option with another value than its default replaces the task's."""
+    """Train TD3 behind each filter but SAILR with the learner settings of the robot's task, such as the quadrotor's
+    penalty growth and imitation. A --td3 option with another value than its default replaces the task's."""
     td3: TD3Config = field(default_factory=TD3Config)
     results: Path = RESULTS
     """Store the tables and figures in this folder."""

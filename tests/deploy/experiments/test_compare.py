@@ -262,12 +262,12 @@ def test_a_method_has_settings_of_its_own_unless_one_is_given_and_a_batch_has_no
     assert given.cost_limit is None and learning(given, "lagrange", task).cost_limit is not None
 
 
-def test_methods_behind_a_filter_that_was_tuned_with_them_have_the_learner_of_the_task():
+def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
     task = robot_with_task("quadrotor").task.learner
     assert task["imitation"] > 0.0
     for method in compared_methods.METHODS:
         used = learning(TD3Config(), method, task)
-        assert (used.imitation > 0.0) == (method in ("ddpc", "cbf", "psf")), method
+        assert (used.imitation > 0.0) == (method in ("ddpc", "secas", "cbf", "psf")), method
     assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
     for wanted in (True, False):
         (job,) = CompareCommand(
