@@ -6,8 +6,9 @@ import logging
 from collections.abc import Iterable, Mapping
 
 from brakeline.errors import UnknownRobot
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot import Robot, refuse_shipped_name, shipped_robots
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import robot_with_task
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadWeights
 from brakeline.messaging.perceptrons import Layer, check_layers
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, Array, shipped_robots
+from brakeline.messaging.robot import Array, shipped_robots
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 

@@ -19,16 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadInput, UnknownRobot
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, ROBOTS_FOLDER, TASK_SEPARATOR
 
 Array = NDArray[np.float64]
 
 INPUT_ROUNDING = 1e-9  # rounding that the bounds of an input allow
-REAL_TIME_SUFFIX = "-late"  # suffix of a robot's name in real time
-TASK_SEPARATOR = "+"  # between a robot's name and the name of an additional task (`brakeline.messaging.task`)
 RAMP, HOLD, FEEDBACK = "ramp", "hold", "feedback"
 INPUT_TOLERANCE = 1e-6  # share of an input's range: closer inputs are equal (logs hold single precision)
 DEFAULT_ACCEPT_BOUND = 0.01
-ROBOTS_FOLDER = Path(__file__).parents[1] / "robots"
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from brakeline.errors import BadDescription, BadText, UnknownRobot
-from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP, REAL_TIME_SUFFIX, Disc, Limit, Robot
+from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP, Disc, Limit, Robot
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.structured_text import parse_toml
 
 NAME = re.compile(r"[A-Za-z0-9_.]+(-[A-Za-z0-9_.]+)*")

@@ -25,17 +25,16 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from brakeline.errors import UnknownName, UnknownTask
 from brakeline.extras import missing_extra
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
-from brakeline.messaging.robot import (
-    FORMER_LAYOUTS,
+from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, robot_named
+from brakeline.messaging.robot_files import (
     REAL_TIME_SUFFIX,
     ROBOTS_FOLDER,
     TASK_SEPARATOR,
-    Robot,
-    robot_named,
+    TASK_SUFFIX,
+    task_file,
+    task_values,
 )
-from brakeline.messaging.structured_text import parse_toml
 
-TASK_SUFFIX = ".task.toml"
 _STRICT = ConfigDict(extra="forbid")
 
 
@@ -279,7 +278,7 @@ def robot_with_task(name: str) -> RobotWithTask:
 
 def robot_maybe_with_task(name: str) -> Robot:
     """Read a robot like `robot_with_task`; a robot from a path may have no task."""
-    if name.endswith(".toml") and not _task_file(name).is_file():
+    if name.endswith(".toml") and not task_file(name).is_file():
         return robot_named(name)
     return robot_with_task(name)
 
@@ -310,7 +309,7 @@ def task_path(name: str) -> Path:
     Raises:
         UnknownRobot, UnknownTask: there is no such robot, or no such file.
     """
-    path = _task_file(name)
+    path = task_file(name)
     if path.is_file():
         return path
     kind = robot_named(name).kind
@@ -319,11 +318,6 @@ def task_path(name: str) -> Path:
         names = sorted(other.name.removesuffix(TASK_SUFFIX) for other in others)
         raise UnknownTask(f"there is no task {name}; additional tasks of {kind}: {', '.join(names)}")
     raise UnknownTask(f"{kind} has no task: write its observation, rewards and arenas to {path}")
-
-
-def _task_file(name: str) -> Path:
-    base = name.removesuffix(REAL_TIME_SUFFIX)
-    return Path(base).with_suffix(TASK_SUFFIX) if base.endswith(".toml") else ROBOTS_FOLDER / f"{base}{TASK_SUFFIX}"
 
 
 def address(name: str) -> str:
@@ -347,7 +341,7 @@ def address_in_real_time(name: str) -> str:
 def read_task(path: Path) -> Task:
     """Read the task in a file. Raises UnknownTask: the file has mistakes; the message lists all of them."""
     try:
-        values = _with_base(path)
+        values = task_values(path)
         arenas = values.get("arenas", {})
         values["arenas"] = {name: _arena(arenas, name) for name in arenas}
         place = {"folder": path.parent, "name": path.name.removesuffix(TASK_SUFFIX)}
@@ -355,15 +349,8 @@ def read_task(path: Path) -> Task:
     except ValidationError as error:
         lines = "".join(f"\n  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise UnknownTask(f"{path} is no task:{lines}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UnknownTask(f"{path} is no task: {error}") from error
-
-
-def _with_base(path: Path) -> dict[str, Any]:
-    """Return the values in a task's file, with those of the task that it is `like` as defaults."""
-    values = parse_toml(path.read_text())
-    base = values.pop("like", None)
-    return ({} if base is None else _with_base(path.with_name(f"{base}{TASK_SUFFIX}"))) | values
 
 
 def _arena(arenas: dict[str, Any], name: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 import tyro
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.errors import BrakelineError
+from brakeline.messaging.robot_files import task_file, task_values
 from brakeline.safety.model.model_config import ModelConfig
 from brakeline.sim.sim_conditions import (
     Conditions,
@@ -257,14 +257,14 @@ def task_learner(learner: LearnerConfig, arguments: list[str], batch: bool = Fal
     Raises:
         ValueError: TD3 has no such setting.
     """
-    from brakeline.messaging.task import Task, robot_with_task
-
-    tasks: list[Task] = []
-    for word in arguments:
-        with suppress(BrakelineError):  # another argument, or a file with mistakes, about which the run complains
-            tasks.append(robot_with_task(word).task)
-    tasks = tasks or [robot_with_task("ground").task]
-    first, *others = [task.learner | (task.batch if batch else {}) for task in tasks]
+    parts = ("learner", "batch") if batch else ("learner",)
+    tables: list[dict[str, Any]] = []
+    for word in [*arguments, "ground"]:  # which is the default
+        # Another argument, or a file with mistakes, about which the run complains:
+        with suppress(OSError, ValueError, TypeError, RecursionError):
+            values = task_values(task_file(word))
+            tables.append({name: value for part in parts for name, value in dict(values.get(part, {})).items()})
+    first, *others = tables[:-1] or tables
     shared = {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
     try:
         return replace(learner, td3=learner.td3.with_settings(shared))

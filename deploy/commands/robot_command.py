@@ -17,8 +17,9 @@ from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.errors import BadDescription, NoSource
 from brakeline.logs.stacking_table import plain_table
-from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
+from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_description import NAME, robot_from_description
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
 
 

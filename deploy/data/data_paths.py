@@ -15,7 +15,8 @@ from pathlib import Path
 
 from brakeline.errors import BadModel
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import TASK_SEPARATOR, Robot
+from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot_files import TASK_SEPARATOR
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.model.model_config import AUTO, DDPC, DIRECT, ONE_STEP, ModelConfig
 

@@ -21,7 +21,7 @@ from brakeline.deploy.experiments.task_engine import LONGEST_LINE, Say, StudyTas
 from brakeline.deploy.interpreter import ONE_THREAD
 from brakeline.errors import NoCluster
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, TASK_SEPARATOR
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, TASK_SEPARATOR
 from brakeline.messaging.task import robot_with_task
 
 LOCAL = "local"

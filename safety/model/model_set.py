@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import FORMER_LAYOUTS, REAL_TIME_SUFFIX, Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout

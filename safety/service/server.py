@@ -17,7 +17,8 @@ from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.bus.identity import certified_name, speaks_for
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import headline
-from brakeline.messaging.robot import REAL_TIME_SUFFIX, Robot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot import Robot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.messaging.robot import ROBOTS_FOLDER
 from brakeline.messaging.robot_description import read_robot
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelSet
 

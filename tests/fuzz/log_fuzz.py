@@ -39,7 +39,7 @@ from brakeline.errors import BrakelineError
 from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 from brakeline.logs.log_recovery import recover
 from brakeline.logs.reader import open_log
-from brakeline.messaging.robot import ROBOTS_FOLDER
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from tests.deploy.data.porter import porter
 from tests.fuzz.log_seeds import SEEDS, seed
 from tests.robots import GROUND

@@ -10,7 +10,8 @@ from brakeline.deploy.data.data_paths import method_path
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadRequest, BadWeights, UnknownRobot
 from brakeline.messaging.policy_weights import MLP, decode
-from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.methods import Method

@@ -17,7 +17,8 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadWeights, UnknownRobot, UnknownTask
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.policy_weights import MLP, decode
-from brakeline.messaging.robot import ROBOTS_FOLDER, robot_named
+from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
 from brakeline.sim.arena import same_room
 from brakeline.sim.lidar import Lidar

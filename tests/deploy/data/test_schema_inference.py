@@ -13,8 +13,8 @@ from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.schema_inference import InferredColumn, brake_periods, infer_schema
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import NoSource
-from brakeline.messaging.robot import ROBOTS_FOLDER as ROBOTS
 from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot_files import ROBOTS_FOLDER as ROBOTS
 from tests.deploy.data.bags import write_bag
 from tests.deploy.data.porter import COLUMNS, drive, write_csv
 

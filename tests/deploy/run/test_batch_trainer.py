@@ -16,11 +16,11 @@ from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import BATCH, RunConfig, in_batches
-from brakeline.errors import BadRequest, NoBatch
+from brakeline.errors import BadRequest, NoBatch, UnknownTask
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.robot import ROBOTS_FOLDER
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
@@ -231,6 +231,11 @@ def test_a_task_has_settings_for_its_learner_which_options_change(tmp_path: Path
         (tmp_path / "ground.task.toml").write_text(f"{shipped}[learner]\n{wrong}\n")
         with pytest.raises(ValueError, match=said):
             imitation(str(tmp_path / "ground.toml"))
+    for wrong in ("learner = 3", 'like = "ground"', "[learner"):  # the run itself complains
+        (tmp_path / "ground.task.toml").write_text(wrong)
+        assert imitation(str(tmp_path / "ground.toml"), "x" * 5000, "\0") == 0.0
+        with pytest.raises(UnknownTask, match="is no task"):
+            robot_with_task(str(tmp_path / "ground.toml"))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.errors import BadModel, BadWeights
 from brakeline.messaging.perceptrons import Perceptrons
-from brakeline.messaging.robot import ROBOTS_FOLDER
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.safety.methods import decode, load, ready
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.rivals.pretrained import Pretrained
