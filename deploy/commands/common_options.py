@@ -247,9 +247,9 @@ def settings_from(kind: type[T], options: object, **values: Any) -> T:
 
 
 def task_learner(learner: LearnerConfig, arguments: list[str], batch: bool = False) -> LearnerConfig:
-    """Return the learner's settings, with those of the tasks of the robots that `arguments` name.
+    """Return the learner's settings, with those of the tasks of the robots that `arguments` name in place of defaults.
 
-    Several robots share the settings that all their tasks have.
+    For several robots, only settings that all their tasks have count.
 
     Args:
         batch: the learner trains with the backend batch, for which a task may have settings of its own.
@@ -257,13 +257,12 @@ def task_learner(learner: LearnerConfig, arguments: list[str], batch: bool = Fal
     Raises:
         ValueError: TD3 has no such setting.
     """
-    parts = ("learner", "batch") if batch else ("learner",)
     tables: list[dict[str, Any]] = []
     for word in [*arguments, "ground"]:  # which is the default
         # Another argument, or a file with mistakes, about which the run complains:
         with suppress(OSError, ValueError, TypeError, RecursionError):
             values = task_values(task_file(word))
-            tables.append({name: value for part in parts for name, value in dict(values.get(part, {})).items()})
+            tables.append(values.get("learner", {}) | (values.get("batch", {}) if batch else {}))
     first, *others = tables[:-1] or tables
     shared = {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
     try:

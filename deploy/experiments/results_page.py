@@ -64,7 +64,7 @@ def stored_cells(results: Path, robot: str) -> list[Result]:
 
 
 def _settings(cell: Result) -> str:
-    """Return the settings of a cell's filter and learner, with the defaults that its version did not have yet."""
+    """Return the settings of a cell's filter and learner, without defaults of the learner: older cells lack some."""
     study = cell["study"]
     td3 = {name: value for name, value in study["td3"].items() if value != getattr(DEFAULTS, name, None)}
     return json.dumps([(cell["model"] or {}).get("settings"), study.get("penalty", 1.0), td3], sort_keys=True)
@@ -188,10 +188,12 @@ def _correction_settings(found: RobotResults) -> list[tuple[str, str]]:
     for name, cells in found.cells.items():
         if METHODS[name].filter != NONE:
             study = cells[0]["study"]
-            values = {"penalty for corrections": study.get("penalty", 1.0)}
-            values |= {setting: study["td3"].get(setting, getattr(DEFAULTS, setting)) for setting in OF_CORRECTIONS}
-            changed = (f"{what} {value:g}" for what, value in values.items() if value != getattr(DEFAULTS, what, None))
-            methods.setdefault(", ".join(changed), []).append(METHODS[name].label)
+            text = f"penalty for corrections {study.get('penalty', 1.0):g}"
+            for setting in OF_CORRECTIONS:
+                default = getattr(DEFAULTS, setting)
+                if (value := study["td3"].get(setting, default)) != default:
+                    text += f", {setting} {value:g}"
+            methods.setdefault(text, []).append(METHODS[name].label)
     return [(f"learner of {', '.join(labels)}", text) for text, labels in methods.items()]
 
 
