@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
-from brakeline.deploy.data.description_plot import draw_description, summary
+from brakeline.deploy.data.description_summary import summary
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.isolated_reader import ReadLimits
 from brakeline.errors import BadDescription, NoSource
@@ -45,8 +45,6 @@ class RobotCommand:
     """With --from, take these topics or message types, where several hold the same quantity."""
     read_seconds: ReadSeconds = 0.0
     read_gib: ReadGib = 4.0
-    picture: Path | None = None
-    """With show, draw the body and the stop into this image."""
     json: Json = False
 
     def run(self) -> int:
@@ -96,9 +94,6 @@ class RobotCommand:
     def _show(self) -> int:
         robot = robot_named(self.file)
         values = summary(robot)
-        if self.picture is not None:
-            draw_description(robot, self.picture)
-            values["picture"] = str(self.picture)
         rows = [
             (escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
             for label, one in values["inputs"].items()

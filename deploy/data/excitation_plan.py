@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.description_plot import nominal_stopping_distance
+from brakeline.deploy.data.description_summary import nominal_stopping_distance
 from brakeline.deploy.data.excitation import excitation
 from brakeline.deploy.data.sources.quantity_names import column_names, quantities
 from brakeline.errors import BadData

@@ -17,13 +17,7 @@ import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
-from brakeline.deploy.experiments.tuning_trials import (
-    SETTINGS,
-    ThresholdTrial,
-    best_learner,
-    best_threshold,
-    value_in_use,
-)
+from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
 from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
@@ -37,7 +31,6 @@ from brakeline.safety.model.model_config import DDPC
 Result = dict[str, Any]
 SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend")  # in all cells of a robot
 CELL = re.compile(r"-s\d+\.json$")
-FIELDS = tuple(ThresholdTrial.__dataclass_fields__)
 
 
 def stored_cells(results: Path, robot: str) -> list[Result]:
@@ -308,9 +301,8 @@ def _tuning(results: Path, robot: RobotWithTask, found: RobotResults) -> list[st
 
 
 def _best(method: str, rows: Sequence[Result]) -> float:
-    if method in SETTINGS:
-        return float(best_learner(rows)["value"])
-    return best_threshold([ThresholdTrial(**{name: row[name] for name in FIELDS}) for row in rows]).value
+    best = best_learner if method in SETTINGS else best_threshold
+    return float(best(rows)["value"])
 
 
 def _tried(row: Result) -> str:
