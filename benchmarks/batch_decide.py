@@ -44,11 +44,11 @@ def run() -> Figures:
     return figures
 
 
-def asked(name: str, mode: str, policy: str, rows: int = ROWS, seed: int = 5) -> tuple[Filter, list[Request]]:
+def asked(name: str, mode: str, policy: str) -> tuple[Filter, list[Request]]:
     """Return a filter, and the requests of a policy that drives behind it."""
     robot = robot_with_task(name)
     ready = Filter(situations.model(mode=mode, robot=robot))
-    driven = islice(situations.driven(policy, seed, robot, mode=mode), rows)
+    driven = islice(situations.driven(policy, situations.SEED, robot, mode=mode), ROWS)
     return ready, list(situations.requests(ready, [outcome.request for _, outcome, _ in driven]))
 
 

@@ -38,9 +38,7 @@ def run(device: str) -> Figures:
     return figures
 
 
-def measured(
-    title: str, ready: Filter, requests: RequestArrays, device: str, sizes: tuple[int, ...] = SIZES
-) -> Figures:
+def measured(title: str, ready: Filter, requests: RequestArrays, device: str) -> Figures:
     """Return a row for each size of a batch that repeats the requests."""
     figures: Figures = {}
     few = [requests.row(row) for row in range(min(LOOP, len(requests)))]
@@ -49,7 +47,7 @@ def measured(
         "other kind": int((ours.kind != theirs.kind.cpu().numpy()).sum()),
         "apart": float(np.abs(ours.plan - theirs.plan.cpu().numpy()).max()),
     }
-    for size in sizes:
+    for size in SIZES:
         arrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
         answers = ready.decide_batch(arrays)
         times = []

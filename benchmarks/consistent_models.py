@@ -78,9 +78,9 @@ class Models(Protocol):
 class LeastSquaresZonotope:
     """The matrix zonotope of zonotopic recursive least squares: C + Σ_tj β_tj g_j sizes_tj h_tᵀ, |β| <= 1.
 
-    The recursion adds a generator for each sample and output. Its result has a closed form: C is weighted least
-    squares, and h_t = λ^((T − t)/2) P φ_t, with P the inverse of Σ_t λ^(T − t) φ_t φ_tᵀ. For λ = 1 this is the matrix
-    zonotope of Lemma 1 for the same features.
+    The recursion adds a generator for each sample and output. For λ = 1, which forgets nothing, its result has a closed
+    form: C is least squares, and h_t = P φ_t, with P the inverse of Σ_t φ_t φ_tᵀ. This is the matrix zonotope of
+    Lemma 1 for the same features.
 
     Attributes:
         H (T, F): rows h_t. sizes (T, n): noise of each sample.
@@ -92,12 +92,9 @@ class LeastSquaresZonotope:
     box: Array
 
     @staticmethod
-    def fit(phi: Array, y: Array, sizes: Array, forgetting: float = 1.0) -> LeastSquaresZonotope:
-        weights = forgetting ** np.arange(len(phi) - 1, -1, -1.0)
-        weighted = phi * weights[:, None]
-        moment = weighted.T @ phi
-        C = np.asarray(np.linalg.solve(moment, weighted.T @ y).T, dtype=float)
-        H = np.sqrt(weights)[:, None] * np.linalg.solve(moment, phi.T).T
+    def fit(phi: Array, y: Array, sizes: Array) -> LeastSquaresZonotope:
+        moment = phi.T @ phi
+        C, H = (np.asarray(np.linalg.solve(moment, right).T, float) for right in (phi.T @ y, phi.T))
         return LeastSquaresZonotope(C, H, sizes, sizes.T @ np.abs(H))
 
     def spread(self, phi: Array) -> tuple[Array, Array]:

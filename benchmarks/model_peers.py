@@ -16,7 +16,6 @@ of `TUNINGS` with the fewest collisions, then the most goals, then the nearest a
 from __future__ import annotations
 
 import importlib
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -99,11 +98,8 @@ def own_log() -> ModuleType:
 
 def driven(minutes: float, seed: int, runs: int = 1) -> Dataset:
     """Return a drive of the differential drive, as `brakeline import` reads it."""
-    words = [sys.executable, str(OWN_LOG / "drive.py"), "diff", "--minutes", str(minutes), "--seed", str(seed)]
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "drive.csv"
-        with log.open("w") as file:
-            subprocess.run([*words, "--runs", str(runs)], stdout=file, check=True)
+        log = own_log().record("diff", minutes, seed, Path(folder) / "drive.csv", runs)
         return import_sources([log], robot_named(str(OWN_LOG / "diff.toml"))).data
 
 

@@ -36,19 +36,19 @@ PARAMETERS = {
 
 
 @contextmanager
-def captured(url: str, system: int, seed: int = 0) -> Iterator[None]:
+def captured(url: str, system: int) -> Iterator[None]:
     """Send measurements until the end of the block. url: an address that nobody else uses."""
     link = open_link(url)
     try:
-        with repeated(_Cameras(link, system, seed).look, LOOKS):
+        with repeated(_Cameras(link, system).look, LOOKS):
             yield
     finally:
         link.close()
 
 
 class _Cameras:
-    def __init__(self, link: Link, system: int, seed: int) -> None:
-        self._link, self._system, self._rng = link, system, np.random.default_rng(seed)
+    def __init__(self, link: Link, system: int) -> None:
+        self._link, self._system, self._rng = link, system, np.random.default_rng(0)
         self._mav = mavlink.MAVLink(
             self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
         )

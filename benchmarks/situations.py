@@ -22,7 +22,7 @@ from brakeline.safety.service.wire import request_of
 from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.sim_conditions import Conditions
 
-STEPS = 1500
+STEPS, SEED = 1500, 5
 
 
 def model(certificate: str = "residual", mode: str = DIRECT, robot: RobotWithTask | None = None) -> ModelSet:
@@ -60,13 +60,12 @@ def driven_behind(
 
 def messages(
     policy: str = "random",
-    seed: int = 5,
     robot: RobotWithTask | None = None,
     conditions: Conditions | None = None,
     mode: str = DIRECT,
 ) -> list[pb.Request]:
     """Return the requests of some episodes of a policy behind the default filter, or one of another mode."""
-    steps = driven(policy, seed, robot or robot_with_task("ground"), conditions, mode)
+    steps = driven(policy, SEED, robot or robot_with_task("ground"), conditions, mode)
     return [outcome.request for _, outcome, _ in islice(steps, STEPS)]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -18,7 +18,6 @@ AGAIN = 10.0  # s between two lines
 PERCENT = 100  # items of one piece of work, of which only the share that is done is known
 UNDER_WAY: list[threading.Event] = []  # nested work that prints lines; only the innermost prints
 PRINTING = threading.Lock()  # outer work must not print after inner work has begun
-T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -29,22 +28,17 @@ class Advance(Protocol):
     def __call__(self, by: int = 1, what: str | None = None) -> None: ...
 
 
-class WorkProgress:
-    """Advance by the share of a piece of work that is done, in `PERCENT` items, so that a bar shows the time left."""
+def by_share(advance: Advance) -> Callable[[float], None]:
+    """Return a function that advances to a share of one piece of work, in `PERCENT` items. It never goes back."""
+    done = 0
 
-    def __init__(self, advance: Advance) -> None:
-        self._advance, self._done = advance, 0
+    def progress(share: float) -> None:
+        nonlocal done
+        now = max(int(PERCENT * share), done)
+        advance(now - done)
+        done = now
 
-    def begin(self, what: str) -> None:
-        """Begin a piece of work."""
-        self._done = 0
-        self._advance(0, what)
-
-    def __call__(self, share: float) -> None:
-        """Advance to a share of the piece; it never goes back."""
-        done = max(int(PERCENT * share), self._done)
-        self._advance(done - self._done)
-        self._done = done
+    return progress
 
 
 def say(name: str, text: str) -> None:
@@ -79,15 +73,6 @@ def under_way(what: str, total: int | None = None) -> Iterator[Advance]:
     """Show `what` until the block ends. total: number of items; None if it is unknown."""
     with _bar(what, total) if console.is_terminal else _lines(what, total) as advance:
         yield advance
-
-
-def each(items: Iterable[T], what: str, total: int, done: int = 0) -> Iterator[T]:
-    """Yield the items and show the progress. `done` of the `total` were done before."""
-    with under_way(what, total) as advance:
-        advance(done)
-        for item in items:
-            advance()
-            yield item
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from brakeline.deploy.commands.command_output import errors, print_json
+from brakeline.deploy.commands.command_output import errors, print_counts
 from brakeline.deploy.commands.common_options import Json, Seed, settings_from
 from brakeline.deploy.run import autopilot_run, px4_simulation
 from brakeline.sim.arena import Arena
@@ -69,10 +69,7 @@ class AutopilotCommand:
             result = autopilot_run.fly(settings, self._print_start)
         else:
             result = self._fly_px4(self.px4, wind)
-        if self.json:
-            print_json(asdict(result))
-        else:
-            errors.print(str(result))
+        print_counts(asdict(result), self.json)
         return 0
 
     def _fly_px4(self, folder: Path, wind: Wind) -> px4_simulation.FlightResult:

@@ -12,7 +12,7 @@ from rich.markup import escape
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, console, errors, print_json
 from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
-from brakeline.deploy.progress import PERCENT, WorkProgress, under_way
+from brakeline.deploy.progress import PERCENT, by_share, under_way
 from brakeline.errors import Unsupported
 from brakeline.logs.stacking_table import StackingTable
 from brakeline.messaging.stated_share import percent
@@ -79,9 +79,9 @@ class CertifyCommand:
         notes: list[str] = []
         forms = self._forms(data.robot)
         with under_way("certifying", PERCENT * len(forms)) as advance:
-            progress = WorkProgress(advance)
             for kind, mode in forms:
-                progress.begin(f"certifying {kind}, {mode}")
+                advance(0, f"certifying {kind}, {mode}")
+                progress = by_share(advance)
                 try:
                     config = replace(settings, certificate=kind, mode=mode)
                     config = config.of_minutes() if self.few else config

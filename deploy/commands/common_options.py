@@ -28,6 +28,7 @@ from brakeline.sim.sim_conditions import (
 )
 
 if TYPE_CHECKING:
+    from brakeline.deploy.data.log_options import LogOptions
     from brakeline.deploy.run.run_config import RunConfig
     from brakeline.learner.learner_config import LearnerConfig
     from brakeline.messaging.bus import BusSettings
@@ -49,13 +50,6 @@ Robot = Annotated[
 Logs = Annotated[
     tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Read these log files (.mcap) or run folders.")
 ]
-ReadSeconds = Annotated[
-    float,
-    tyro.conf.arg(
-        help="Stop reading a foreign log after this computing time [s]. 0 means 3 s, and 1 s more for each 200 kB."
-    ),
-]
-ReadGib = Annotated[float, tyro.conf.arg(help="Stop reading a foreign log that needs more than this memory [GiB].")]
 Seed = Annotated[int, tyro.conf.arg(help="Draw everything random from this seed. The same seed gives the same result.")]
 ArenaName = Annotated[
     str,
@@ -87,6 +81,27 @@ Verbose = Annotated[Flag, tyro.conf.arg(aliases=("-v",), help="Print all figures
 Quiet = Annotated[Flag, tyro.conf.arg(aliases=("-q",), help="Show no progress.")]
 Watch = Annotated[Flag, tyro.conf.arg(help="Open a live page in a browser.")]
 Json = Annotated[Flag, tyro.conf.arg(help="Print one JSON object on stdout.")]
+
+
+@dataclass(frozen=True)
+class LogReadOptions:
+    """Set how to read logs of other programs."""
+
+    unit: tuple[str, ...] = ()
+    """Read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
+    topics: tuple[str, ...] = ()
+    """Take these topics or message types, where several hold the same quantity."""
+    read_seconds: float = 0.0
+    """Stop reading a foreign log after this computing time [s]. 0 means 3 s, and 1 s more for each 200 kB."""
+    read_gib: float = 4.0
+    """Stop reading a foreign log that needs more than this memory [GiB]."""
+
+    def options(self, places: tuple[str, ...]) -> LogOptions:
+        """Return the options of a log, with the words of `--map`. Raises NoSource if a word is malformed."""
+        from brakeline.deploy.data.log_options import LogOptions
+        from brakeline.deploy.data.sources.isolated_reader import ReadLimits
+
+        return LogOptions.parse(places, self.unit, self.topics, ReadLimits(self.read_seconds, self.read_gib))
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,8 @@ class ExciteCommand:
             return self._drive(robot_with_task(self.robot), self.drive)
         robot = robot_named(self.robot)
         print(",".join(("time", "run", *column_names(robot)[1])))
-        for row in excitation_plan.excitation_rows(robot, self.keep, self.minutes, self.seed):
-            print(",".join((f"{row.time:.9g}", str(row.run), *(f"{value:.6g}" for value in row.input))))
+        for time, run, u in excitation_plan.excitation_rows(robot, self.keep, self.minutes, self.seed):
+            print(",".join((f"{time:.9g}", str(run), *(f"{value:.6g}" for value in u))))
         return 0
 
     def _drive(self, robot: RobotWithTask, path: Path) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from brakeline.deploy.commands.command_output import errors, print_result
-from brakeline.deploy.commands.common_options import Json, Quiet, ReadGib, ReadSeconds
+from brakeline.deploy.commands.common_options import Json, LogReadOptions, Quiet, Unprefixed
 from brakeline.deploy.data.resample import HOLD
 from brakeline.logs.stacking_table import PLAIN, StackingTable
 
@@ -32,17 +32,12 @@ class ImportCommand:
     map: tuple[str, ...] = ()
     """Find coordinates, inputs and the time at these places of the log, each as NAME=TABLE/FIELD (of a file of columns:
     NAME=COLUMN), if they are not at their usual places."""
-    unit: tuple[str, ...] = ()
-    """Read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
-    topics: tuple[str, ...] = ()
-    """Take these topics or message types, where several hold the same quantity."""
     delay: float = 0.0
     """Shift the inputs, which are stamped too early, by this time [s]. The report says how much later than its inputs
     the robot moves."""
     hold: float = HOLD
     """Let an input count for this time after its last message [s]."""
-    read_seconds: ReadSeconds = 0.0
-    read_gib: ReadGib = 4.0
+    reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)
     picture: Path | None = None
     """Draw what was driven into this image (.png)."""
     quiet: Quiet = False
@@ -54,13 +49,10 @@ class ImportCommand:
         from brakeline.deploy.data.build_lock import folder_lock
         from brakeline.deploy.data.coverage import coverage, draw_coverage
         from brakeline.deploy.data.data_paths import record_path
-        from brakeline.deploy.data.log_options import LogOptions
-        from brakeline.deploy.data.sources.isolated_reader import ReadLimits
         from brakeline.messaging.robot import robot_named
 
         robot = robot_named(self.robot)
-        limits = ReadLimits(self.read_seconds, self.read_gib)
-        options = LogOptions.parse(self.map, self.unit, self.topics, limits)
+        options = self.reading.options(self.map)
         imported = importer.import_sources(self.sources, robot, options, self.delay, self.hold)
         covered = coverage(imported.data)
         path = self.out or record_path(robot)

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.markup import escape
 
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
-from brakeline.deploy.commands.common_options import Json, ReadGib, ReadSeconds
-from brakeline.deploy.data.description_plot import draw_description, summary
-from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.sources.isolated_reader import ReadLimits
+from brakeline.deploy.commands.common_options import Json, LogReadOptions, Unprefixed
+from brakeline.deploy.data.description_summary import summary
 from brakeline.errors import BadDescription, NoSource
 from brakeline.logs.stacking_table import plain_table
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_description import NAME, robot_from_description
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
+
+if TYPE_CHECKING:
+    from brakeline.deploy.data.log_options import LogOptions
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,7 @@ class RobotCommand:
     """With --from, give the names of coordinates, inputs and the time, and their places in the log, each as
     NAME=TABLE/FIELD (of a file of columns: NAME=COLUMN; then no other column is taken). The name of an input begins
     with `command `."""
-    unit: tuple[str, ...] = ()
-    """With --from, read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
-    topics: tuple[str, ...] = ()
-    """With --from, take these topics or message types, where several hold the same quantity."""
-    read_seconds: ReadSeconds = 0.0
-    read_gib: ReadGib = 4.0
-    picture: Path | None = None
-    """With show, draw the body and the stop into this image."""
+    reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)
     json: Json = False
 
     def run(self) -> int:
@@ -61,8 +55,7 @@ class RobotCommand:
             raise ValueError(f"{path} exists: check it with `brakeline robot check {path}`, or choose another name")
         text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
-        limits = ReadLimits(self.read_seconds, self.read_gib)
-        options = LogOptions.parse(self.map, self.unit, self.topics, limits)
+        options = self.reading.options(self.map)
         if self.from_:
             text, notes = _from_logs(self.from_, text, path.stem, options)
         path.write_text(text)
@@ -96,9 +89,6 @@ class RobotCommand:
     def _show(self) -> int:
         robot = robot_named(self.file)
         values = summary(robot)
-        if self.picture is not None:
-            draw_description(robot, self.picture)
-            values["picture"] = str(self.picture)
         rows = [
             (escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
             for label, one in values["inputs"].items()

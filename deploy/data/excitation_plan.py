@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.deploy.data.description_plot import nominal_stopping_distance
+from brakeline.deploy.data.description_summary import nominal_stopping_distance
 from brakeline.deploy.data.excitation import excitation
 from brakeline.deploy.data.sources.quantity_names import column_names, quantities
 from brakeline.errors import BadData
@@ -27,17 +26,10 @@ TRIES = 400  # random manoeuvres to try for one that stays inside
 LEAD = 4  # smallest number of periods of a manoeuvre
 
 
-@dataclass(frozen=True)
-class InputRow:
-    """One row of the printed table."""
+def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> Iterator[tuple[float, int, Array]]:
+    """Yield the time since the start of the run [s], the run and the input of each period.
 
-    time: float  # s since the begin of the run
-    run: int
-    input: Array
-
-
-def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> Iterator[InputRow]:
-    """Yield one input per period. Each run begins at rest in the middle of the region, with the heading along x.
+    Each run begins at rest in the middle of the region, with the heading along x.
 
     Raises:
         BadData: the region is too small for the robot, or its inputs do not determine its motion.
@@ -52,7 +44,7 @@ def excitation_rows(robot: Robot, keep: Region, minutes: float, seed: int) -> It
             before = done[-1] if done else robot.zero_input()
             inputs, pose = bounded.draw(pose, bounded.low, bounded.high, before)
             done += inputs
-        yield from (InputRow(k * robot.period, run, u) for k, u in enumerate(done))
+        yield from ((k * robot.period, run, u) for k, u in enumerate(done))
 
 
 def run_length(robot: Robot) -> int:

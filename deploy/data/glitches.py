@@ -23,7 +23,7 @@ NAMED = 5  # glitches that notes name
 
 
 def without_glitches(
-    places: Places, positions: Sequence[str], inputs: Sequence[str] = (), heading: str = ""
+    places: Places, positions: Sequence[str], heading: str, inputs: Sequence[str] = ()
 ) -> tuple[Places, list[str]]:
     """Return the places with glitches as missing values, and notes that name them.
 
@@ -32,8 +32,8 @@ def without_glitches(
     Args:
         places: table and field of each column.
         positions: they have no usual range: a glitch jumps away and back.
-        inputs: columns of inputs; the recording is cut at their glitches.
         heading: the column of the heading in rad; as positions, but modulo 2 pi.
+        inputs: columns of inputs; the recording is cut at their glitches.
     """
     clean, notes = dict(places), list[str]()
     for name, (table, column) in places.items():

@@ -124,7 +124,7 @@ def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
     ]
 
 
-def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool = False) -> SpeedFit | None:
+def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool) -> SpeedFit | None:
     """Return the speed of the motion that a column agrees with best, or None. The motion follows an input later."""
     i, j = log.spans(SPAN)
     sums = np.concatenate([[0.0], np.cumsum(log.columns[name])])

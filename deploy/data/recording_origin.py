@@ -13,7 +13,7 @@ ORIGIN = "collect"
 VERSION = "simulator_version"
 
 
-def origin(robot: RobotWithTask, seed: int, conditions: Conditions, restless: int = 0) -> dict[str, str]:
+def origin(robot: RobotWithTask, seed: int, conditions: Conditions, restless: int) -> dict[str, str]:
     """Return the `about` entries of a recording: conditions, seed, origin, and how many trajectories are restless."""
     recorded = {"seed": str(seed), "origin": ORIGIN, VERSION: str(robot.task.simulator_version)}
     return conditions.describe() | recorded | {RESTLESS: str(restless)}

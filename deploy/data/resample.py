@@ -73,7 +73,7 @@ def resample(
     positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
-    places, glitches = without_glitches(places, positions, inputs, heading)
+    places, glitches = without_glitches(places, positions, heading, inputs)
     if robot.position_dim:
         refuse_contradictions(places, positions, inputs, heading, column_units(robot))
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)

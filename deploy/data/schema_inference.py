@@ -160,7 +160,7 @@ def _read(sources: Sequence[Sequence[Table]], options: LogOptions) -> tuple[Alig
     logs, notes = list[AlignedLog](), list[str]()
     for tables in sources:
         fields = _from_messages(tables, options) if tables[0].name else _from_columns(tables[0], options)
-        places, more = without_glitches(fields.places, fields.positions, heading=fields.heading)
+        places, more = without_glitches(fields.places, fields.positions, fields.heading)
         notes += [*notes_of(tables), *fields.notes, *choice_notes(tables, places), *more]
         logs.append(align(places, fields.positions, fields.inputs, fields.units, fields.heading))
     log = joined(logs)

@@ -10,7 +10,7 @@ from pathlib import Path
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.recording_origin import ORIGIN, origin, outdated
-from brakeline.deploy.progress import console, each
+from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, needs_task
@@ -77,11 +77,14 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
     rest = collect.record(robot, trajectories, seed, conditions, len(driven), restless)
     saved = time.monotonic()
     try:
-        for trajectory in each(rest, f"recording {robot.name}", total, len(driven)):
-            driven.append(trajectory)
-            if time.monotonic() - saved > SAVE_EVERY:
-                collect.dataset(robot, driven, seed, conditions, restless).save(part)
-                saved = time.monotonic()
+        with under_way(f"recording {robot.name}", total) as advance:
+            advance(len(driven))
+            for trajectory in rest:
+                advance()
+                driven.append(trajectory)
+                if time.monotonic() - saved > SAVE_EVERY:
+                    collect.dataset(robot, driven, seed, conditions, restless).save(part)
+                    saved = time.monotonic()
     except KeyboardInterrupt:
         if driven:
             collect.dataset(robot, driven, seed, conditions, restless).save(part)

@@ -8,7 +8,7 @@ results/campaign/<robot>.md, <robot>.json        the table
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,76 +169,59 @@ class CampaignSearch:
         return {"study": configuration(self), **about, **found}
 
 
-@dataclass
-class CellFigures:
-    """The figures of a cell, over all its parts.
-
-    Attributes:
-        cell: arena, policy, model set, perturbation.
-        count: sums over the episodes, by the name of a column.
-        closest: m.
-        near: the episodes whose logs are kept.
-    """
-
-    cell: tuple[str, str, str, str]
-    model: str
-    episodes: int = 0
-    count: dict[str, int] = field(default_factory=dict)
-    closest: float = float("inf")
-    near: list[dict[str, Any]] = field(default_factory=list)
-    _interventions: ClusteredProportion = field(default_factory=ClusteredProportion)
-
-    def add(self, result: dict[str, Any]) -> None:
-        """Add a part. Raises ResultError if another model set decided in it."""
-        if result["model"] != self.model:
-            raise ResultError(
-                f"parts of {'-'.join(self.cell)} have other model sets ({self.model}, {result['model']}): "
-                "run the campaign again with --again, or give it another --runs folder"
-            )
-        columns = result["episodes"]
-        self.episodes += len(columns["steps"])
-        for name, values in columns.items():
-            if name != "closest":
-                self.count[name] = self.count.get(name, 0) + int(sum(values))
-        self.closest = min(self.closest, *columns["closest"])
-        self.near += result["near"]
-        for interventions, steps in zip(columns["interventions"], columns["steps"], strict=True):
-            self._interventions.add(interventions, steps)
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures with exact 95 % intervals (`logs/proportion_intervals.py`)."""
-        touched = self.count["collision"] + self.count["contact_moving"]
-        return {
-            **dict(zip(("arena", "policy", "model_set", "perturbation"), self.cell, strict=True)),
-            "model": self.model,
-            "episodes": self.episodes,
-            "steps": self.count["steps"],
-            "goals": self.count["goal"],
-            "goals_interval": clopper_pearson(self.count["goal"], self.episodes),
-            "collisions": touched,
-            "collisions_interval": clopper_pearson(touched, self.episodes),
-            "timeouts": self.count["timeout"],
-            "interventions": self.count["interventions"],
-            "interventions_interval": self._interventions.interval(),
-            **{name: self.count[name] for name in ("failsafes", "compared", "violations")},
-            "violations_interval": clopper_pearson(self.count["violations"], self.count["compared"]),
-            "closest": self.closest,
-            "near": self.near,
-        }
-
-
 def parts_of_cell(cell: CampaignPart, episodes: int) -> list[CampaignPart]:
     """Cut a cell of so many episodes into parts. A longer campaign later goes on after the same parts."""
     return [replace(cell, first=first, episodes=min(PART, episodes - first)) for first in range(0, episodes, PART)]
 
 
 def cells_of(parts: Sequence[CampaignPart], results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the figures of each cell, in the order of the parts. Raises ResultError: see `CellFigures.add`."""
-    cells: dict[str, CellFigures] = {}
+    """Return the figures of each cell, in the order of the parts.
+
+    Raises:
+        ResultError: the parts of a cell have several model sets.
+    """
+    cells: dict[str, tuple[CampaignPart, list[dict[str, Any]]]] = {}
     for part, result in zip(parts, results, strict=True):
-        key = part.arena, Path(part.policy).stem, part.model_set, part.perturbation
-        cells.setdefault(part.cell, CellFigures(key, result["model"])).add(result)
-    return [cell.figures() for cell in cells.values()]
+        cells.setdefault(part.cell, (part, []))[1].append(result)
+    return [_figures(part, own) for part, own in cells.values()]
+
+
+def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of a cell over all its parts, with 95 % intervals (`logs/proportion_intervals.py`)."""
+    models = sorted({result["model"] for result in results})
+    if len(models) > 1:
+        raise ResultError(
+            f"parts of {cell.cell} have other model sets ({', '.join(models)}): "
+            "run the campaign again with --again, or give it another --runs folder"
+        )
+    columns = {
+        name: [value for result in results for value in result["episodes"][name]] for name in results[0]["episodes"]
+    }
+    closest, episodes, interventions = min(columns.pop("closest")), len(columns["steps"]), ClusteredProportion()
+    count = {name: int(sum(values)) for name, values in columns.items()}
+    for hits, steps in zip(columns["interventions"], columns["steps"], strict=True):
+        interventions.add(hits, steps)
+    touched = count["collision"] + count["contact_moving"]
+    return {
+        "arena": cell.arena,
+        "policy": Path(cell.policy).stem,
+        "model_set": cell.model_set,
+        "perturbation": cell.perturbation,
+        "model": models[0],
+        "episodes": episodes,
+        "steps": count["steps"],
+        "goals": count["goal"],
+        "goals_interval": clopper_pearson(count["goal"], episodes),
+        "collisions": touched,
+        "collisions_interval": clopper_pearson(touched, episodes),
+        "timeouts": count["timeout"],
+        "interventions": count["interventions"],
+        "interventions_interval": interventions.interval(),
+        **{name: count[name] for name in ("failsafes", "compared", "violations")},
+        "violations_interval": clopper_pearson(count["violations"], count["compared"]),
+        "closest": closest,
+        "near": [episode for result in results for episode in result["near"]],
+    }
 
 
 HEADS = (

@@ -25,7 +25,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 )
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
-from brakeline.deploy.experiments.trials import EpisodeTable, Trainer, TrialLog, run_trial
+from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog, run_trial, train_in_lockstep
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, driving, network_named
 from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.vehicle_factory import environment
@@ -104,10 +104,8 @@ class CellRun:
     def _train_single(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
         """Train with one robot and one learner in lockstep. Return the policy and the number of updates."""
         driver, ask = self._driver(trial, self.cell.seed, self.cell.name)
-        trainer = Trainer(driver, ask, self._learner())
-        for step in trainer.run(begin):
-            take(step)
-        return trainer.policy, trainer.learner.updates
+        learner = self._learner()
+        return train_in_lockstep(driver, ask, learner, take, begin), learner.updates
 
     def _train_batch(self, trial: TrialConfig, take: Take, begin: Begin) -> tuple[MLP, int]:
         """Train with many robots at once, as `_train_single` returns it."""

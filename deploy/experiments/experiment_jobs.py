@@ -71,11 +71,9 @@ def _default(field: Field[Any]) -> Any:
     return json.loads(json.dumps(plain))
 
 
-def write(results: Path, job: Job, result: dict[str, Any]) -> Path:
-    """Write a result atomically, and return its path."""
-    path = result_path(results, job)
-    write_atomically(path, (json.dumps(result, separators=(",", ":")) + "\n").encode())
-    return path
+def write(results: Path, job: Job, result: dict[str, Any]) -> None:
+    """Write a result atomically."""
+    write_atomically(result_path(results, job), (json.dumps(result, separators=(",", ":")) + "\n").encode())
 
 
 def complete(

@@ -17,13 +17,7 @@ import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
-from brakeline.deploy.experiments.tuning_trials import (
-    SETTINGS,
-    ThresholdTrial,
-    best_learner,
-    best_threshold,
-    value_in_use,
-)
+from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
 from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
@@ -37,7 +31,6 @@ from brakeline.safety.model.model_config import DDPC
 Result = dict[str, Any]
 SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend")  # in all cells of a robot
 CELL = re.compile(r"-s\d+\.json$")
-FIELDS = tuple(ThresholdTrial.__dataclass_fields__)
 
 
 def stored_cells(results: Path, robot: str) -> list[Result]:
@@ -244,7 +237,8 @@ def _main(found: RobotResults) -> list[str]:
         got = int((learned < found.study["steps"]).sum())
         shares = [_percent(found.interventions(method, arena)) for arena in found.arenas]
         times = [f"{found.decision_ms(method, arena):.2f}" for arena in found.arenas]
-        speed = _steps(aggregate(learned))
+        figures = aggregate(learned)
+        speed = f"{figures['iqm']:,.0f}" + _interval(figures["iqm_interval"], ",.0f")
         rows.append([METHODS[method].label, speed, f"{got} of {len(cells)}", *shares, *times])
     return [*lines, *markdown_table(heads, rows), ""]
 
@@ -253,17 +247,14 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.1f} %"
 
 
+def _interval(ends: Sequence[float] | None, form: str, scale: float = 1.0) -> str:
+    """Format an interval behind its figure. A single run has none."""
+    return "" if ends is None else f" [{scale * ends[0]:{form}}, {scale * ends[1]:{form}}]"
+
+
 def _iqm(figures: Result) -> str:
     """Format the interquartile mean of shares with its interval."""
-    interval = figures["iqm_interval"]
-    shown = "" if interval is None else f" [{100.0 * interval[0]:.1f}, {100.0 * interval[1]:.1f}]"
-    return _percent(figures["iqm"]) + shown
-
-
-def _steps(figures: Result) -> str:
-    """Format the interquartile mean of steps with its interval."""
-    interval = figures["iqm_interval"]
-    return f"{figures['iqm']:,.0f}" + ("" if interval is None else f" [{interval[0]:,.0f}, {interval[1]:,.0f}]")
+    return _percent(figures["iqm"]) + _interval(figures["iqm_interval"], ".1f", 100.0)
 
 
 def _share(count: int, episodes: int) -> str:
@@ -278,9 +269,8 @@ def _improvements(found: RobotResults) -> list[str]:
     for method in found.cells:
         if method != DDPC:
             row = probability_of_improvement(found.goals(DDPC), found.goals(method))
-            interval = row["interval"]
-            shown = "" if interval is None else f" [{interval[0]:.2f}, {interval[1]:.2f}]"
-            rows.append([f"ours over {METHODS[method].label}", f"{row['probability']:.2f}{shown}"])
+            probability = f"{row['probability']:.2f}" + _interval(row["interval"], ".2f")
+            rows.append([f"ours over {METHODS[method].label}", probability])
     return [*markdown_table(["", "probability"], rows), ""]
 
 
@@ -308,9 +298,8 @@ def _tuning(results: Path, robot: RobotWithTask, found: RobotResults) -> list[st
 
 
 def _best(method: str, rows: Sequence[Result]) -> float:
-    if method in SETTINGS:
-        return float(best_learner(rows)["value"])
-    return best_threshold([ThresholdTrial(**{name: row[name] for name in FIELDS}) for row in rows]).value
+    best = best_learner if method in SETTINGS else best_threshold
+    return float(best(rows)["value"])
 
 
 def _tried(row: Result) -> str:

@@ -57,7 +57,7 @@ class Engine:
     """Use a Ray cluster instead: local starts one on this machine, auto takes the running one, and HOST:PORT takes the
     one at this address. A part whose machine dies runs again. You need the extra ray."""
 
-    def completed(self, tasks: Sequence[T], runs: Path, say: Say = unsaid) -> Iterator[tuple[T, Any]]:
+    def completed(self, tasks: Sequence[T], runs: Path, say: Say) -> Iterator[tuple[T, Any]]:
         """Run tasks, and yield each with its result once it is there.
 
         Args:

@@ -8,7 +8,7 @@ the same schema, without observations.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from operator import add
 from pathlib import Path
@@ -223,32 +223,39 @@ def fresh_trial(robot: RobotWithTask, arena: str, policy: str, question: Ask | N
     return run_trial(driver, policy_named(policy, robot, 0), question, episodes)
 
 
-class Trainer:
-    """One episode runner and one learner in lockstep: the learner makes all due updates before the next step."""
+def train_in_lockstep(
+    driver: EpisodeRunner,
+    question: Ask | None,
+    learner: Learner,
+    take: Callable[[pb.Step], object],
+    begin: Callable[[pb.Episode], object],
+) -> MLP:
+    """Train with one robot and one learner, and return the last policy.
 
-    def __init__(self, driver: EpisodeRunner, question: Ask | None, learner: Learner) -> None:
-        self.driver, self.question, self.learner = driver, question, learner
-        robot = driver.robot
-        reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))
-        self.policy: MLP = decode(reply.weights.file, robot)
+    The learner makes all due updates before the next step.
 
-    def run(self, begin: Callable[[pb.Episode], object] = lambda message: None) -> Iterator[pb.Step]:
-        """Yield the steps of the whole training. Calls `begin` with the description of each episode."""
-        episode = 0
-        while not self.learner.done:
-            if not self.driver.running:
-                message = self.driver.begin(episode)
-                episode += 1
-                self._random = scripted("random", self.driver.robot, self.driver.rng)
-                begin(message)
-            step = take_step(self.driver, self._explore, self.question, self.policy.version)
-            self.learner.insert(step)
-            self.learner.work(1 << 30)
-            if self.learner.weights_due():
-                self.policy = decode(self.learner.publish().file, self.driver.robot)
-            yield step
+    Args:
+        driver: runs the episodes.
+        question: asks the filter; None for no filter.
+        learner: learns from the steps, and ends the training.
+        take: called with each step.
+        begin: called with the description of each episode.
+    """
+    robot, episode = driver.robot, 0
+    reply = learner.join(pb.Join(robot=robot.name, actor=driver.identity.actor, layout=robot.learning_layout()))
+    policy = decode(reply.weights.file, robot)
 
-    def _explore(self, observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
-        if self.learner.warming_up:
-            return np.asarray(self._random(observation, info))
-        return self.policy.explore(observation, self.driver.rng)
+    def explore(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        return np.asarray(random(observation, info)) if learner.warming_up else policy.explore(observation, driver.rng)
+
+    while not learner.done:
+        if not driver.running:
+            begin(driver.begin(episode))
+            episode, random = episode + 1, scripted("random", robot, driver.rng)
+        step = take_step(driver, explore, question, policy.version)
+        learner.insert(step)
+        learner.work(1 << 30)
+        if learner.weights_due():
+            policy = decode(learner.publish().file, robot)
+        take(step)
+    return policy

@@ -14,7 +14,7 @@ results/<robot>/tuning-<method>-<value>.json
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,60 +45,36 @@ VALUES = {
 SETTING = {SECAS: "clearance", SAILR: "threshold", CBF: "rate", PSF: "margin"}
 
 
-@dataclass(frozen=True)
-class ThresholdTrial:
-    """A value of `SETTING` (SECAS: its margin to the footprint) and its results over `episodes` per policy."""
-
-    value: float
-    episodes: int
-    oracle_goals: int
-    oracle_interventions: float  # share of its steps
-    greedy_goals: int
-    greedy_collisions: int
-
-
 def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
     """Return the values of a method's setting to try."""
     in_metres = method == SECAS or (method == PSF and robot.heading is None)  # a vehicle needs more than a unicycle
     return robot.task.rivals.margins if in_metres else VALUES[method]
 
 
-def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episodes: int) -> ThresholdTrial:
-    """Evaluate the model with another threshold on fresh episodes."""
+def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episodes: int) -> dict[str, Any]:
+    """Return the figures of the model with another value of `SETTING` on fresh episodes of each policy.
+
+    value: of SECAS, its margin to the footprint. The interventions are a share of the steps.
+    """
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
     oracle, greedy = (fresh_trial(robot, "default", policy, question, episodes) for policy in (ORACLE, GREEDY))
     reached, driven = oracle.columns(), greedy.columns()
-    return ThresholdTrial(
-        value,
-        episodes,
-        oracle_goals=int(sum(reached["goal"])),
-        oracle_interventions=sum(reached["interventions"]) / max(oracle.decisions, 1),
-        greedy_goals=int(sum(driven["goal"])),
-        greedy_collisions=int(sum(driven["collision"])),
-    )
+    return {
+        "value": value,
+        "episodes": episodes,
+        "oracle_goals": int(sum(reached["goal"])),
+        "oracle_interventions": sum(reached["interventions"]) / max(oracle.decisions, 1),
+        "greedy_goals": int(sum(driven["goal"])),
+        "greedy_collisions": int(sum(driven["collision"])),
+    }
 
 
-def tune_threshold(
-    model: Pretrained,
-    robot: RobotWithTask,
-    values: Sequence[float],
-    episodes: int,
-    say: Callable[[ThresholdTrial], object] = lambda row: None,
-) -> list[ThresholdTrial]:
-    """Evaluate every value, and call `say` after each one."""
-    rows = []
-    for value in values:
-        rows.append(try_threshold(model, robot, value, episodes))
-        say(rows[-1])
-    return rows
-
-
-def best_threshold(rows: Sequence[ThresholdTrial]) -> ThresholdTrial:
-    """Return the best row by the rule of this module."""
-    most = max(row.oracle_goals for row in rows)
-    without_loss = [row for row in rows if row.oracle_goals == most]
-    return min(without_loss, key=lambda row: (row.greedy_collisions, -row.greedy_goals, row.oracle_interventions))
+def best_threshold(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the best row of a filter by the rule of this module."""
+    most = max(row["oracle_goals"] for row in rows)
+    rows = [row for row in rows if row["oracle_goals"] == most]
+    return min(rows, key=lambda row: (row["greedy_collisions"], -row["greedy_goals"], row["oracle_interventions"]))
 
 
 @dataclass(frozen=True)
@@ -123,7 +99,7 @@ class FilterTuning:
         robot = robot_with_task(self.robot)
         model = method_for(robot, self.method, ModelConfig())
         assert isinstance(model, Pretrained)
-        return {"study": configuration(self), **asdict(try_threshold(model, robot, self.value, self.episodes))}
+        return {"study": configuration(self), **try_threshold(model, robot, self.value, self.episodes)}
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,24 @@ def search(
         return driver.row(candidate.number, log, candidate.policy(robot))
 
     found = _Found()
+
+    def score(candidate: SearchedEpisode) -> float:
+        """Drive a candidate and return what CMA-ES makes small."""
+        row = drive(candidate)
+        (arena,) = drawn
+        start = np.asarray(arena.start[: arena.dim])
+        free = float(arena.shapes.distance(start).min()) - robot.footprint
+        if free < robot.footprint:  # it began too near to something: no fault of the filter
+            return 10.0 - free
+        found.episodes, found.steps = found.episodes + 1, found.steps + int(row["steps"])
+        touched = bool(row["collision"] or row["contact_moving"])
+        found.collisions += touched
+        value = float(row["closest"]) - TOUCHED * touched
+        if value < found.score:
+            found.score, found.closest, found.worst = value, float(row["closest"]), candidate
+        found.history.append(round(found.closest, 5))
+        return value
+
     size = MOVED * robot.position_dim + PIECES * robot.action_dim
     number = 0
     while found.episodes < episodes:
@@ -111,9 +129,7 @@ def search(
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
         while not strategy.stop() and found.episodes < episodes:
             candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
-            strategy.tell(
-                [one.values for one in candidates], [_score(one, drive, found, drawn, robot) for one in candidates]
-            )
+            strategy.tell([one.values for one in candidates], list(map(score, candidates)))
             say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
         number += 1
         if not found.episodes and number == MOST_ARENAS:
@@ -145,30 +161,6 @@ class _Found:
     closest: float = math.inf  # m, of the candidate with the least score
     worst: SearchedEpisode | None = None
     history: list[float] = field(default_factory=list)
-
-
-def _score(
-    candidate: SearchedEpisode,
-    drive: Callable[[SearchedEpisode], Row],
-    found: _Found,
-    drawn: list[Arena],
-    robot: RobotWithTask,
-) -> float:
-    """Drive a candidate and return what CMA-ES makes small."""
-    row = drive(candidate)
-    (arena,) = drawn
-    start = np.asarray(arena.start[: arena.dim])
-    free = float(arena.shapes.distance(start).min()) - robot.footprint
-    if free < robot.footprint:  # it began too near to something: no fault of the filter
-        return 10.0 - free
-    found.episodes, found.steps = found.episodes + 1, found.steps + int(row["steps"])
-    touched = bool(row["collision"] or row["contact_moving"])
-    found.collisions += touched
-    score = float(row["closest"]) - TOUCHED * touched
-    if score < found.score:
-        found.score, found.closest, found.worst = score, float(row["closest"]), candidate
-    found.history.append(round(found.closest, 5))
-    return score
 
 
 def _movable(obstacle: Obstacle, arena: Arena) -> bool:

@@ -54,12 +54,6 @@ class FlightResult:
     slips: int = 0  # times that the simulation gave up catching up with real time
     collisions: int = 0  # touches of an obstacle
 
-    def __str__(self) -> str:
-        return (
-            f"{self.simulated:.1f} s simulated in {self.real:.1f} s: {self.speed:.2f} x real time, "
-            f"{self.unanswered} steps without an answer, {self.slips} slips, {self.collisions} collisions"
-        )
-
 
 def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda vehicle: None) -> FlightResult:
     """Start PX4 and let it fly until the duration ends, SIGINT or SIGTERM.

@@ -37,7 +37,7 @@ from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 PRACTICE = 0.01  # of a run that certifies anew: a model set needs stops
 
 
-Work = Callable[[], bool]  # returns True when it is done, False when a signal ended it
+Work = Callable[[], bool | None]  # returns True when it is done. Otherwise a signal ended it
 
 
 def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
@@ -49,7 +49,7 @@ def _recorder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettin
     derive = derive_entries(config.pictures, robots)
     files = attachments(config, folder)
     settings = recorder.LogSettings(folder / LOG, metadata(config, folder), files, derive, config.rotation)
-    return endless(partial(recorder.main, bus, settings, spec.name))
+    return partial(recorder.main, bus, settings, spec.name)
 
 
 def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
@@ -64,13 +64,13 @@ def _safety(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings
     models = tuple(model_in_run(config, folder, robot, trust) for robot in robots)
     accepted = config.accept_bound
     settings = SafetySettings(bus, models, folder, spec.name, limits, accepted, secrets=folder / KEYS)
-    return endless(partial(main, settings))
+    return partial(main, settings)
 
 
 def _certifier(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.adaptation_process import CertifierSettings, main
 
-    return endless(partial(main, CertifierSettings(bus, config.robots, folder, config.accept_bound, spec.name)))
+    return partial(main, CertifierSettings(bus, config.robots, folder, config.accept_bound, spec.name))
 
 
 def _learner(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
@@ -137,23 +137,13 @@ def _autopilot(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSetti
         changes=changes_of(config.conditions),
         truth=f"127.0.0.1:{flight.truth}",
     )
-    return endless(lambda: print(fly(settings), file=sys.stderr))
+    return lambda: print(fly(settings), file=sys.stderr)
 
 
 def _feeder(spec: ProcessSpec, folder: Path, config: RunConfig, bus: BusSettings) -> Work:
     from brakeline.deploy.run.log_feed import FeederSettings, main
 
     return partial(main, FeederSettings(bus, config.from_logs, spec.robot, spec.name, config.actors == 0))
-
-
-def endless(run: Callable[[], object]) -> Work:
-    """Return work that is never done: that of a recorder, a safety service, a certifier or an autopilot."""
-
-    def work() -> bool:
-        run()
-        return False
-
-    return work
 
 
 # Each function imports what a process needs, and returns its work.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -106,7 +105,7 @@ class Adversary:
 
 
 class Planner:
-    """Follows the cheapest path on a grid to the goal (Dijkstra), and backs off if it does not get on."""
+    """Follows the cheapest path on a grid to the goal, and backs off if it does not get on."""
 
     def __init__(self, arena: Arena, room: float) -> None:
         """Plan. room [m]: distance that a path keeps to all cylinders."""
@@ -127,20 +126,16 @@ class Planner:
     def costs(self) -> Array:
         """The costs (count, count) from each cell to the goal; infinite where no path leads there."""
         weight = np.where(self._gap > 0.0, CELL * (1.0 + EXTRA * np.exp(-np.maximum(self._gap, 0.0) / CAUTION)), np.inf)
-        costs = np.full(weight.shape, np.inf)
-        goal = self._cell(self.arena.goal)
-        costs[goal] = 0.0
-        queue = [(0.0, goal)]
-        while queue:
-            cost, (i, j) = heapq.heappop(queue)
-            if cost > costs[i, j]:
-                continue
-            for a, b in self._around(i, j):
-                further = cost + weight[a, b] * math.hypot(a - i, b - j)
-                if further < costs[a, b]:
-                    costs[a, b] = further
-                    heapq.heappush(queue, (further, (a, b)))
-        return costs
+        costs, n = np.full(weight.shape, np.inf), self.count
+        costs[self._cell(self.arena.goal)] = 0.0
+        steps = [(i, j) for i in (0, 1, 2) for j in (0, 1, 2) if (i, j) != (1, 1)]
+        while True:  # each round adds the paths with one more step
+            around = np.pad(costs, 1, constant_values=np.inf)
+            ways = [around[i : i + n, j : j + n] + weight * math.hypot(i - 1, j - 1) for i, j in steps]
+            cheaper = np.minimum(costs, np.min(ways, axis=0))
+            if np.array_equal(cheaper, costs):
+                return costs
+            costs = cheaper
 
     def _around(self, i: int, j: int) -> list[tuple[int, int]]:
         steps = ((a, b) for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1) if (a, b) != (i, j))

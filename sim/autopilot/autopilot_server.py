@@ -62,9 +62,6 @@ class ServerStats:
     slips: int = 0  # times that it stopped catching up
     collisions: int = 0
 
-    def __str__(self) -> str:
-        return f"{self.ticks} ticks, {self.late} late, {self.slips} slips, {self.collisions} collisions"
-
 
 def serve(
     autopilots: Sequence[Autopilot],

@@ -398,10 +398,8 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
 
 
 @pytest.mark.parametrize("robot", ["ground", "quadrotor"])
-def test_show_prints_and_draws_a_description(command, figures, tmp_path, robot):
-    picture = tmp_path / "robot.png"
-    shown = figures("robot", "show", robot, "--picture", picture)
-    assert picture.read_bytes().startswith(b"\x89PNG")
+def test_show_prints_a_description(command, figures, robot):
+    shown = figures("robot", "show", robot)
     assert shown["name"] == robot and shown["footprint_m"] in (0.105, 0.3)
     out = command("robot", "show", robot)[1]
     assert "[m/s]" in out and "layout" in out

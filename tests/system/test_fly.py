@@ -165,7 +165,7 @@ def test_what_is_killed_in_flight_hurts_nobody(tmp_path: Path) -> None:
     assert second["HEARTBEAT"].custom_mode == PX4_OFFBOARD, "its vehicle server flew it until it hovered"
     assert _speed(second["LOCAL_POSITION_NED"]) < 0.3
     assert third["HEARTBEAT"].custom_mode == PX4_POSITION, "without one the autopilot braked by itself, and held"
-    assert "0 collisions" in (run.folder / "logs" / "autopilot.log").read_text()
+    assert "collisions=0)" in (run.folder / "logs" / "autopilot.log").read_text()
     lines = (run.folder / "logs" / "actor-0.log").read_text()
     assert "braking along the committed plan" in lines and "it hovers at" in lines
 

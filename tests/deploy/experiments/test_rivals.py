@@ -7,7 +7,7 @@ import pytest
 
 from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, config_for, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.deploy.experiments.tuning_trials import ThresholdTrial, best_threshold, tune_threshold, values_of
+from brakeline.deploy.experiments.tuning_trials import best_threshold, try_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
 from tests.robots import GROUND, QUADROTOR
@@ -50,24 +50,23 @@ def test_a_pretrained_model_says_what_it_cost(config_class):
 
 
 def row(value, oracle, collisions, goals):
-    return ThresholdTrial(value, 10, oracle, 0.0, goals, collisions)
+    figures = {"oracle_goals": oracle, "greedy_goals": goals, "greedy_collisions": collisions}
+    return {"value": value, "episodes": 10, "oracle_interventions": 0.0, **figures}
 
 
 def test_safety_counts_among_those_that_cost_the_oracle_nothing():
     rows = [row(1.0, 10, 3, 5), row(2.0, 10, 1, 4), row(3.0, 10, 1, 6), row(4.0, 9, 0, 9)]
-    assert best_threshold(rows).value == 3.0
-    often = replace(row(0.5, 10, 1, 6), oracle_interventions=0.2)
-    assert best_threshold([often, *rows]).value == 3.0, "of two alike, the one that leaves A* alone"
-    assert best_threshold([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)]).value == 2.0, "the least that any value costs"
+    assert best_threshold(rows)["value"] == 3.0
+    often = row(0.5, 10, 1, 6) | {"oracle_interventions": 0.2}
+    assert best_threshold([often, *rows])["value"] == 3.0, "of two alike, the one that leaves A* alone"
+    assert best_threshold([row(1.0, 8, 0, 9), row(2.0, 9, 5, 0)])["value"] == 2.0, "the least that any value costs"
 
 
 def test_a_threshold_that_never_steps_in_and_one_that_always_does():
     model = pretrain(GROUND, SailrConfig(**LITTLE))
-    reported = []
-    never, always = tune_threshold(model, GROUND, (1.0, -1.0), 1, reported.append)
-    assert reported == [never, always]
-    assert never.oracle_goals == 1 and never.oracle_interventions == 0.0
-    assert always.oracle_goals == 0 and always.oracle_interventions == 1.0 and always.greedy_collisions == 0
+    never, always = (try_threshold(model, GROUND, value, 1) for value in (1.0, -1.0))
+    assert never["oracle_goals"] == 1 and never["oracle_interventions"] == 0.0
+    assert always["oracle_goals"] == 0 and always["oracle_interventions"] == 1.0 and always["greedy_collisions"] == 0
 
 
 def test_each_robot_has_values_of_its_own():

@@ -1,13 +1,12 @@
-"""Summarise a robot description and plot it (`brakeline robot check`, `brakeline robot show`)."""
+"""Summarise a robot description (`brakeline robot check`, `brakeline robot show`)."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brakeline.messaging.robot import FEEDBACK, HOLD, RAMP, Array, Robot
+from brakeline.messaging.robot import RAMP, Array, Robot
 
 
 def full_stop_inputs(robot: Robot) -> Array:
@@ -62,30 +61,3 @@ def summary(robot: Robot) -> dict[str, Any]:
         "layout": robot.layout(),
         "remarks": remarks(robot),
     }
-
-
-def draw_description(robot: Robot, path: Path) -> None:
-    """Plot the body from above (in joint space, the limits) and the stop of each input into the image `path`."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Circle
-
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    body, plan = figure.subplots(1, 2)
-    if robot.position_dim:
-        for disc in robot.body:
-            body.add_patch(Circle((disc.at[0], disc.at[1]), disc.radius, alpha=0.3))
-        body.add_patch(Circle((0.0, 0.0), robot.footprint, fill=False, linestyle=":"))
-        body.annotate("", (robot.footprint, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
-        body.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"{robot.name}: body and footprint")
-        reach = 1.2 * robot.footprint
-        body.set(xlim=(-reach, reach), ylim=(-reach, reach))
-    else:
-        body.barh([limit.name for limit in robot.limits], [limit.most for limit in robot.limits], alpha=0.3)
-        body.set(xlabel="largest value", title=f"{robot.name}: limits")
-    times = robot.period * np.arange(robot.horizon + 1)
-    for label, rule, values in zip(robot.action, robot.stop, full_stop_inputs(robot).T, strict=True):
-        how = {RAMP: "ramp", HOLD: "held", FEEDBACK: "by feedback"}.get(str(rule), "profile")
-        plan.stairs(values, times, baseline=None, label=f"{label}: {how}", linewidth=1.5)
-    plan.set(xlabel="time [s]", ylabel="input", title="a plan from the largest inputs")
-    plan.legend(fontsize="small")
-    figure.savefig(path, dpi=120)
