@@ -90,7 +90,7 @@ class CampaignCommand:
         (self.results / f"{robot.name}.md").write_text(campaign.markdown(robot.name, driven, found))
         (self.results / f"{robot.name}.json").write_text(json.dumps(table, indent=1) + "\n")
         if not self.json:
-            console.print(plain_table(campaign.HEADS, campaign.rows_of(driven)))
+            console.print(plain_table(*campaign.cell_table(driven)))
             if found:
                 console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
             console.print(f"[dim]{self.results}: {robot.name}.md, {robot.name}.json[/]")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from brakeline.deploy.experiments.evaluate import Evaluation
 
 PART = 500  # episodes of a part
+AXES = ("arena", "policy", "model set", "perturbation")  # of the cells
 NEAR = 0.05  # of the footprint: an episode that comes nearer is kept
 
 # What differs from the robot that was recorded. Names say the change; a value of None does nothing.
@@ -214,6 +215,7 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
         "goals_interval": clopper_pearson(count["goal"], episodes),
         "collisions": touched,
         "collisions_interval": clopper_pearson(touched, episodes),
+        "contacts_standing": count["contact_standing"],
         "timeouts": count["timeout"],
         "interventions": count["interventions"],
         "interventions_interval": interventions.interval(),
@@ -224,28 +226,35 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
     }
 
 
-HEADS = (
-    *("arena", "policy", "model set", "perturbation", "episodes", "goals", "collisions", "interventions"),
-    *("steps outside", "closest [mm]", "near misses"),
-)
 SEARCH_HEADS = ("arena", "model set", "perturbation", "episodes", "collisions", "closest [mm]", "log")
 
 
-def rows_of(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Return the texts of the table of cells, below `HEADS`."""
-    return [
-        [
-            *(cell[name] for name in ("arena", "policy", "model_set", "perturbation")),
-            f"{cell['episodes']:,}",
-            _percent(cell["goals"], cell["episodes"], cell["goals_interval"]),
-            f"{cell['collisions']}: {_percent(cell['collisions'], cell['episodes'], cell['collisions_interval'])}",
-            _percent(cell["interventions"], cell["steps"], cell["interventions_interval"]),
-            _percent(cell["violations"], cell["compared"], cell["violations_interval"]),
-            f"{1e3 * cell['closest']:.1f}",
-            str(len(cell["near"])),
-        ]
-        for cell in cells
-    ]
+def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return the heads and the texts of the table of cells.
+
+    The column of walkers that ran into the standing robot is left out where there are none.
+    """
+    columns = {
+        **{name: [cell[name.replace(" ", "_")] for cell in cells] for name in AXES},
+        "episodes": [f"{cell['episodes']:,}" for cell in cells],
+        "goals": [_percent(cell["goals"], cell["episodes"], cell["goals_interval"]) for cell in cells],
+        "collisions": [
+            f"{cell['collisions']}: {_percent(cell['collisions'], cell['episodes'], cell['collisions_interval'])}"
+            for cell in cells
+        ],
+        "run into, standing": [str(cell["contacts_standing"]) for cell in cells],
+        "interventions": [
+            _percent(cell["interventions"], cell["steps"], cell["interventions_interval"]) for cell in cells
+        ],
+        "steps outside": [
+            _percent(cell["violations"], cell["compared"], cell["violations_interval"]) for cell in cells
+        ],
+        "closest [mm]": [f"{1e3 * cell['closest']:.1f}" for cell in cells],
+        "near misses": [str(len(cell["near"])) for cell in cells],
+    }
+    if not any(cell["contacts_standing"] for cell in cells):
+        del columns["run into, standing"]
+    return list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
 
 
 def search_rows(searches: Sequence[dict[str, Any]]) -> list[list[str]]:
@@ -271,7 +280,7 @@ def markdown(robot: str, cells: Sequence[dict[str, Any]], searches: Sequence[dic
         "episodes and steps, clustered by episode for interventions. A step is outside if the measured state left the "
         "set that the filter predicted.",
         "",
-        *markdown_table(HEADS, rows_of(cells)),
+        *markdown_table(*cell_table(cells)),
         "",
     ]
     if searches:

@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 
 from brakeline.deploy.commands.campaign_command import COLLIDED, CampaignCommand
 from brakeline.deploy.experiments import campaign, experiment_jobs
-from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cells_of, parts_of_cell
+from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cell_table, cells_of, parts_of_cell
 from brakeline.deploy.experiments.campaign_episodes import CampaignDriver
 from brakeline.deploy.experiments.experiment_jobs import complete
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS
@@ -100,6 +100,17 @@ def test_a_collision_behind_the_filter_is_an_exit_status(driven, monkeypatch, tm
     assert command.run() == COLLIDED
     (cell,) = json.loads(capsys.readouterr().out)["ground"]["cells"]
     assert cell["collisions"] == 1
+
+
+def test_walkers_that_run_into_a_standing_robot_are_no_collisions_and_have_a_column_where_there_are_any(driven):
+    parts, results, _ = driven
+    heads, _ = cell_table(cells_of(parts, results))
+    assert "run into, standing" not in heads
+    touched = json.loads(json.dumps(results))
+    touched[0]["episodes"]["contact_standing"][:2] = [2, 1]
+    heads, (row,) = cell_table(cells_of(parts, touched))
+    assert row[heads.index("run into, standing")] == "3"
+    assert row[heads.index("collisions")].startswith("0: ")
 
 
 def test_the_same_perturbation_is_another_change_in_the_air_and_none_where_a_robot_has_no_such_thing():
