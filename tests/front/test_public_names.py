@@ -124,7 +124,7 @@ def test_a_wheel_has_everything(wheel):
     robots = ("ground.toml", "quadrotor.task.toml", "template.txt", "ground.model.safetensors")
     needed = {"py.typed", "policies/ground/trained.safetensors", *(f"robots/{name}" for name in robots)}
     needed |= {"sim/ground.xml", "sim/quadrotor.xml", "deploy/experiments/paper.json", "messaging/brakeline.proto"}
-    needed |= {"logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json"}
+    needed |= {"logs/report_page/report.html.j2", "logs/report_page/main.js", "logs/brakeline.foxglove-layout.json"}
     needed |= {f"logs/viewer/{name}" for name in (*STYLES, *SCRIPTS, "three.LICENSE")}
     assert needed <= files, needed - files
     tracked = subprocess.run(["git", "ls-files", *PARTS], capture_output=True, text=True, check=True, cwd=ROOT)
