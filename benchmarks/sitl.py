@@ -14,8 +14,8 @@ from tempfile import gettempdir
 
 from filelock import FileLock, Timeout
 
-from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
-from brakeline.messaging.byte_links import open_link
+from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, Wait
+from brakeline.messaging.byte_links import Link, open_link
 
 KINDS = ("ardupilot", "px4")
 INSTANCES = range(1, 10)  # PX4 has no more ports
@@ -75,10 +75,8 @@ def hall(system: int) -> str:
     return f"udpout:127.0.0.1:{19450 + system - 1}"
 
 
-def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
-    """Set parameters, and wait until the autopilot has saved them. Raises NoAutopilot if it refuses one."""
-    link = open_link(url)
-    client = AutopilotClient(link.send, system)
+def connected(link: Link, client: AutopilotClient) -> Wait:
+    """Wait for the autopilot behind a link. Returns the function with which its client waits for more."""
 
     def wait(condition: Callable[[], bool], seconds: float) -> bool:
         end = time.monotonic() + seconds
@@ -88,8 +86,17 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
             time.sleep(0.05)
         return condition()
 
+    client.identify(lambda condition, seconds: wait(condition, max(seconds, STARTS_IN)))
+    return wait
+
+
+def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
+    """Set parameters, and wait until the autopilot has saved them. Raises NoAutopilot if it refuses one."""
+    link = open_link(url)
+    client = AutopilotClient(link.send, system)
+
     try:
-        client.identify(lambda condition, seconds: wait(condition, max(seconds, STARTS_IN)))
+        wait = connected(link, client)
         for name, value in parameters.items():
             if not client.set_parameter(name, value, wait):
                 raise NoAutopilot(f"it does not take {name} = {value:g}: {'; '.join(client.texts[-2:])}")

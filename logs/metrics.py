@@ -26,7 +26,7 @@ from brakeline.logs.step_admission import StepAdmission
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.identity import identity_of
-from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic
+from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic, topic_of
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -111,7 +111,7 @@ class Metrics:
         self.late: list[pb.Step] = []
         self._now = 0  # ns, when the message in hand was received
         self._tube_stats = partial(TubeStats, self._robots)
-        self._roots = {topic.key.split("/", 1)[0] for topic in topics}
+        self._topics = set(topics)
         self._handlers: dict[type[Message], Callable[[Any], None]] = {
             pb.Step: self._step,
             pb.Exchange: self._exchange,
@@ -158,8 +158,7 @@ class Metrics:
         Args:
             topic: count only the messages of this topic.
         """
-        root = "" if topic is None else topic.key.partition("/")[0] + "/"
-        streams = {place: stream for place, stream in self.streams.items() if place[0].startswith(root)}
+        streams = {place: s for place, s in self.streams.items() if topic is None or topic_of(place[0]) is topic}
         return covered(self.spans(streams).values())
 
     def latency(self) -> dict[str, dict[str, QuantileSketch]]:
@@ -228,7 +227,7 @@ class Metrics:
         process.alive = not health.last
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
-            if count and key.split("/", 1)[0] in self._roots:
+            if count and topic_of(key) in self._topics:
                 place = key, health.header.run
                 stream = self.streams.get(place) or self._new_stream(place)
                 stream.published = max(stream.published, count)

@@ -21,6 +21,7 @@ RATIO = 1.01  # of the edges of a bin
 RESOLUTION = 0.005  # largest relative error of a percentile
 TINY = 1e-9  # a smaller absolute value counts as zero
 HUGE = 1e15  # a larger absolute value counts as not finite: its square could overflow the sum
+BAR = 1.25  # ratio of the edges of a bar in a chart, about
 BATCH = 1024  # values sorted into bins at once
 
 _PER_E = 1.0 / math.log(RATIO)  # bins per factor e
@@ -114,9 +115,9 @@ class QuantileSketch:
                 return min(max(_middle(place), self.low), self.high)
         raise ValueError("the sketch has no value")
 
-    def bars(self, ratio: float = 1.25) -> list[tuple[float, float, int]]:
-        """Return coarser bins (from, to, count) of the positive values, about `ratio` wide, also the empty ones."""
-        width = max(1, round(math.log(ratio) * _PER_E))
+    def bars(self) -> list[tuple[float, float, int]]:
+        """Return coarser bins (from, to, count) of the positive values, about `BAR` wide, also the empty ones."""
+        width = round(math.log(BAR) * _PER_E)
         counts: Counter[int] = Counter()
         for place, count in self.bins.items():
             if place > 0:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
@@ -30,16 +31,15 @@ from brakeline.logs.mcap_container import (
 )
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.run_clock import RunClock
-from brakeline.logs.segment import ABOUT, CLOCK, STEADY, being_written, name_of, number_of
+from brakeline.logs.segment import being_written, name_of, number_of
 from brakeline.messaging.bus.stated_names import check_names
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import check
-from brakeline.messaging.topics import TOPICS, Topic
+from brakeline.messaging.topics import TOPICS, topic_of
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 TYPES: dict[str, type[Message]] = {topic.message.DESCRIPTOR.full_name: topic.message for topic in TOPICS}
-ROOTS = {topic.key.split("/", 1)[0]: topic for topic in TOPICS}
 
 
 class Record(NamedTuple):
@@ -158,8 +158,6 @@ class Log:
                         self.cuts.append(replace(item, path=path, reason=reason))
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
-                        if item.name == ABOUT and item.metadata.get(CLOCK) == STEADY:
-                            self.clock.trust()
                         if item.name == "robots":
                             self.robots.describe(item.metadata)
                     elif isinstance(item, Attachment):
@@ -169,10 +167,9 @@ class Log:
 
     @staticmethod
     def _channel(key: str, schema: str) -> LogChannel:
-        kind, root = TYPES.get(schema), key.split("/", 1)[0]
-        topic = ROOTS.get(root)
+        kind, topic = TYPES.get(schema), topic_of(key)
         names = {} if topic is None else names_of(topic, key)
-        name = root if topic is None else topic.name
+        name = key.partition("/")[0] if topic is None else topic.name
         return LogChannel(name, key, None if kind is None else kind.FromString, names=names)
 
 
@@ -213,20 +210,6 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     return runs
 
 
-def count_of_topic(paths: Paths, topic: Topic) -> int | None:
-    """Return the number of messages of a topic; None if a file has no summary because its recorder was killed.
-
-    Raises:
-        LogError: a path has no log.
-    """
-    root, total = topic.key.split("/", 1)[0], 0
-    for path in find(paths):
-        if (counts := _in_summary(path)) is None:
-            return None
-        total += sum(messages for key, messages in counts.items() if key.split("/", 1)[0] == root)
-    return total
-
-
 def count_by_key(path: Path) -> Counter[str]:
     """Return the number of messages in a file at each key. A file without a summary is read from front to back.
 
@@ -234,29 +217,16 @@ def count_by_key(path: Path) -> Counter[str]:
         LogError: the file is no log.
         OSError: it cannot be read.
     """
-    if (counts := _in_summary(path)) is not None:
-        return counts
-    return Counter(channel.key for channel, *_ in Log((path,)).rows())
-
-
-def _in_summary(path: Path) -> Counter[str] | None:
-    """Return the number of messages at each key by the file's summary; None if it has none."""
-    with path.open("rb") as file:
-        if not has_whole_summary(file, path.stat().st_size):
-            return None
-        file.seek(0)
-        try:
+    with path.open("rb") as file, suppress(*BROKEN, KeyError):
+        if has_whole_summary(file, path.stat().st_size):
+            file.seek(0)
             summary = make_reader(file).get_summary()
-        except BROKEN:
-            return None
-    if summary is None or summary.statistics is None:
-        return None
-    counts: Counter[str] = Counter()
-    for number, messages in summary.statistics.channel_message_counts.items():
-        if (channel := summary.channels.get(number)) is None:
-            return None
-        counts[channel.topic] += messages
-    return counts
+            if summary is not None and summary.statistics is not None:
+                counts: Counter[str] = Counter()
+                for number, messages in summary.statistics.channel_message_counts.items():
+                    counts[summary.channels[number].topic] += messages
+                return counts
+    return Counter(channel.key for channel, *_ in Log((path,)).rows())
 
 
 def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:

@@ -14,6 +14,7 @@ import itertools
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ CONFIDENCE = 0.95
 POINTS = 60  # steps of a curve
 WINDOW = 0.1  # of the longest run: a curve's value is the rate over this many steps before
 LEVELS = np.linspace(0.0, 1.0, 101)  # of a performance profile
+MEAN = partial(np.mean, axis=-1)
 SCORES = ("goals", "collisions", "interventions", "reward")  # of the last episodes of a run
 CURVES: dict[str, tuple[str, str]] = {  # name: what is counted, over what
     "goals": ("goals", "episodes"),
@@ -62,11 +64,6 @@ def interquartile_mean(values: Array) -> Array:
     count = values.shape[-1]
     cut = int(0.25 * count)
     return np.asarray(np.sort(values, axis=-1)[..., cut : count - cut].mean(axis=-1))
-
-
-def mean(values: Array) -> Array:
-    """Return the mean of the values (..., n)."""
-    return np.asarray(values.mean(axis=-1))
 
 
 def compare_groups(runs: Sequence[GroupedRun]) -> Figures:
@@ -173,12 +170,12 @@ def aggregate(values: Array) -> Figures:
         "values": values.tolist(),
         "mean": float(values.mean()),
         "iqm": float(interquartile_mean(values.ravel())),
-        "mean_interval": _interval(values, mean),
+        "mean_interval": _interval(values, MEAN),
         "iqm_interval": _interval(values, interquartile_mean),
     }
 
 
-def _interval(values: Array, statistic: Callable[[Array], Array]) -> list[float] | None:
+def _interval(values: Array, statistic: Callable[[Array], Any]) -> list[float] | None:
     """Return the percentile bootstrap interval of a statistic over runs. A mean of shares stays within 0 and 1."""
     if values.shape[-1] < 2:
         return None
@@ -191,10 +188,9 @@ def _resampled(count: int, task: int = 0) -> NDArray[np.intp]:
     return np.random.default_rng(task).integers(count, size=(RESAMPLES, count))
 
 
-def _percentiles(drawn: Array) -> list[float]:
+def _percentiles(drawn: Array, axis: int | None = None) -> list[Any]:
     tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(drawn, (tail, 100.0 - tail))
-    return [float(low), float(high)]
+    return list(np.percentile(drawn, (tail, 100.0 - tail), axis=axis).tolist())
 
 
 def performance_profile(values: Array) -> Figures:
@@ -204,8 +200,7 @@ def performance_profile(values: Array) -> Figures:
     profile: Figures = {"level": LEVELS.tolist(), "share": above.mean(axis=(0, 1)).tolist() if values.size else []}
     if values.shape[1] > 1:
         drawn = np.mean([part[_resampled(len(part), task)].mean(axis=1) for task, part in enumerate(above)], axis=0)
-        tail = 50.0 * (1.0 - CONFIDENCE)
-        profile["low"], profile["high"] = np.percentile(drawn, (tail, 100.0 - tail), axis=0).tolist()
+        profile["low"], profile["high"] = _percentiles(drawn, axis=0)
     return profile
 
 
@@ -248,7 +243,7 @@ def _curves(runs: list[list[Figures]]) -> Figures:
 
 
 def _point(values: Array) -> Figures:
-    low, high = _interval(values, mean) or (None, None)
+    low, high = _interval(values, MEAN) or (None, None)
     return {"mean": float(values.mean()) if len(values) else None, "low": low, "high": high}
 
 

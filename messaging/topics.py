@@ -47,7 +47,6 @@ class Topic:
     publishers: tuple[str, ...]  # roles
     subscribers: tuple[str, ...]  # roles, in addition to `RECORDERS` for a recorded topic
     recorded: bool
-    answer: type[Message] | None = None  # to a query
     largest: int = 2**20  # bytes; larger messages are rejected
     own: bool = True  # False: `{source}` is an actor of a log, whose steps a feeder publishes
 
@@ -72,9 +71,8 @@ AHEAD = 1000  # steps beyond its limit in FLOW that an actor may publish: an ear
 BLOCK, DROP, QUERY = Delivery.BLOCK, Delivery.DROP, Delivery.QUERY
 # fmt: off
 DECIDE = Topic("decide", "safety/{robot}/decide/{source}", pb.RequestBatch, QUERY, None, ("actor", "client"),
-               ("safety",), False, pb.ReplyBatch)
-JOIN = Topic("join", "learner/{robot}/join/{source}", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False,
-             pb.JoinReply)
+               ("safety",), False)
+JOIN = Topic("join", "learner/{robot}/join/{source}", pb.Join, QUERY, None, ("actor", "feeder"), ("learner",), False)
 MODEL = Topic("model", "model/{robot}/{source}", pb.Model, BLOCK, None, ("certify",), ("safety",), True, largest=FILE)
 STEP = Topic("step", "step/{robot}/{source}", pb.Step, BLOCK, None, SIMULATORS, ("learner", "certify"), True)
 LOGGED = Topic("logged", "logged/{robot}/{source}", pb.Step, BLOCK, None, ("feeder",), ("learner",), False, own=False)
@@ -97,3 +95,10 @@ TOPICS: tuple[Topic, ...] = (
 )
 BUNDLED: tuple[Topic, ...] = (STEP, EPISODE, EXCHANGE, FRAMES)  # an actor publishes them under the name of each robot
 RECORDED: tuple[Topic, ...] = tuple(topic for topic in TOPICS if topic.recorded)
+
+_BY_ROOT = {topic.key.partition("/")[0]: topic for topic in TOPICS}
+
+
+def topic_of(key: str) -> Topic | None:
+    """Return the topic of a key without the prefix of the bus; None if there is none."""
+    return _BY_ROOT.get(key.partition("/")[0])

@@ -24,6 +24,11 @@ class MessageSink(Protocol):
         """Publish a message."""
 
 
+def frame_message(frame: CapturedFrame) -> pb.MavlinkFrame:
+    """Return the message of a frame that was sent or received just now."""
+    return pb.MavlinkFrame(wall_time=steady_time_ns(), outgoing=frame.outgoing, raw=frame.raw)
+
+
 class FrameRecorder:
     """Collects the frames of one vehicle from any thread."""
 
@@ -33,7 +38,7 @@ class FrameRecorder:
 
     def record(self, frame: CapturedFrame) -> None:
         """Collect a frame that was sent or received just now."""
-        self.add(pb.MavlinkFrame(wall_time=steady_time_ns(), outgoing=frame.outgoing, raw=frame.raw))
+        self.add(frame_message(frame))
 
     def add(self, frame: pb.MavlinkFrame) -> None:
         """Collect a frame that another process sent or received."""

@@ -22,7 +22,7 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from brakeline.actors.mavlink.frame_log import CapturedFrame
+from brakeline.actors.mavlink.frame_recorder import frame_message
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
@@ -40,7 +40,6 @@ from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.messaging.steady_clock import steady_time_ns
 from brakeline.messaging.stop_signals import stop_on_signals
 
 log = logging.getLogger("brakeline.flight")
@@ -145,7 +144,7 @@ class VehicleServer:
         self._vehicle = MavlinkVehicle(
             request.robot,
             request.flight,
-            tap=self._store_frame,
+            tap=lambda frame: self._frames.append(frame_message(frame)),
             rejected=self._rejected,
             stop=lambda: stop.is_set() or actor.poll(),
             mavlink_truth=MavlinkGroundTruth(lambda position: float(shapes.distance(position).min()) - footprint),
@@ -222,9 +221,6 @@ class VehicleServer:
             self._rejected.reject("vehicle command", error)
             return pb.CommitReply(number=command.number, error=error_message(error))
         return pb.CommitReply(number=command.number, in_time=in_time)
-
-    def _store_frame(self, frame: CapturedFrame) -> None:
-        self._frames.append(pb.MavlinkFrame(wall_time=steady_time_ns(), outgoing=frame.outgoing, raw=frame.raw))
 
     def _send_updates(self) -> None:
         """Send each period as it begins. What arrives while there is no actor goes to the next one."""

@@ -41,15 +41,15 @@ class ReplayCommand:
     def run(self) -> int:
         """Replay the logs and print the comparison. Returns the exit status: 0, or DIFFERENT."""
         from brakeline.deploy.run.replay_run import replay
-        from brakeline.logs.reader import count_of_topic
-        from brakeline.messaging.topics import EXCHANGE
+        from brakeline.logs.reader import count_by_key, find
 
         values = {"certificate": self.certificate, "data": self.data and str(self.data), "margin": self.margin}
         changes = {name: value for name, value in values.items() if value is not None}
         if self.certificate or self.data:
             changes["mode"] = self.mode
         replacement = self._replacement() if changes else None
-        total = count_of_topic(list(self.logs), EXCHANGE)
+        counts = (count_by_key(path) for path in find(self.logs))
+        total = sum(n for count in counts for key, n in count.items() if key.startswith("exchange/"))
         # The warnings of the filter were about the robots of that time.
         with under_way("deciding each request again", total) as advance, errors_only("brakeline.safety"):
             result = replay(list(self.logs), replacement, advance)

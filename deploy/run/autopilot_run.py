@@ -11,11 +11,10 @@ import numpy as np
 
 from brakeline.deploy.quadrotor_vehicles import flight_arena
 from brakeline.messaging.byte_links import open_link
-from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
-from brakeline.sim.autopilot.autopilot_server import ServerStats, TruthSender, serve
+from brakeline.sim.autopilot.autopilot_server import ServerStats, TruthSender, WallClock, serve
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise

@@ -15,10 +15,9 @@ import numpy as np
 
 from brakeline.deploy.run.autopilot_run import PAD, arena_or_field, open_truth
 from brakeline.errors import AutopilotGone
-from brakeline.messaging.process_clock import WallClock
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
-from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender
+from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender, WallClock
 from brakeline.sim.autopilot.hil_link import HilLink
 from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
 from brakeline.sim.autopilot.px4_process import Px4Process

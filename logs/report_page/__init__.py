@@ -29,7 +29,6 @@ from brakeline.messaging import stated_share
 
 OWN_STYLES = ("report.css",)
 PAGE = "report.html.j2"
-PIECES = ("headline.html.j2", "details.html.j2", "groups.html.j2")
 OWN_SCRIPTS = ("save.js", "groups.js", "learning.js", "charts.js", "episodes.js", "main.js")
 
 RATES = (  # name, unit, description
@@ -124,13 +123,13 @@ def hashed(text: str) -> str:
     return f"sha256-{b64encode(sha256(text.encode()).digest()).decode()}"
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def number(value: float | None) -> str:
     """Format a number with 3 significant digits and separated thousands; a dash for None and NaN."""
     if value is None or not math.isfinite(value):
         return "–"
     if isinstance(value, int) or (value == int(value) and abs(value) >= 1000):
         return f"{int(value):,}".replace(",", "\u202f")
-    return f"{value:.{digits}g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", "\u202f")
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", "\u202f")
 
 
 def percent(share: float | None) -> str:
@@ -163,8 +162,3 @@ def raw(value: Any) -> str:
 
 def _text(name: str) -> str:
     return files(__name__).joinpath(name).read_text(encoding="utf-8")
-
-
-def names() -> Iterable[str]:
-    """Return the names of all files of the page."""
-    return (PAGE, *PIECES, *OWN_STYLES, *OWN_SCRIPTS)

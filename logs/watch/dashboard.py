@@ -12,7 +12,7 @@ from brakeline.errors import Implausible
 from brakeline.logs.arena_view import arena_view
 from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
-from brakeline.logs.episode_view import LETTERS
+from brakeline.logs.episode_view import letter
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
@@ -131,7 +131,7 @@ class RobotPanel:
             "first": steps[0].step if steps else 0,
             "path": path,
             "heading": None if robot.heading is None else [state[robot.heading] for state in states],
-            "kinds": "".join(LETTERS.get(kind_of(step), "n") for step in steps),
+            "kinds": "".join(map(letter, steps)),
             "clearance": [step.clearance for step in steps],
         }
 

@@ -18,7 +18,7 @@ from brakeline.messaging.bus.publisher import Publisher
 from brakeline.messaging.bus.subscription import Sample
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.rejected_messages import RejectedMessages
-from brakeline.messaging.topics import BUNDLE, BUNDLED, Topic
+from brakeline.messaging.topics import BUNDLE, BUNDLED, Topic, topic_of
 
 HOLD = 0.2  # longest time for which a message waits [s]
 MOST_BUNDLED = 16  # messages of a bundle: half of what a learner permits an actor in advance, with the decisions
@@ -26,8 +26,6 @@ LARGE = 2**18  # bytes from which a bundle leaves at once
 MOST_ROUTES = 4096  # that a receiver remembers
 
 Deliver = Callable[[str, bytes, int], None]  # takes a key, a payload and the time of receipt [ns]
-
-_ROOTS = {topic.key.split("/", 1)[0]: topic for topic in BUNDLED}
 
 
 class BundlePublisher:
@@ -99,9 +97,9 @@ class Unbundler:
 
     def _route(self, bundle: str, key: str) -> list[Deliver]:
         """Return who wants the messages at a key in the bundles at another. Raises Malformed."""
-        sender, topic = names_of(BUNDLE, bundle), _ROOTS.get(key.split("/", 1)[0])
+        sender, topic = names_of(BUNDLE, bundle), topic_of(key)
         names = {} if topic is None else names_of(topic, key)
-        if topic is None or key != topic.at(**names) or names["robot"] != sender["robot"]:
+        if topic not in BUNDLED or key != topic.at(**names) or names["robot"] != sender["robot"]:
             raise Malformed(f"a bundle holds a message at {key[:200]!r}")
         if not speaks_for(sender["source"], names["source"]):
             raise Malformed(f"a bundle holds a message of {names['source'][:100]!r}")

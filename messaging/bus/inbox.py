@@ -48,13 +48,13 @@ class Inbox:
                 self._count(identity, size)
                 self._waiting.append((sample, size, identity))
 
-    def oldest(self, size: int = BATCH) -> list[Sample]:
-        """Return the oldest samples, about `size` bytes; they stay in the inbox until `remove`."""
+    def oldest(self) -> list[Sample]:
+        """Return the oldest samples, about `BATCH` bytes; they stay in the inbox until `remove`."""
         batch: list[Sample] = []
         total = 0
         with self._lock:
             for sample, one, _ in self._waiting:
-                if batch and total + one > size:
+                if batch and total + one > BATCH:
                     break
                 batch.append(sample)
                 total += one

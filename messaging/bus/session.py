@@ -190,11 +190,10 @@ class Bus:
         names = {"source": self.source} | names
         return self._query_client.ask(self._full(exact_key(topic, names)), payload, timeout)
 
-    def living(self, timeout: float = 1.0) -> frozenset[str]:
+    def living(self) -> frozenset[str]:
         """Return the names of the processes that are alive now, with this one."""
-        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(
-            self._full(ALIVE.format(source="*")), timeout=timeout
-        )
+        key = self._full(ALIVE.format(source="*"))
+        replies: Iterable[zenoh.Reply] = self._telemetry.liveliness().get(key, timeout=1.0)
         names = (str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None)
         return frozenset(name for name in names if NAME.fullmatch(name))
 

@@ -11,10 +11,9 @@ from google.protobuf.descriptor import Descriptor
 from brakeline.errors import Implausible
 from brakeline.messaging.bus.identity import role_of, speaks_for
 from brakeline.messaging.bus.topic_keys import names_of
-from brakeline.messaging.topics import TOPICS
+from brakeline.messaging.topics import topic_of
 
 SOURCES = ("actor", "process")  # fields with the name of a process, or of a robot that it drives
-_ROOTS = {topic.key.split("/", 1)[0]: topic for topic in TOPICS}
 
 
 def check_names(names: Mapping[str, str], message: Any) -> None:
@@ -45,7 +44,7 @@ def _publishes(source: str, key: str) -> bool:
 
     Keys without a source, and those of logged steps, which name the actor of the log, are a matter of the role.
     """
-    topic = _ROOTS.get(key.split("/", 1)[0])
+    topic = topic_of(key)
     if topic is None:
         return False
     stated = names_of(topic, key).get("source")

@@ -15,17 +15,32 @@ from __future__ import annotations
 import json
 import math
 import socket
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from brakeline.messaging.byte_links import Link
-from brakeline.messaging.process_clock import WallClock
 from brakeline.sim.autopilot.endpoint import TICK, Autopilot
 from brakeline.sim.quadrotor import Quadrotor
 
 TRUTH_RATE = 25.0  # Hz
 PATIENCE = 0.25  # s behind the clock, from which the server stops catching up
+
+
+class WallClock:
+    """Real time in seconds since the clock was created, independent of changes to the system's date."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic()
+
+    def now(self) -> float:
+        """Return the time [s]."""
+        return time.monotonic() - self._start
+
+    def sleep_until(self, moment: float) -> None:
+        """Return when `now()` has reached `moment` [s]; at once if it has passed."""
+        time.sleep(max(0.0, moment - self.now()))
 
 
 class TruthSender:

@@ -16,9 +16,8 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.process_clock import WallClock
 from brakeline.safety.model.model_set import ModelConfig
-from brakeline.sim.autopilot import autopilot_server
+from brakeline.sim.autopilot.autopilot_server import TruthSender, WallClock, serve
 from brakeline.sim.autopilot.endpoint import Autopilot
 from tests.robots import GROUND
 
@@ -29,10 +28,10 @@ def no_answer(requests: Sequence[pb.Request]) -> NoReturn:
 
 
 @contextmanager
-def served(autopilot: Autopilot, truth: autopilot_server.TruthSender | None = None) -> Iterator[str]:
+def served(autopilot: Autopilot, truth: TruthSender | None = None) -> Iterator[str]:
     """Run an autopilot in a thread. Yields the URL that reaches it."""
     link, stop = open_link("udpin:127.0.0.1:0"), threading.Event()
-    thread = threading.Thread(target=autopilot_server.serve, args=([autopilot], link, WallClock(), stop.is_set, truth))
+    thread = threading.Thread(target=serve, args=([autopilot], link, WallClock(), stop.is_set, truth))
     thread.start()
     try:
         yield f"udpout:127.0.0.1:{link.port}"  # type: ignore[union-attr]

@@ -13,25 +13,20 @@ from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.errors import BadInput, CommandRefused, NoAutopilot
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
-from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from brakeline.sim.autopilot.parameters import AT_ONCE
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
-from tests.arenas import staged_arena
 from tests.robots import QUADROTOR
+from tests.sim.station import field
 
 RULES = ("px4", "ardupilot")
 
 
-def arena(*obstacles: Obstacle) -> Arena:
-    return staged_arena(*obstacles, start=(0.0, 0.0, 10.0), goal=(9.0, 9.0, 9.0), half_width=500.0, height=500.0)
-
-
 def quadrotor(*obstacles: Obstacle, floor: float | None = None, scale: float = 1.0) -> Quadrotor:
-    return Quadrotor(arena(*obstacles), np.random.default_rng(0), QuadrotorNoise(scale=scale), floor=floor)
+    return Quadrotor(field(*obstacles), np.random.default_rng(0), QuadrotorNoise(scale=scale), floor=floor)
 
 
 def embedded(rules: str, *obstacles: Obstacle) -> Autopilot:

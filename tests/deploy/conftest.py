@@ -1,5 +1,6 @@
 """A short log, some minutes of data, and the command line and the readers of foreign logs within this process."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +32,19 @@ def command(capsys):
             status = end.code
         printed = capsys.readouterr()
         return status, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture
+def figures(command):
+    """The one JSON object that a command prints, and nothing else."""
+
+    def run(*words):
+        status, out, err = command(*words, "--json")
+        assert status == 0, err
+        assert out.endswith("\n") and out.count("\n") == 1
+        return json.loads(out)
 
     return run
 

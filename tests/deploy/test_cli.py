@@ -46,19 +46,6 @@ STATED = {
 }
 
 
-@pytest.fixture
-def figures(command):
-    """The one JSON object that a command prints, and nothing else."""
-
-    def run(*words):
-        status, out, err = command(*words, "--json")
-        assert status == 0, err
-        assert out.endswith("\n") and out.count("\n") == 1
-        return json.loads(out)
-
-    return run
-
-
 @pytest.mark.parametrize(
     "words, said",
     [
@@ -179,10 +166,12 @@ def test_certify_refuses_too_little_data_with_status_1(command, figures, tmp_pat
     assert "encoder ticks" not in command(*words)[1], "the conditions need --verbose"
 
 
-def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(command, few_data, monkeypatch):
+def test_certify_states_each_error_bound_in_json_in_words_and_with_its_conditions(
+    command, figures, few_data, monkeypatch
+):
     monkeypatch.setattr(progress, "FIRST", 0.01)
     words = ("certify", "--data", few_data, "--mode", "direct")
-    bounds = json.loads(command(*words, "--json")[1])
+    bounds = figures(*words)
     for name in ("residual", "set-membership", "matrix-zonotope"):
         assert bounds[name].keys() >= STATED
         assert bounds[name]["violations"] <= bounds[name]["windows"] and 0 < bounds[name]["bound_step"] < 0.1

@@ -1,7 +1,6 @@
 """Test the formats that a log is exported to, with the programs that read them."""
 
 import csv
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from brakeline.deploy import cli
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
@@ -25,14 +23,9 @@ def messages(path: Path) -> list[tuple[str, Any, bytes]]:
         return [(channel.topic, message, raw.data) for _, channel, raw, message in reader.iter_decoded_messages()]
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
-    assert cli.main(["export", *map(str, words), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_has_every_step_with_every_field(log, tmp_path, figures) -> None:
     steps = [message for topic, message, _ in messages(log) if topic.startswith("step/")]
-    assert run(capsys, log, "--csv", tmp_path / "a" / "steps.csv")["csv"]["steps"] == len(steps) == STEPS
+    assert figures("export", log, "--csv", tmp_path / "a" / "steps.csv")["csv"]["steps"] == len(steps) == STEPS
     with (tmp_path / "a" / "steps.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == STEPS
@@ -50,13 +43,13 @@ def test_csv_has_every_step_with_every_field(log: Path, tmp_path: Path, capsys: 
     assert missing == {"path"}
 
 
-def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, capsys) -> None:
+def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, command, figures) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    figures = run(capsys, log, "--minari", "brakeline/ground-v0")["minari"]
+    exported = figures("export", log, "--minari", "brakeline/ground-v0")["minari"]
     steps = [message for topic, message, _ in messages(log) if topic.startswith("step/")]
     numbers = Counter(step.episode for step in steps)
-    assert (figures["steps"], figures["episodes"]) == (STEPS, len(numbers))
+    assert (exported["steps"], exported["episodes"]) == (STEPS, len(numbers))
     data = minari.load_dataset("brakeline/ground-v0")
     assert data.action_space.shape == (2,) and data.action_space.low.tolist() == pytest.approx([0.0, -0.5])
     for episode, number in zip(data.iterate_episodes(), sorted(numbers), strict=True):
@@ -70,13 +63,13 @@ def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, capsys) -> None:
         assert episode.truncations[-1] == (not mine[-1].terminated), "also where the log ends within an episode"
         assert np.array_equal(episode.infos["proposed"], np.array([s.proposed for s in mine], np.float32))
         assert episode.infos["decision"].tolist() == [s.decision for s in mine]
-    assert cli.main(["export", str(log), "--minari", "brakeline/ground-v0"]) == 1
-    assert "exists already" in capsys.readouterr().err
+    status, _, err = command("export", log, "--minari", "brakeline/ground-v0")
+    assert status == 1 and "exists already" in err
 
 
-def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, capsys) -> None:
+def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, command, figures) -> None:
     out = tmp_path / "full.mcap"
-    count = run(capsys, log, "--foxglove", out)["foxglove"]["messages"]
+    count = figures("export", log, "--foxglove", out)["foxglove"]["messages"]
     before, after = messages(log), messages(out)
     assert count == len(after)
     ours = [(topic, payload) for topic, _, payload in after if not topic.startswith("foxglove/")]
@@ -84,16 +77,17 @@ def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, capsys) -
     drawn = Counter(topic.split("/")[1] for topic, _, _ in after if topic.startswith("foxglove/"))
     assert drawn["decision"] == drawn["lidar"] == STEPS
     again = tmp_path / "again.mcap"
-    assert run(capsys, out, "--foxglove", again)["foxglove"]["messages"] == count, "old pictures are not kept"
-    assert cli.main(["replay", str(out)]) == 0, "the model sets are in it too"
-    assert cli.main(["export", str(log), "--foxglove", str(out)]) == 1
+    assert figures("export", out, "--foxglove", again)["foxglove"]["messages"] == count, "old pictures are not kept"
+    assert command("replay", out)[0] == 0, "the model sets are in it too"
+    assert command("export", log, "--foxglove", out)[0] == 1
 
 
-def test_an_impossible_export_fails_with_a_reason(log, tmp_path, capsys) -> None:
-    assert cli.main(["export", str(log)]) == 1
-    assert "--csv, --minari, --foxglove" in capsys.readouterr().err
-    assert cli.main(["export", str(tmp_path), "--csv", str(tmp_path / "a.csv")]) == 1
-    assert "no log" in capsys.readouterr().err
-    assert cli.main(["export", str(log), "--csv", str(tmp_path / "q.csv"), "--robot", "quadrotor"]) == 1
-    assert "but steps of ground: give --robot NAME" in capsys.readouterr().err
+def test_an_impossible_export_fails_with_a_reason(log, tmp_path, command) -> None:
+    for words, said in (
+        ((log,), "--csv, --minari, --foxglove"),
+        ((tmp_path, "--csv", tmp_path / "a.csv"), "no log"),
+        ((log, "--csv", tmp_path / "q.csv", "--robot", "quadrotor"), "but steps of ground: give --robot NAME"),
+    ):
+        status, _, err = command("export", *words)
+        assert status == 1 and said in err
     assert not list(tmp_path.glob("q.csv*")), "no file with a headline alone"

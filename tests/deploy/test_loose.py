@@ -62,15 +62,14 @@ def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
 
 
 def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(
-    few, tmp_path, monkeypatch, command
+    few, tmp_path, monkeypatch, command, figures
 ):
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     data = Dataset.load(few / "ground" / "record.safetensors")
     replace(data, trajectories=data.trajectories[:10]).save(tmp_path / "fewer.safetensors")
     words = ("certify", "ground-late", "--data", tmp_path / "fewer.safetensors", "--accept-bound", "0.5")
     strict, lenient = (
-        json.loads(command(*words, "--use", "--outside", outside, "--json")[1])["residual"]["one-step"]
-        for outside in ("0.001", "0.1")
+        figures(*words, "--use", "--outside", outside)["residual"]["one-step"] for outside in ("0.001", "0.1")
     )
     assert ModelSet.load(tmp_path / "ground-late" / "residual-one-step.safetensors").robot.name == "ground-late"
     assert all(lenient[name] < strict[name] for name in ("inflation", "half_width_rest"))

@@ -309,16 +309,8 @@ def judged(url: str, system: int) -> Iterator[Judge]:
     client = AutopilotClient(link.send, system)
     judge = Judge(client, link, MavlinkGroundTruth(lambda at: float(MAP.shapes.distance(at).min()) - robot.footprint))
 
-    def wait(condition: Callable[[], bool], seconds: float) -> bool:
-        end = time.monotonic() + seconds
-        while not condition() and time.monotonic() < end:
-            client.heartbeat()
-            client.feed(link.receive())
-            time.sleep(0.05)
-        return condition()
-
     try:
-        client.identify(lambda condition, seconds: wait(condition, max(seconds, sitl.STARTS_IN)))
+        wait = sitl.connected(link, client)
         wait(lambda: False, 60.0)  # until its estimator is ready
         for what in (MOTION, TRUTH):
             client.choose(what, TRUTH_INTERVAL, wait)

@@ -124,7 +124,7 @@ def test_a_wheel_has_everything(wheel):
     robots = ("ground.toml", "quadrotor.task.toml", "template.txt", "ground.model.safetensors")
     needed = {"py.typed", "policies/ground/trained.safetensors", *(f"robots/{name}" for name in robots)}
     needed |= {"sim/ground.xml", "sim/quadrotor.xml", "deploy/experiments/paper.json", "messaging/brakeline.proto"}
-    needed |= {"logs/report_page/report.html.j2", "logs/brakeline.foxglove-layout.json"}
+    needed |= {"logs/report_page/report.html.j2", "logs/report_page/main.js", "logs/brakeline.foxglove-layout.json"}
     needed |= {f"logs/viewer/{name}" for name in (*STYLES, *SCRIPTS, "three.LICENSE")}
     assert needed <= files, needed - files
     tracked = subprocess.run(["git", "ls-files", *PARTS], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -165,12 +165,6 @@ sys.meta_path.insert(0, NotInstalled())
 """
 
 
-def light(code: str) -> subprocess.CompletedProcess[str]:
-    """Run code in an interpreter that has no extra."""
-    words = [sys.executable, "-c", BLOCKER + code]
-    return subprocess.run(words, check=False, capture_output=True, text=True, cwd=ROOT)
-
-
 def test_every_public_name_is_there_and_the_service_and_its_questions_need_no_extra():
     code = """
 import brakeline
@@ -185,12 +179,12 @@ for command in ("safety", "query", "status", "router", "keys"):
     assert not code, command
 print("all")
 """
-    done = light(code)
-    assert done.stdout.endswith("all\n"), done.stderr
+    assert printed(BLOCKER + code).endswith("all")
 
 
 def test_a_missing_extra_is_named_with_its_command():
-    done = light("from brakeline.deploy.cli import main\nsys.exit(main(['collect', 'ground']))")
+    code = BLOCKER + "from brakeline.deploy.cli import main\nsys.exit(main(['collect', 'ground']))"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert re.search(r"pip install .brakeline\[(sim|logs)\]", done.stderr)
 

@@ -42,63 +42,16 @@ from brakeline.logs.reader import open_log
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from tests.deploy.data.porter import porter
 from tests.fuzz.log_seeds import SEEDS, seed
+from tests.fuzz.mutations import mutated
 from tests.robots import GROUND
 
 HANG = 10.0  # s for one file
 BATCH = 20_000  # files of one worker
 COUNTS = ("next", "read", "refused", "limited", "tracebacks", "hangs", "peak_mib")
 NEXT, READ, REFUSED, LIMITED, TRACEBACKS, HANGS, PEAK = range(len(COUNTS))
-NUMBERS = (
-    b"nan",
-    b"inf",
-    b"-1e308",
-    b"1e400",
-    b"-0",
-    b"9" * 30,
-    b"",
-    b"\0",
-    b"\xff\xfe",
-    b",,,",
-    b"{}",
-    b"[[",
-    b'"',
-    b"\n",
-)
 T = TypeVar("T")
 ROBOT = porter()
 TEMPLATE = (ROBOTS_FOLDER / "template.txt").read_text()
-
-
-def mutated(data: bytes, random: Random) -> bytes:
-    """Return the bytes with one to four mutations."""
-    out = bytearray(data)
-    for _ in range(random.randrange(1, 5)):
-        if not out:
-            break
-        at, what = random.randrange(len(out)), random.randrange(9)
-        end = min(len(out), at + random.choice((1, 2, 4, 8, 40, 400)))
-        if what == 0:
-            out[at] ^= 1 << random.randrange(8)
-        elif what == 1:
-            out[at] = random.choice((0, 1, 127, 128, 254, 255))
-        elif what == 2:
-            out[at:end] = random.randbytes(end - at)
-        elif what == 3:
-            del out[at:end]
-        elif what == 4:
-            out[at:at] = out[at:end]
-        elif what == 5:
-            del out[at:]
-        elif what == 6:
-            size = random.choice((2, 4, 8))
-            value = random.choice((0, 1, 2**7, 2**15, 2**31, 2**63, 2**64 - 1)) + random.randrange(-1, 2)
-            out[at : at + size] = (value % 2 ** (8 * size)).to_bytes(size, "little")
-        elif what == 7:
-            out[at:end] = random.choice(NUMBERS)
-        else:
-            other = random.randrange(len(out))
-            out[at:end] = out[other : other + end - at]
-    return bytes(out)
 
 
 class Refused(Exception):

@@ -13,6 +13,7 @@ from google.protobuf.message import Message
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.topics import TOPICS, Topic
+from tests.fuzz.mutations import mutated
 
 ACTORS = 60  # number of names; so few that tables by name are soon full
 CORPUS = 200  # valid messages of each topic, which the mutated ones come from
@@ -47,20 +48,7 @@ class MessageFuzzer:
         if kind < 0.4:
             corpus[at] = self._altered(topic, corpus[at])
             return corpus[at]
-        data = bytearray(corpus[at])
-        for _ in range(random.randrange(3)):
-            if not data:
-                break
-            place, what = random.randrange(len(data)), random.randrange(4)
-            if what == 0:
-                data[place] ^= 1 << random.randrange(8)
-            elif what == 1:
-                data[place] = random.choice((0, 127, 128, 255))
-            elif what == 2:
-                del data[place:]
-            else:
-                data += data[place : place + 100]
-        return bytes(data[:4096])
+        return (mutated(corpus[at], random) if kind < 0.8 else corpus[at])[:4096]
 
     def _altered(self, topic: Topic, payload: bytes) -> bytes:
         """Return a valid message with some fields drawn anew."""

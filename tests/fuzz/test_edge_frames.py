@@ -19,9 +19,9 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.ros2 import cdr_messages as cdr
 from brakeline.messaging.topics import FRAMES
+from tests.fuzz.mutations import WORDS, mutated
 
 OWN = ("COMMAND_ACK", "STATUSTEXT", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "SYS_STATUS", "FENCE_STATUS", "TIMESYNC")
-WORDS = (b"\x00\x00\x80\x7f", b"\x00\x00\xc0\x7f", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80")
 
 
 def examples() -> dict[str, object]:
@@ -53,30 +53,12 @@ def examples() -> dict[str, object]:
     }
 
 
-def mutated(random: Random, payload: bytes) -> bytes:
-    """Turn bits, set words to extremes, cut the end off, or repeat it."""
-    data = bytearray(payload)
-    for _ in range(random.randint(1, 4)):
-        place = random.randrange(len(data))
-        match random.randrange(4):
-            case 0:
-                data[place] ^= 1 << random.randrange(8)
-            case 1:
-                place -= place % 4
-                data[place : place + 4] = random.choice(WORDS)
-            case 2:
-                data = data[: max(place, 1)]
-            case 3:
-                data += data[place:]
-    return bytes(data)
-
-
 @pytest.mark.parametrize("name", examples())
 def test_a_ros_message_is_read_or_malformed(name: str) -> None:
     random, message = Random(name), examples()[name]
     whole, read = cdr.encode(message), 0
     for _ in range(300):
-        payload = random.choice((mutated(random, whole), random.randbytes(random.randrange(200))))
+        payload = random.choice((mutated(whole, random), random.randbytes(random.randrange(200))))
         with suppress(Malformed):
             read += isinstance(cdr.decode(type(message), payload), type(message))
     assert read > 0, "some are another message of this type"
@@ -104,7 +86,7 @@ def test_whatever_an_autopilot_sends_the_decoder_goes_on() -> None:
             size = mavlink.mavlink_map[numbers[name]].unpacker.size
             payload = random.choice((random.randbytes(size), random.choice(WORDS) * (size // 4 + 1)))[:size]
             raw = frame(random, numbers[name], payload)
-            frames += [raw, mutated(random, raw)]
+            frames += [raw, mutated(raw, random)]
     for raw in frames:
         decoder.feed(raw)
         captured = decode_frame(raw, outgoing=False)

@@ -6,8 +6,9 @@ from random import Random
 
 import pytest
 
-from tests.fuzz.log_fuzz import LIMITED, READ, REFUSED, mutated, outcome
+from tests.fuzz.log_fuzz import LIMITED, READ, REFUSED, outcome
 from tests.fuzz.log_seeds import SEEDS, seed
+from tests.fuzz.mutations import mutated
 
 FILES = 12  # of each format
 

@@ -15,13 +15,13 @@ import brakeline
 from brakeline import ModelSet
 from brakeline.deploy.cli import parse
 from brakeline.deploy.experiments.compared_methods import METHODS
+from tests.laws.test_names import PARTS
 
 pytestmark = pytest.mark.fast
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
-PARTS = ("actors", "brakeline", "deploy", "learner", "logs", "messaging", "safety", "sim")
 
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 CODE = re.compile(r"`([^`\n]+)`")

@@ -12,6 +12,7 @@ from brakeline.errors import CheckpointError
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint_state import PartState
 from tests.faults.failing_calls import Died, failing, full
+from tests.fuzz.mutations import flipped
 
 NAMES = ("big", "small")
 
@@ -80,10 +81,6 @@ def test_damaged_and_missing_files_are_named(tmp_path, file, damage, part):
         path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(checkpoint.DamagedPart, match=f"part '{part}"):
         checkpoint.load(tmp_path, (*NAMES, "other"))
-
-
-def flipped(data: bytes, place: int, bit: int) -> bytes:
-    return data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :]
 
 
 @pytest.mark.parametrize("file", ["manifest.json", "manifest.sha256", "small.safetensors"])

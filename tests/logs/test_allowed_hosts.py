@@ -1,6 +1,5 @@
 """Foreign web pages cannot read a running system, whatever host name they use."""
 
-import http.client
 import json
 import re
 import socket
@@ -14,33 +13,19 @@ from websockets.sync.client import connect
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.foxglove_server import FoxgloveServer
 from brakeline.logs.watch.live_page_server import FILES, LivePageServer
+from tests.http_client import asked, port_of
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[LivePageServer]:
+def port() -> Iterator[int]:
+    """The port of a live page."""
     with LivePageServer(Dashboard().view) as server:
-        yield server
-
-
-def asked(server: LivePageServer, path: str, **headers: str) -> tuple[int, bytes]:
-    """Request a path and return status and body. The default `Host` is the server's; an empty header is not sent."""
-    port = int(server.url.rsplit(":", 1)[1].strip("/"))
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
-    try:
-        connection.putrequest("GET", path, skip_host=True)
-        for name, value in ({"Host": f"127.0.0.1:{port}"} | headers).items():
-            if value:
-                connection.putheader(name, value.format(port=port))
-        connection.endheaders()
-        answer = connection.getresponse()
-        return answer.status, answer.read()
-    finally:
-        connection.close()
+        yield port_of(server.url)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "192.168.1.7:{port}"])
-def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> None:
-    status, body = asked(server, "/view.json", Host=host, Origin=f"http://{host}")
+def test_the_live_page_itself_is_allowed(port: int, host: str) -> None:
+    status, body = asked(port, "/view.json", Host=host, Origin=f"http://{host}")
     assert status == 200 and json.loads(body)["robots"] == []
 
 
@@ -53,16 +38,16 @@ def test_the_live_page_itself_is_allowed(server: LivePageServer, host: str) -> N
     ],
     ids=str,
 )
-def test_a_foreign_page_is_rejected(server: LivePageServer, headers: dict[str, str]) -> None:
+def test_a_foreign_page_is_rejected(port: int, headers: dict[str, str]) -> None:
     for path in ("/", "/view.json", "/events", "/page.js", "/viewer.js", "/report.html"):
-        status, body = asked(server, path, **headers)
+        status, body = asked(port, path, **headers)
         assert status == 403 and b"robots" not in body, path
 
 
-def test_the_live_page_has_every_script_that_it_names(server: LivePageServer) -> None:
-    names = re.findall(r'(?:src|href)="(/[^"]+)"', asked(server, "/")[1].decode())
+def test_the_live_page_has_every_script_that_it_names(port: int) -> None:
+    names = re.findall(r'(?:src|href)="(/[^"]+)"', asked(port, "/")[1].decode())
     assert set(names) == set(FILES) - {"/"} | {"/report.html"}
-    assert all(asked(server, name)[0] == 200 for name in FILES)
+    assert all(asked(port, name)[0] == 200 for name in FILES)
 
 
 @pytest.fixture(scope="module")

@@ -8,30 +8,27 @@ import pytest
 from brakeline.errors import LogError
 from brakeline.logs.mcap_container import MAGIC
 from brakeline.logs.reader import count_by_key, open_log
-from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
+from tests.fuzz.mutations import flipped
+from tests.logs.sample_log import written
 
 KEY = "step/ground/a"
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    log = open_segment(tmp_path / "run.mcap", {"run": {"seed": "7"}}, {"model/ground/x": bytes(100)})
-    for number in range(30):
-        step = pb.Step(actor="a", step=number).SerializeToString()
-        log.save([Entry(KEY, pb.Step, step, 10**18 + number, 10**18 + number, number)])
-    log.finish()
-    return log.path
-
-
-def flipped(data: bytes, place: int, bit: int) -> bytes:
-    return data[:place] + bytes([data[place] ^ 1 << bit]) + data[place + 1 :]
+    steps = ((KEY, pb.Step(actor="a", step=number), 10**18 + number) for number in range(30))
+    return written(tmp_path / "run.mcap", steps, {"run": {"seed": "7"}}, {"model/ground/x": bytes(100)})
 
 
 def test_each_flipped_bit_is_named(path: Path) -> None:
     log = open_log(path)
     assert len(list(log)) == 30 and log.cuts == [], "whole, there is no damage"
     whole, random = path.read_bytes(), Random(0)
+    chunk = [at for at in range(len(whole)) if whole.startswith(b"zstd", at)][5]
+    path.write_bytes(flipped(whole, chunk + 40, 3))
+    log = open_log(path)
+    assert len(list(log)) == log.segments[0].messages == 29 and log.cuts[0].lost > 0, "only that chunk is lost"
     places = [*(random.randrange(len(whole)) for _ in range(150)), whole.index(b"seed"), len(whole) - 1]
     for place in places:
         path.write_bytes(flipped(whole, place, random.randrange(8)))

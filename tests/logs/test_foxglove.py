@@ -50,11 +50,11 @@ def step(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0", robot: str
     return pb.Step(robot=robot, actor=actor, step=number, decision=kind, **(about | more))
 
 
-def exchange(number: int, kind: int = pb.ALLOWED, actor: str = "actor-0") -> pb.Exchange:
+def exchange(number: int, kind: int = pb.ALLOWED) -> pb.Exchange:
     decision = pb.Decision(
         kind=kind, tube_center=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6), tube_half_width=(0.01, 0.02, 0.03, 0.04, 0.05, 0.06)
     )
-    request = pb.Request(robot="ground", actor=actor, step=number, state=(0.0, 0.1, 0.0, 0.0, 0.0))
+    request = pb.Request(robot="ground", actor="actor-0", step=number, state=(0.0, 0.1, 0.0, 0.0, 0.0))
     return pb.Exchange(request=request, reply=pb.Reply(decision=decision))
 
 

@@ -15,7 +15,7 @@ from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
-from brakeline.logs.reader import Log, by_run, find, open_log
+from brakeline.logs.reader import Log, by_run, find
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
 
@@ -262,24 +262,6 @@ def test_lives_of_a_process_that_fell_silent_and_was_started_again() -> None:
             timeline.health(health, health.header.wall_time)
     lives = [(life.start - BEGIN / 1e9, life.end - BEGIN / 1e9, life.goodbye, life.restart) for life in timeline.lives]
     assert lives == [(0.0, 2.0, False, False), (9.0, 10.0, False, False), (12.0, 13.0, True, True)]
-
-
-def test_a_damaged_chunk_in_the_middle_is_skipped_and_the_rest_is_read(tmp_path: Path) -> None:
-    writer = Writer(losses=0.0)
-    for number in range(20):
-        writer.episode("actor-0", number)
-    total = len(writer.entries)
-    path = writer.write(tmp_path / "run.mcap", portion=50)
-    data = bytearray(path.read_bytes())
-    places = [at for at in range(len(data)) if data.startswith(b"zstd", at)]
-    data[places[3] + 40] ^= 0xFF
-    path.write_bytes(data)
-    log = open_log(path)
-    numbers = [record.message.header.sequence for record in log if record.topic == "step"]
-    assert total - 50 <= sum(1 for _ in open_log(path)) < total and numbers == sorted(numbers)
-    (cut,) = log.cuts
-    assert cut.lost > 0 and "byte" in str(cut)
-    assert log.segments[0].messages == sum(1 for _ in open_log(path))
 
 
 @pytest.mark.parametrize("columns", [60, 80, 160])

@@ -14,7 +14,7 @@ import pytest
 
 from brakeline.deploy.cli import main
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_runs
-from brakeline.logs.report_page import embedded, names, number, percent, render, write
+from brakeline.logs.report_page import embedded, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
 from tests.logs.conftest import show
@@ -354,11 +354,6 @@ def test_numbers_are_for_people() -> None:
     assert [percent(value) for value in (None, 0.0, 0.5, 0.00123)] == ["–", "0.0 %", "50.0 %", "0.12 %"]
     assert json.loads(embedded({"x": TRICKS, "y": float("nan")})) == {"x": TRICKS, "y": None}
     assert "<" not in embedded(TRICKS)
-
-
-def test_all_files_of_the_page_are_packaged() -> None:
-    folder = Path(__file__).parents[2] / "logs" / "report_page"
-    assert {item.name for item in folder.iterdir() if item.suffix in (".j2", ".css", ".js")} == set(names())
 
 
 HOSTILE = '"><img src=x onerror="document.title=\'owned\'"></title></text><script>document.title="owned"</script>'

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
@@ -12,20 +11,13 @@ from brakeline.deploy.run.live_page import LivePage
 from brakeline.logs.watch.dashboard import Dashboard
 from brakeline.logs.watch.live_page_server import LivePageServer, RunReport
 from tests.browser import Page
+from tests.http_client import asked, port_of
 from tests.logs.conftest import watched
 from tests.logs.sample_log import mixed
 from tests.waiting import until
 
 HOSTILE = '"><img src=x onerror="document.title=\'owned\'"><script>document.title="owned"</script>\''
 RUNNING: dict[str, Any] = {"run": HOSTILE, "method": "ddpc", "arena": "default", "seed": "0", "steps": "10"}
-
-
-def asked(url: str) -> tuple[int, str]:
-    try:
-        with urlopen(url, timeout=30.0) as answer:
-            return answer.status, answer.read().decode()
-    except HTTPError as error:
-        return error.code, error.read().decode()
 
 
 @pytest.fixture
@@ -46,23 +38,30 @@ def server(shown: dict[str, Any], log: Path) -> Iterator[LivePageServer]:
         yield server
 
 
+def report_of(server: LivePageServer) -> tuple[int, bytes]:
+    return asked(port_of(server.url), "/report.html")
+
+
 def test_the_report_is_there_when_the_run_has_ended_and_not_before(
     server: LivePageServer, shown: dict[str, Any]
 ) -> None:
-    assert asked(server.url + "report.html") == (404, "the run goes on: its report is here when it has ended\n")
+    assert report_of(server) == (
+        404,
+        b"the run goes on: its report is here when it has ended\n",
+    )
     shown["run"]["outcome"] = "finished"
-    status, page = asked(server.url + "report.html")
-    assert status == 200 and "Brakeline: run" in page and "script-src 'sha256-" in page
+    status, page = report_of(server)
+    assert status == 200 and b"Brakeline: run" in page and b"script-src 'sha256-" in page
 
 
 def test_without_a_log_the_answer_says_what_to_do(shown: dict[str, Any], tmp_path: Path) -> None:
     shown["run"]["outcome"] = "finished"
     with LivePageServer(lambda: shown) as server:
-        status, words = asked(server.url + "report.html")
-    assert status == 404 and "--report" in words
+        status, words = report_of(server)
+    assert status == 404 and b"--report" in words
     with LivePageServer(lambda: shown, report=RunReport(tmp_path / "none")) as server:
-        status, words = asked(server.url + "report.html")
-    assert status == 500 and "brakeline analyse" in words
+        status, words = report_of(server)
+    assert status == 500 and b"brakeline analyse" in words
 
 
 def test_the_page_links_to_the_report_which_draws_itself(

@@ -1,28 +1,23 @@
 """Console tables never truncate a cell, in files and in terminals."""
 
-import io
-
-from rich.console import Console
-
 from brakeline.logs.stacking_table import StackingTable
+from tests.logs.sample_log import printed
 
 CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
 
 
-def printed(**console):
+def shown(width=None, **console):
     table = StackingTable(*(f"column {i}" for i in range(6)), title="a title")
     table.add_row(*CELLS)
-    file = io.StringIO()
-    Console(file=file, **console).print(table)
-    return file.getvalue()
+    return printed(table, width, **console)
 
 
 def test_a_table_has_its_full_width_in_a_file_and_is_stacked_where_less_is_allowed(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
-    (row,) = (line for line in printed().splitlines() if CELLS[0] in line)
+    (row,) = (line for line in shown().splitlines() if CELLS[0] in line)
     assert all(cell in row for cell in CELLS)
     for width in (40, 80):
-        text = printed(force_terminal=True, width=width, no_color=True)
+        text = shown(force_terminal=True, width=width, no_color=True)
         assert "column 5:" in text and max(map(len, text.splitlines())) < width + 40  # and colours
     monkeypatch.setenv("COLUMNS", "80")
-    assert "column 5:" in printed() and "not short" in printed().replace("\n", " ")
+    assert "column 5:" in shown() and "not short" in shown().replace("\n", " ")

@@ -2,13 +2,9 @@
 scraped is what the processes say; what the dashboard and the autoscaler ask for is exported.
 """
 
-import contextlib
-import http.client
 import json
 import re
 import socket
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -26,6 +22,7 @@ from brakeline.messaging.http_server import MOST_CLIENTS, ConnectionSlots
 from brakeline.messaging.metrics_endpoint import FIGURES, MetricsServer, ProcessStatus
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.topics import LOG
+from tests.http_client import asked, port_of
 from tests.waiting import until
 
 CROWD = 3 * MOST_CLIENTS
@@ -40,7 +37,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[tuple[int, str]]:
     """The port of a server, and a path that it serves."""
     if request.param == "page":
         with LivePageServer(view) as page:
-            yield int(page.url.rsplit(":", 1)[1].strip("/")), "/view.json"
+            yield port_of(page.url), "/view.json"
         return
     server = MetricsServer("0", everything)
     yield server.port, "/live"
@@ -66,7 +63,7 @@ def test_a_crowd_that_sends_no_whole_request_keeps_nobody_out(
 ) -> None:
     port, path = served
     crowd = [connect(port, sent) for _ in range(CROWD)]
-    assert get(port, path)
+    assert asked(port, path)[0] == 200
     assert crowd[0].recv(1) == b"", "the one that waited longest had to go"
 
 
@@ -94,11 +91,11 @@ def test_pages_that_stay_open_leave_places_for_short_requests(
     connect: Callable[[int, bytes], socket.socket],
 ) -> None:
     with LivePageServer(view) as page:
-        port = int(page.url.rsplit(":", 1)[1].strip("/"))
+        port = port_of(page.url)
         asking = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
         answers = [connect(port, asking).recv(12) for _ in range(MOST_STREAMS + 1)]
         assert answers == [b"HTTP/1.1 200"] * MOST_STREAMS + [b"HTTP/1.1 503"]
-        assert get(port, "/view.json")
+        assert asked(port, "/view.json")[0] == 200
 
 
 def test_a_crowd_before_the_foxglove_server_keeps_nobody_out(
@@ -141,39 +138,26 @@ def test_the_one_that_waited_longest_gives_way_and_one_that_is_served_does_not()
             end.close()
 
 
-def ask(port: int, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
-    """Return the status and the text of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
-    connection.request("GET", path, headers=headers)
-    answer = connection.getresponse()
-    with contextlib.closing(connection):
-        return answer.status, answer.read()
-
-
 def test_a_foreign_page_does_not_read_the_metrics_and_a_scraper_names_the_machine(exposed) -> None:
     """By DNS rebinding a page of `evil` reaches this machine, and names `evil` as the host."""
     port = exposed(everything())
     for host in ("evil", "evil:9100", "127.0.0.1.evil.com", ""):
         headers = {"Host": host} if host else {"Origin": "http://evil"}
         for path in ("/metrics", "/live", "/ready", "/elsewhere"):
-            status, text = ask(port, path, headers)
+            status, text = asked(port, path, **headers)
             assert status == 403 and b"brakeline" not in text, (headers, path)
     for host in ("localhost:9100", "10.1.2.3:9100", "[fd00::1]:9100", socket.gethostname()):
-        assert b"brakeline_connected" in ask(port, "/metrics", {"Host": host})[1], host
+        assert b"brakeline_connected" in asked(port, "/metrics", Host=host)[1], host
 
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
-
-
-def get(port, path):
-    return urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=10.0).read().decode()
 
 
 def scraped(port):
     """Value by name and labels other than the process's."""
     return {
         (sample.name, sample.labels.get("topic", "")): (sample.value, sample.labels["process"], sample.labels["role"])
-        for family in text_string_to_metric_families(get(port, "/metrics"))
+        for family in text_string_to_metric_families(asked(port, "/metrics")[1].decode())
         for sample in family.samples
     }
 
@@ -202,30 +186,25 @@ def test_a_process_is_scraped_and_asked_whether_it_is_ready():
     settings = BusSettings(listen=(free_endpoint(),), metrics="0")
     with Process(settings, "safety-0", stderr=False) as process:
         port = process._metrics.port
-        with pytest.raises(urllib.error.HTTPError, match="503"):
-            get(port, "/ready")
+        assert asked(port, "/ready")[0] == 503
         process.figures.update(decisions=7, decide_ms=2.5)
         process.bus.publisher(LOG)
         process.announce()
-        assert get(port, "/ready") == get(port, "/live") == "yes\n"
+        assert asked(port, "/ready") == asked(port, "/live") == (200, b"yes\n")
         until(lambda: scraped(port).get(("brakeline_published_total", "health"), (0,))[0] >= 1, "a Health")
         metrics = scraped(port)
         assert metrics["brakeline_decisions_total", ""] == (7.0, "safety-0", "safety")
         assert metrics["brakeline_decide_seconds", ""][0] == pytest.approx(2.5e-3)
         assert metrics["brakeline_connected", ""][0] == 1.0 and metrics["brakeline_passed_over_total", ""][0] == 0.0
-        with pytest.raises(urllib.error.HTTPError, match="404"):
-            get(port, "/keys")
-    with pytest.raises(urllib.error.URLError):
-        get(port, "/metrics")
+        assert asked(port, "/keys")[0] == 404
+    with pytest.raises(ConnectionRefusedError):
+        asked(port, "/metrics")
 
 
 def test_who_is_stuck_does_not_live_and_who_is_cut_off_is_not_ready(exposed):
     stuck, cut = exposed(everything(live=False)), exposed(everything(ready=False, connected=False))
-    with pytest.raises(urllib.error.HTTPError, match="503"):
-        get(stuck, "/live")
-    with pytest.raises(urllib.error.HTTPError, match="503"):
-        get(cut, "/ready")
-    assert get(cut, "/live") == "yes\n" and scraped(cut)["brakeline_connected", ""][0] == 0.0
+    assert asked(stuck, "/live")[0] == asked(cut, "/ready")[0] == 503
+    assert asked(cut, "/live") == (200, b"yes\n") and scraped(cut)["brakeline_connected", ""][0] == 0.0
 
 
 def test_where_nothing_can_be_served_is_said(exposed):
@@ -238,8 +217,8 @@ def test_where_nothing_can_be_served_is_said(exposed):
 @pytest.mark.parametrize("path", ["grafana/brakeline.json", "kubernetes/autoscaler.yaml"])
 def test_what_is_asked_for_is_exported(exposed, path):
     text = (DEPLOY / path).read_text()
-    asked = set(re.findall(r"\bbrakeline_[a-z_]+", text))
-    assert asked
-    assert asked <= {name for name, _ in scraped(exposed(everything()))}
+    wanted = set(re.findall(r"\bbrakeline_[a-z_]+", text))
+    assert wanted
+    assert wanted <= {name for name, _ in scraped(exposed(everything()))}
     if path.endswith(".json"):
-        assert len(asked) > 15 and json.loads(text)["panels"]
+        assert len(wanted) > 15 and json.loads(text)["panels"]

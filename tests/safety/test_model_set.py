@@ -166,6 +166,7 @@ def test_tampered_model_sets_are_refused(model):
     for metadata, message in (
         ({"robot": "submarine"}, "submarine"),
         ({"layout": "another"}, "layout"),
+        ({"layout": None}, "layout"),
         ({"version": "0" * 12}, "version"),
         ({"recipe": "{}x"}, "no model set"),
         ({"recipe": {"certificate": "hope"}}, "hope"),

@@ -250,7 +250,7 @@ class Robot:
 
 
 @contextmanager
-def steered(simulated=False, stamped=False, ask=allow):
+def steered(simulated=False, stamped=False):
     endpoint, stop = free_endpoint(), threading.Event()
     with RosNode(RosSettings(listen=(endpoint,), namespace="/r"), "robot") as node:
         robot = Robot(node, simulated, stamped)
@@ -261,7 +261,7 @@ def steered(simulated=False, stamped=False, ask=allow):
             sensors=SensorSettings(),
             age_limits=AGE_LIMITS,
         )
-        node_under_test = FilterNode(settings, ask, stop)
+        node_under_test = FilterNode(settings, allow, stop)
         thread = threading.Thread(target=node_under_test.run)
         thread.start()
         try:

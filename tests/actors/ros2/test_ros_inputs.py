@@ -172,13 +172,13 @@ def test_an_invalid_scan_is_refused(wrong):
 ROBOT = GROUND.in_real_time()
 
 
-def odometry(at, x=0.0, y=0.0, yaw=0.0, speed=0.0, turn_rate=0.0):
+def odometry(at, x=0.0, speed=0.0):
     none = np.zeros(36)
     return cdr.Odometry(
         header=cdr.header(at, "odom"),
         child_frame_id="base_footprint",
-        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, y, yaw), covariance=none),
-        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, turn_rate), covariance=none),
+        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, 0.0, 0.0), covariance=none),
+        twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, 0.0), covariance=none),
     )
 
 

@@ -67,10 +67,14 @@ def joystick(rng, seconds, stops=True):
 
 
 def drive(seconds=1500.0, seed=0, stops=True):
-    """(time (T,), values (T, 7)): measured states and inputs in force from then on, as `COLUMNS` names them."""
+    """What `driven_by` returns, of a hand on a joystick."""
     rng = np.random.default_rng(seed)
-    robot, rows = Porter(rng), []
-    inputs = joystick(rng, seconds, stops)
+    return driven_by(Porter(rng), joystick(rng, seconds, stops))
+
+
+def driven_by(robot, inputs):
+    """(time (T,), values (T, 7)): measured states and inputs in force from then on, as `COLUMNS` names them."""
+    rows = []
     for u in inputs:
         rows.append([*robot.measured(), *u])
         robot.step(u)

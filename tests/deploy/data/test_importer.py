@@ -1,7 +1,5 @@
 """Recordings of any robot, in any format, become the same data set; and what they lack is said."""
 
-import json
-
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
@@ -119,10 +117,10 @@ def table(time, values, **columns) -> Table:
     return Table("", np.asarray(time), named, run)
 
 
-def steady(seconds=20.0, step=0.2, speed=0.3, turn=0.0):
-    """A robot that drives steadily, without noise: (time, values)."""
-    time = step * np.arange(round(seconds / step) + 1)
-    heading = turn * time
+def steady(step=0.2, turn=0.0):
+    """20 s of a robot that drives steadily, without noise: (time, values)."""
+    time = step * np.arange(round(20.0 / step) + 1)
+    speed, heading = 0.3, turn * time
     x = np.cumsum(speed * step * np.cos(heading))
     y = np.cumsum(speed * step * np.sin(heading))
     one = np.ones(len(time))
@@ -254,16 +252,14 @@ def test_a_bag_without_stops_is_refused_with_what_to_drive(tmp_path, capsys):
     assert not out.exists()
 
 
-def test_the_report_says_what_is_missing_and_draws_it(tmp_path, capsys):
+def test_the_report_says_what_is_missing_and_draws_it(tmp_path, figures):
     time, values = drive(seconds=200.0, seed=4)
     values[:, [3, 5]] *= 0.5  # never faster than 0.3 m/s
     values[:, 0] = np.cumsum(STEP * values[:, 3] * np.cos(values[:, 2]))
     values[:, 1] = np.cumsum(STEP * values[:, 3] * np.sin(values[:, 2]))
     path = write_csv(tmp_path / "slow.csv", time, values)
     out, picture = tmp_path / "a.safetensors", tmp_path / "a.png"
-    words = ["import", str(path), "--robot", str(FILE), "--out", str(out), "--picture", str(picture), "--json"]
-    assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = figures("import", path, "--robot", FILE, "--out", out, "--picture", picture)
     missing = said["coverage"]["missing"]
     assert "speed never above 0.3 m/s (bound 0.6): record this" in missing
     assert any(text.startswith("no braking above 0.3 m/s of speed") for text in missing), missing

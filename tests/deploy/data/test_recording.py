@@ -15,7 +15,6 @@ from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.errors import BadData, BadModel, NoBatch
-from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kinds
@@ -25,6 +24,7 @@ from brakeline.safety.model.windows import windows
 from brakeline.sim.batch import batch_support
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels
 from tests.accepting import BOUND
+from tests.logs.sample_log import written
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.toys import car
 from tests.waiting import PATIENCE
@@ -260,16 +260,13 @@ def test_trajectories_from_a_log_are_cut_at_gaps_episodes_actors_and_restarts():
 
 
 def test_the_last_steps_of_a_log(tmp_path):
-    segment = open_segment(tmp_path / "run.mcap", {})
     made = [*steps("a", 0, range(50)), *steps("a", 1, range(50))]
-    segment.save([Entry("step/ground/a", pb.Step, s.SerializeToString(), i, i, i) for i, s in enumerate(made)])
-    segment.finish()
-    data, note = from_log(tmp_path / "run.mcap", GROUND, last=60)
+    log = written(tmp_path / "run.mcap", (("step/ground/a", step, i) for i, step in enumerate(made)))
+    data, note = from_log(log, GROUND, last=60)
     assert [len(t.inputs) for t in data.trajectories] == [9, 49]
     assert "58 of the last 60 steps" in note and data.about == {"origin": "log"}
-    open_segment(tmp_path / "none.mcap", {}).finish()
     with pytest.raises(BadData, match="no trajectory of ground"):
-        from_log(tmp_path / "none.mcap", GROUND, last=60)
+        from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
 
 
 def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys):

@@ -31,7 +31,7 @@ def table(time, values, names=COLUMNS) -> Table:
 
 
 @pytest.mark.parametrize("kind", ["csv", "bag"])
-def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(driven, tmp_path, capsys, kind):
+def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(driven, tmp_path, capsys, figures, kind):
     write = {"csv": write_csv, "bag": write_bag}[kind]
     log, path = write(tmp_path / {"csv": "drive.csv", "bag": "drive"}[kind], *driven), tmp_path / f"drafted-{kind}.toml"
     assert main(["robot", "new", str(path), "--from", str(log)]) == 0
@@ -39,8 +39,7 @@ def test_a_drafted_description_is_checked_and_reads_the_log_it_was_made_from(dri
     assert "# The body cannot be inferred from the log: measure it." in text and "# error: cannot be inferred" in text
     path.write_text(text.replace("radius = 0.2", "radius = 0.15").replace("sight = 3.0", "sight = 2.5"))
     capsys.readouterr()
-    assert main(["robot", "check", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["problems"] == []
+    assert figures("robot", "check", path)["problems"] == []
     robot = robot_named(str(path))
     speeds = ("v [m/s]", "w [rad/s]") if kind == "csv" else ("speed [m/s]", "turn rate [rad/s]")
     assert robot.state == ("x [m]", "y [m]", "heading [rad]", *speeds) and robot.heading == 2

@@ -1,7 +1,6 @@
 """Files of columns as other people write them: one drive in any dialect, unit and kind of stamps is one data set."""
 
 import io
-import json
 import math
 import re
 from datetime import UTC, datetime
@@ -17,7 +16,7 @@ from brakeline.deploy import progress
 from brakeline.deploy.cli import main
 from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.dataset import Dataset
-from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, write_csv
+from tests.deploy.data.porter import COLUMNS, FILE, STEP, Porter, drive, driven_by, write_csv
 from tests.deploy.data.test_importer import same
 
 pytestmark = pytest.mark.usefixtures("reading_here")
@@ -184,20 +183,17 @@ def test_implausible_stamps_are_refused(driven, tmp_path, capsys, scale):
 # --- the period, bounds and choice of a description ---------------------------------------------------------------
 
 
-def held(seconds=120.0, seed=0):
-    """A drive of somebody who holds the stick for a second at a time, commanded every 0.1 s."""
-    rng = np.random.default_rng(seed)
-    robot, rows, u, left = Porter(rng), [], np.zeros(2), 0
-    for k in range(round(seconds / STEP)):
+def held():
+    """120 s with somebody who holds the stick for a second at a time, commanded every 0.1 s."""
+    rng = np.random.default_rng(0)
+    inputs, u, left = [], np.zeros(2), 0
+    for k in range(round(120.0 / STEP)):
         if k % 5 == 0:
             if left == 0:
                 u, left = rng.choice([0.0, 0.3, 0.6], 2) * [1.0, rng.choice([-2.0, 2.0])], int(rng.integers(3, 21))
             left -= 1
-        rows.append([*robot.measured(), *u])
-        robot.step(u)
-    values = np.array(rows)
-    values[:, 2] = (values[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    return STEP * np.arange(len(rows)), values
+        inputs.append(u)
+    return driven_by(Porter(rng), inputs)
 
 
 def described(path, *words, name="my"):
@@ -223,7 +219,7 @@ def test_inputs_that_change_at_any_time_have_no_beat(tmp_path, capsys):
     assert robot.period == pytest.approx(0.1) and "a guess" in text
 
 
-def test_glitches_are_named_and_cut(driven, tmp_path, capsys):
+def test_glitches_are_named_and_cut(driven, tmp_path, capsys, figures):
     time, values = driven
     values = values.copy()
     for row, column, value in ((700, 5, 51.0), (701, 5, 51.0), (1500, 5, -40.0), (2000, 3, 900.0), (2500, 0, 77.0)):
@@ -235,8 +231,7 @@ def test_glitches_are_named_and_cut(driven, tmp_path, capsys):
     assert "glitchy.csv, line 702, column speed: 51 is a glitch" in text
     assert "glitchy.csv, line 2002, column v: 900 is a glitch" in text and "line 2502, column x: 77" in text
     capsys.readouterr()
-    assert main(["import", str(path), "--robot", str(FILE), "--out", str(tmp_path / "a.safetensors"), "--json"]) == 0
-    notes = json.loads(capsys.readouterr().out)["report"]["notes"]
+    notes = figures("import", path, "--robot", FILE, "--out", tmp_path / "a.safetensors")["report"]["notes"]
     assert any("line 2002, column v: 900 is a glitch" in note and "left out" in note for note in notes)
     assert any("line 702, column speed: 51 is a glitch" in note and "cut there" in note for note in notes)
     data = Dataset.load(tmp_path / "a.safetensors")

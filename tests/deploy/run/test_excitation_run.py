@@ -1,6 +1,5 @@
 """Test driven excitation: the robot stays in its region, and the log is data of the robot."""
 
-import json
 from itertools import islice
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
-from brakeline.deploy.cli import main
 from brakeline.deploy.data.excitation_plan import RegionExcitation
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.vehicle_factory import environment
@@ -24,14 +22,13 @@ CAR = str(Path(__file__).parents[3] / "examples" / "car" / "car.toml")
 KEEP = (-1.6, -1.4, 1.8, 1.4)
 
 
-def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, capsys):
+def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, command, figures):
     """Its inputs do not tell where it turns to: only measuring keeps it inside."""
     log, data = tmp_path / "excited.mcap", tmp_path / "data.safetensors"
-    words = ["excite", CAR, "--keep", *map(str, KEEP), "--minutes", "2", "--drive", str(log), "--json"]
-    assert main(words) == 0
-    figures = json.loads(capsys.readouterr().out)
+    words = ("excite", CAR, "--keep", *KEEP, "--minutes", 2, "--drive", log)
+    said = figures(*words)
     steps = [record.message for record in read(log) if record.topic == "step"]
-    assert len(steps) == figures["periods"] == 600 and figures["runs"] == 2 and figures["collisions"] == 0
+    assert len(steps) == said["periods"] == 600 and said["runs"] == 2 and said["collisions"] == 0
     robot = robot_with_task(CAR)
     truth = np.array([step.true_state for step in steps])
     for disc in robot.body:
@@ -39,11 +36,12 @@ def test_a_car_is_driven_inside_the_region_and_its_log_is_imported(tmp_path, cap
         centre = truth[:, :2] + ahead
         assert (centre - disc.radius > KEEP[:2]).all() and (centre + disc.radius < KEEP[2:]).all()
     assert np.ptp(truth[:, :2], axis=0).min() > 0.8, "and yet it went about"
-    assert main(["import", str(log), "--robot", CAR, "--out", str(data)]) == 0
+    assert command("import", log, "--robot", CAR, "--out", data)[0] == 0
     driven = Dataset.load(data)
     assert driven.periods > 580 and len(windows(driven, robot.horizon, PLAN)) > 60
-    assert main(words) == 1 and "is there already" in capsys.readouterr().err
-    assert main(["excite", CAR]) == 1 and "do not determine how it turns" in capsys.readouterr().err
+    for again, reason in ((words, "is there already"), (("excite", CAR), "do not determine how it turns")):
+        status, _, err = command(*again)
+        assert status == 1 and reason in err
 
 
 def test_a_robot_that_leaves_the_region_brakes_by_its_own_rule():

@@ -8,18 +8,14 @@ import pytest
 from brakeline.deploy.run.log_feed import LoggedSteps, count
 from brakeline.deploy.run.processes import process_specs
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import STEP
+from tests.logs.sample_log import written
 from tests.robots import GROUND, QUADROTOR
 
 
 def record(path: Path, *steps: pb.Step) -> None:
-    segment = open_segment(path, {})
-    for i, step in enumerate(steps):
-        key = STEP.at(robot="ground", source=step.actor)
-        segment.save([Entry(key, pb.Step, step.SerializeToString(), 1 + i, 1 + i, i)])
-    segment.finish()
+    written(path, ((STEP.at(robot="ground", source=step.actor), step, 1 + i) for i, step in enumerate(steps)))
 
 
 def step(number: int, actor: str = "a", episode: int = 0, **more: object) -> pb.Step:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brakeline.deploy import cli
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments.evaluate import in_process
@@ -31,24 +30,18 @@ STEPS = 150
 LINE = 64  # bytes: the widest vector that a processor loads at once
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
-    status = cli.main([*map(str, words), "--json"])
-    return status, json.loads(capsys.readouterr().out)
+def test_the_same_version_decides_the_same(log: Path, figures) -> None:
+    same = figures("replay", log)
+    assert (same["requests"], same["identical"] + same["equal"], same["different"]) == (STEPS, STEPS, 0)
+    assert set(same["kinds"]) >= {"allowed", "adjusted"}, "the log has something to compare"
+    assert same["fields"] == {} and same["examples"] == [] and same["same_input"] == STEPS
 
 
-def test_the_same_version_decides_the_same(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, figures = run(capsys, "replay", log)
-    assert status == 0
-    assert (figures["requests"], figures["identical"] + figures["equal"], figures["different"]) == (STEPS, STEPS, 0)
-    assert set(figures["kinds"]) >= {"allowed", "adjusted"}, "the log has something to compare"
-    assert figures["fields"] == {} and figures["examples"] == [] and figures["same_input"] == STEPS
-
-
-def test_a_log_suffices_for_a_replay(log, tmp_path, monkeypatch, capsys) -> None:
+def test_a_log_suffices_for_a_replay(log, tmp_path, monkeypatch, figures) -> None:
     shutil.copy(log, tmp_path / "elsewhere.mcap")
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "nothing"))
-    status, figures = run(capsys, "replay", tmp_path / "elsewhere.mcap")
-    assert (status, figures["identical"] + figures["equal"]) == (0, STEPS)
+    again = figures("replay", tmp_path / "elsewhere.mcap")
+    assert again["identical"] + again["equal"] == STEPS
 
 
 def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(data_folder, tmp_path, monkeypatch) -> None:
@@ -62,27 +55,26 @@ def test_a_log_without_models_is_replayed_from_its_folder_or_not_at_all(data_fol
     assert (again.requests, again.unanswered, again.different) == (20, 0, 0)
 
 
-def test_another_margin_changes_decisions_by_stated_amounts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_margin_changes_decisions_by_stated_amounts(log: Path, figures) -> None:
     margin = Filter(model_for(GROUND, ModelConfig())).clearance_margin
-    status, figures = run(capsys, "replay", log, "--margin", margin + 0.05)
-    assert status == 0, "it was asked for"
-    assert figures["different"] > 0 and figures["instead"] == {"margin": margin + 0.05}
-    assert figures["fields"]["input"]["largest"] > 0.0
-    assert figures["same_input"] == STEPS - figures["fields"]["input"]["count"] < STEPS
-    changes = [example["differences"].get("input", 0.0) for example in figures["examples"]]
-    assert changes == sorted(changes, reverse=True) and changes[0] == figures["fields"]["input"]["largest"]
-    assert run(capsys, "replay", log, "--margin", margin)[1]["different"] == 0
+    wider = figures("replay", log, "--margin", margin + 0.05)
+    assert wider["different"] > 0 and wider["instead"] == {"margin": margin + 0.05}
+    assert wider["fields"]["input"]["largest"] > 0.0
+    assert wider["same_input"] == STEPS - wider["fields"]["input"]["count"] < STEPS
+    changes = [example["differences"].get("input", 0.0) for example in wider["examples"]]
+    assert changes == sorted(changes, reverse=True) and changes[0] == wider["fields"]["input"]["largest"]
+    assert figures("replay", log, "--margin", margin)["different"] == 0
 
 
-def test_another_error_bound_and_other_data_can_be_replayed(log, few_data, tmp_path, monkeypatch, capsys) -> None:
+def test_another_error_bound_and_other_data_can_be_replayed(log, few_data, tmp_path, monkeypatch, figures) -> None:
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
     record_path(GROUND).parent.mkdir()
     shutil.copy(few_data, record_path(GROUND))
     words = ("replay", log, "--certificate", "matrix-zonotope")
-    _, wider = run(capsys, *words)
+    wider = figures(*words)
     assert wider["different"] == STEPS and "model" not in wider["fields"]
     assert sum(count for row in wider["kinds"].values() for count in row.values()) == STEPS
-    _, same = run(capsys, *words, "--data", record_path(GROUND))
+    same = figures(*words, "--data", record_path(GROUND))
     assert same["kinds"] == wider["kinds"] and same["instead"]["data"] == str(record_path(GROUND))
 
 
@@ -102,7 +94,7 @@ def test_requests_older_than_known_free_keep_their_meaning(data_folder: Path, tm
     assert replayed.kinds["error", "error"] == 2 and replayed.kinds.total() == 10
 
 
-def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, command) -> None:
     def falsify(exchange: pb.Exchange) -> None:
         decision = exchange.reply.decision
         if exchange.request.step == 1:
@@ -119,7 +111,8 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys
         decision.time_ms += 1.0
 
     drive(tmp_path / "run.mcap", 12, falsify)
-    status, figures = run(capsys, "replay", tmp_path)
+    status, out, _ = command("replay", tmp_path, "--json")
+    figures = json.loads(out)
     assert status == 1
     assert (figures["requests"], figures["unanswered"], figures["different"]) == (12, 1, 3)
     assert figures["identical"] + figures["equal"] == 8 and figures["equal"] >= 1
@@ -127,9 +120,8 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, capsys
     assert figures["fields"]["input"] == {"count": 1, "largest": pytest.approx(1e-11, rel=1e-3)}
     assert figures["fields"]["kind"]["count"] == 1 and figures["fields"]["result"]["count"] == 1
     assert {example["step"] for example in figures["examples"]} == {3, 5, 9}
-    assert cli.main(["replay", str(tmp_path)]) == 1
-    shown = capsys.readouterr().out
-    assert "11 requests; 1 had no answer" in shown and "different: 3" in shown
+    status, shown, _ = command("replay", tmp_path)
+    assert status == 1 and "11 requests; 1 had no answer" in shown and "different: 3" in shown
 
 
 def test_a_log_that_begins_after_a_change_of_models_has_no_stale_models(data_folder: Path, tmp_path: Path) -> None:
