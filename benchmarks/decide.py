@@ -18,8 +18,8 @@ from benchmarks.timing import WARM_UP, Figures, milliseconds
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.error_bounds import KINDS
-from brakeline.safety.model.model_set import DIRECT, MODES, ONE_STEP, ModelSet
+from brakeline.safety.model.model_config import DIRECT, KINDS, MODES, ONE_STEP
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.sim.sim_conditions import Conditions, Perception
 
 SCANS = Conditions(perception=Perception("scan"))

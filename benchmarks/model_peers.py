@@ -43,9 +43,8 @@ from brakeline.safety.filter.request import Decision, Request
 from brakeline.safety.methods import Method
 from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.error_bounds import MATRIX_ZONOTOPE
-from brakeline.safety.model.model_config import CBF, DIRECT, FREE, ONE_STEP, PLAN, RECURSION, ModelConfig
-from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.model_config import CBF, DIRECT, FREE, MATRIX_ZONOTOPE, ONE_STEP, PLAN, ModelConfig
+from brakeline.safety.model.model_set import RECURSION, ModelSet
 from brakeline.safety.model.one_step import features_for
 from brakeline.safety.model.one_step_fitting import choose
 from brakeline.safety.model.one_step_regression import Regression

@@ -12,7 +12,7 @@ As in Tessler et al., "Reward constrained policy optimization", one critic estim
 
 from __future__ import annotations
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 
 
 class LagrangeMultiplier:

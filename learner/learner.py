@@ -18,7 +18,7 @@ import numpy as np
 
 from brakeline.errors import BadStep, CheckpointError, DamagedPart
 from brakeline.learner import checkpoint
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.n_step import NStepWindows

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from brakeline.learner.learner_config import Stored
 from brakeline.learner.replay import Transition, Vector
 

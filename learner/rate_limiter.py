@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 
 
 class RateLimiter:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 
 Vector = NDArray[np.float32]
 NAMES = ("observation", "action", "reward", "discount", "next_observation", "cost", "penalty", "imitated")

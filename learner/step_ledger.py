@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 
 
 @dataclass

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.networks import Adam, Network
 from brakeline.learner.replay import Batch

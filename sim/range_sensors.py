@@ -21,7 +21,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import CUT
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.sim_conditions import Perception as Perception
+from brakeline.sim.sim_conditions import Perception
 from brakeline.sim.traffic import Crowd
 
 S = TypeVar("S", Scan, RangeImage)

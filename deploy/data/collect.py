@@ -85,7 +85,7 @@ def _recorded(robot: RobotWithTask, recipe: _Recipe, conditions: Conditions) -> 
 
 def _recorded_at_once(robot: RobotWithTask, recipes: Sequence[_Recipe], conditions: Conditions) -> list[Trajectory]:
     """Record many trajectories at once."""
-    from brakeline.sim.batch.batch_factory import vehicle_batch
+    from brakeline.sim.batch.batch_env import vehicle_batch
     from brakeline.sim.batch.normal_streams import NormalStreams
 
     streams = NormalStreams(len(recipes), ahead=False)  # each generator draws the inputs as well

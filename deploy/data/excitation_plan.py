@@ -17,7 +17,7 @@ from brakeline.deploy.data.excitation import excitation
 from brakeline.deploy.data.sources.quantity_names import column_names, quantities
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 
 Region = tuple[float, float, float, float]  # x and y, least and most [m]
 

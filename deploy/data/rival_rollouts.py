@@ -16,7 +16,7 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
-from brakeline.safety.filter.braking import brake
+from brakeline.safety.filter.backup_plan import brake
 from brakeline.safety.rivals.sailr import normalised_input
 from brakeline.safety.rivals.secas import Constraints
 from brakeline.sim.scripted_policies import Policy, scripted

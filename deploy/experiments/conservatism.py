@@ -20,8 +20,7 @@ from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.trials import EpisodeTable, fresh_trial
 from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.task import arena_kind, robot_with_task
-from brakeline.safety.model.error_bounds import KINDS
-from brakeline.safety.model.model_set import MODES, ModelConfig
+from brakeline.safety.model.model_config import KINDS, MODES, ModelConfig
 
 ORACLE = "astar"
 ANY_BOUND = 1.0  # accept every bound: the experiment measures it, in a simulator

@@ -214,3 +214,22 @@ def correction_penalty(
     wanted = np.where(np.isfinite(wanted), wanted, 0.0)
     clipped = np.minimum(np.maximum(wanted, np.maximum(low, before - slew)), np.minimum(high, before + slew))
     return weight * float(np.linalg.norm((np.asarray(executed, float) - clipped) / (high - low)))
+
+
+def brake(robot: Robot, before: Array) -> Array:
+    """Return the input (m,) after the input `before` (m,) while braking as fast as the slew allows.
+
+    This is the backup policy μ of methods that verify nothing: μ(u_before) = u_before − clip(u_before, −slew, slew).
+    Without a slew limit the input is zero at once. An input that the stop rule holds stays as it is.
+    """
+    slew = np.asarray(robot.action_slew)
+    return np.where(robot.zero_at_rest, before - np.clip(before, -slew, slew), before)
+
+
+def braking_plan(robot: Robot, first: Array) -> Array:
+    """Return the plan (N, m): `first`, then μ. Its last input is zero: the horizon suffices to brake from any input."""
+    plan = np.zeros((robot.horizon, robot.action_dim))
+    plan[0] = first
+    for k in range(1, robot.horizon):
+        plan[k] = brake(robot, plan[k - 1])
+    return plan

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, worst
 from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
@@ -29,10 +28,6 @@ from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.perception import occluded_regions as shades
 from brakeline.safety.perception import scan_free_space as seen
 
-Array = NDArray[np.float64]
-
-ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
-EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
 ASIDE = 0.5  # m beyond all plans: what a range image is looked at for, and so the largest margin that it tells
 
 

@@ -151,7 +151,7 @@ class PlanSearch:
         adjusted = self._turned_only(adjusted) or adjusted
         if adjusted is not None:
             adjusted.for_clearance = for_clearance
-        if adjusted is None:
+        else:
             record.reason += "; no verified input was found"
         return adjusted
 

@@ -209,19 +209,14 @@ class RecursionMaps:
     plan: Array  # (N·m, F·m): S, from free inputs to all inputs
     first: Array  # (n, nz): y_0 from z = [x_0; u_{-1}; f], with the position at zero
 
-    def previous(self) -> Array:
-        """Return the map (m, nz) from z to the input in force."""
-        nz, m = self.first.shape[1], self.inputs
-        pick = np.zeros((m, nz))
-        free = self.plan.shape[1]
-        pick[:, nz - free - m : nz - free] = np.eye(m)
-        return pick
-
     def input(self, k: int) -> Array:
-        """Return the map (m, nz) from z to input k of the plan."""
-        nz, m = self.first.shape[1], self.inputs
-        pick = np.zeros((m, nz))
-        pick[:, nz - self.plan.shape[1] :] = self.plan[k * m : (k + 1) * m]
+        """Return the map (m, nz) from z to input k of the plan, or to the input in force for k = -1."""
+        m, known = self.inputs, self.first.shape[1] - self.plan.shape[1]
+        pick = np.zeros((m, self.first.shape[1]))
+        if k < 0:
+            pick[:, known - m : known] = np.eye(m)
+        else:
+            pick[:, known:] = self.plan[k * m : (k + 1) * m]
         return pick
 
 
@@ -254,7 +249,7 @@ def stack_recursive(
     initial: generators (n, g) of the set of the first state; r is their share. None: the measured state is exact.
     """
     n, nz = how.first.shape
-    y, before = how.first, how.previous()
+    y, before = how.first, how.input(-1)
     generators = np.zeros((n, 0)) if initial is None else initial  # all generators so far, propagated to step k
     start = generators.shape[1]
     regress, coordinates = list(how.E), [*range(position_dim), *more]

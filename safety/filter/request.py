@@ -178,7 +178,7 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     if predicted is not None:
         further["predicted_center"] = predicted.center, (robot.state_dim,)
         further["predicted_half_width"] = predicted.half_width, (robot.state_dim,)
-    _check_motion(robot, request, further)
+    check_motion(robot, request, further)
     _within_bounds(robot, "plan", request.plan)
     if not robot.is_stop_input(request.plan[-1]):
         raise BadRequest("plan", "the committed plan does not end in a stop")
@@ -279,17 +279,12 @@ class FastRequestCheck:
         return self.within(np.concatenate((request.state, *inputs, *sets)), self.with_predicted)
 
 
-def check_for_rival(robot: Robot, request: Request, observed: int) -> None:
-    """Check the fields that the rivals read; `observed` is the number of values that the rival's networks observe.
+def check_motion(robot: Robot, request: Request, further: Named) -> None:
+    """Check state and inputs, and that all further arrays have their shapes and are finite.
 
     Raises:
         BadRequest: a value is missing, not finite or of the wrong size. It has the field's name.
     """
-    _check_motion(robot, request, {"observation": (request.observation, (observed,))})
-
-
-def _check_motion(robot: Robot, request: Request, further: Named) -> None:
-    """Check state and inputs, and that all further arrays have their shapes and are finite."""
     inputs = (robot.action_dim,)
     named: Named = {
         "state": (request.state, (robot.state_dim,)),

@@ -49,11 +49,6 @@ class Reservation:
         parts = self.center, self.half_width, self.radius
         return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 
-    def distance(self, other: Reservation) -> float:
-        """Return the distance [m] of two reservations in their nearest period; 0 or less if they overlap."""
-        between = np.abs(self.center - other.center) - self.half_width - other.half_width
-        return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - self.radius - other.radius).min())
-
 
 @dataclass(frozen=True)
 class OtherReservations:

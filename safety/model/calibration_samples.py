@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadData
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.windows import displacement, predicted_outputs, way_after_rest, ways
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 FOLDS = 5
@@ -43,7 +42,7 @@ class Samples:
     start: Index
 
 
-def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
+def samples_of(data: Dataset) -> Samples:
     """Cut recorded driving into periods and windows, each with its fold.
 
     With many trajectories, a fold consists of whole trajectories; otherwise, of one block of each trajectory.
@@ -52,29 +51,23 @@ def samples_of(data: Dataset, folds: int = FOLDS) -> Samples:
         BadData: a fold holds no window; the message says how much driving is missing.
     """
     robot, N = data.robot, data.robot.horizon
-    whole = len(data.trajectories) >= 4 * folds
+    whole = len(data.trajectories) >= 4 * FOLDS
     parts: list[tuple[NDArray[Any], ...]] = []
     for number, t in enumerate(data.trajectories):
         periods = len(t.inputs)
-        block = np.full(periods, number % folds) if whole else np.arange(periods) * folds // periods
+        block = np.full(periods, number % FOLDS) if whole else np.arange(periods) * FOLDS // periods
         parts.append((*_periods(robot, t), block, np.arange(periods) > 0, *_windows(data, t, number, block)))
     names = ("v", "y", "period_fold", "follows", "z", "after", "chords", "stops", "fold", "start")
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))
     samples = Samples(**dict(zip(names, columns, strict=True)))
-    if len(np.unique(samples.fold)) < folds:
-        needed = 4 * folds * N * robot.period / 60.0
+    if len(np.unique(samples.fold)) < FOLDS:
+        needed = 4 * FOLDS * N * robot.period / 60.0
         raise BadData(f"too little driving to calibrate with: record at least {needed:.1f} minutes")
     return samples
 
 
-def _before(robot: Robot, t: Trajectory) -> Array:
-    """Return the input in force at each period's start (T, m)."""
-    first = np.zeros(robot.action_dim) if t.before is None else t.before
-    return np.vstack([first, t.inputs[:-1]])
-
-
 def _periods(robot: Robot, t: Trajectory) -> tuple[Array, Array]:
-    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, _before(robot, t)])
+    v = np.hstack([t.states[:-1, list(robot.regressor)], t.inputs, t.in_force()])
     return v, displacement(robot, t.states[:-1], t.states[1:])
 
 
@@ -86,7 +79,7 @@ def _windows(
     start = start[block[start] == block[start + N - 1]]
     at = start[:, None] + np.arange(N)
     measured, inputs = t.states[start][:, list(robot.regressor)], t.inputs[at].reshape(len(at), N * robot.action_dim)
-    z = np.hstack([measured, _before(robot, t)[start], inputs])
+    z = np.hstack([measured, t.in_force()[start], inputs])
     ends = [displacement(robot, t.states[start], t.states[start + k]) for k in range(1, N + 1)]
     after = [predicted_outputs(robot, end) for end in ends]
     chords = (ways(robot, t)[0] + data.chord_deviation)[at]

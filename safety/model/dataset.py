@@ -11,16 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import BadData, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import Array, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.tensor_file import pack, unpack
-
-Array = NDArray[np.float64]
 
 ENTRY = "dataset"
 RESTLESS = "restless"  # entry in `about`: the number of restless trajectories, which are the last ones
@@ -51,6 +48,15 @@ class Trajectory:
     turned: Array
     before: Array | None = None
     headings: Array | None = None
+
+    @property
+    def first_in_force(self) -> Array:
+        """The input in force (m,) at the start; zero if the robot stood still."""
+        return np.zeros(self.inputs.shape[1]) if self.before is None else self.before
+
+    def in_force(self) -> Array:
+        """Return the input in force (T, m) at the start of each period."""
+        return np.vstack([self.first_in_force, self.inputs[:-1]])
 
 
 def _continues(first: Trajectory, second: Trajectory) -> bool:
@@ -170,7 +176,7 @@ class Dataset:
         """Write a safetensors file with the concatenated trajectories and their lengths."""
         names = ("states", "inputs", "paths", "turned")
         tensors = {n: np.concatenate([getattr(t, n) for t in self.trajectories]) for n in names}
-        tensors["before"] = np.array([self._before(t) for t in self.trajectories])
+        tensors["before"] = np.array([t.first_in_force for t in self.trajectories])
         if all(t.headings is not None for t in self.trajectories):
             tensors["headings"] = np.concatenate([t.headings for t in self.trajectories])
         tensors["lengths"] = np.array([len(t.inputs) for t in self.trajectories])
@@ -252,10 +258,6 @@ class Dataset:
         except (OSError, ValueError, TypeError):
             return {}
 
-    def _before(self, t: Trajectory) -> Array:
-        """Return the input in force (m,) at the start of a trajectory; zero of a robot that stood still."""
-        return np.zeros(self.robot.action_dim) if t.before is None else t.before
-
     def digest(self) -> str:
         """Return a hash of the recorded numbers, 12 hexadecimal digits: the same after `save` and `load`."""
         sha = hashlib.sha256()
@@ -264,7 +266,7 @@ class Dataset:
             sha.update(t.inputs.tobytes())
             sha.update(t.paths.tobytes())
             sha.update(t.turned.tobytes())
-            sha.update(self._before(t).tobytes())
+            sha.update(t.first_in_force.tobytes())
             sha.update(b"" if t.headings is None else t.headings.tobytes())
         return sha.hexdigest()[:12]
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.error_causes import REGIMES, regimes
-
-Array = NDArray[np.float64]
 
 START, RESTLESS, JUMPING = "start of an episode", "restless inputs", "jumping inputs"
 JUMP = 0.5  # share of the largest change that range and slew allow; a change that differs by more is a jump

@@ -15,10 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import ErrorBoundError
-from brakeline.safety.model.model_config import KINDS as KINDS
-from brakeline.safety.model.model_config import MATRIX_ZONOTOPE as MATRIX_ZONOTOPE
-from brakeline.safety.model.model_config import RESIDUAL as RESIDUAL
-from brakeline.safety.model.model_config import SET_MEMBERSHIP as SET_MEMBERSHIP
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
-
-Array = NDArray[np.float64]
+from brakeline.messaging.robot import Array, Robot
 
 PATH, AFTER = "the path within a period", "the way after the stop"
 STANDING, SLOW, TURNING, FAST, BOTH = "standing", "slow", "turning", "fast", "fast and turning"

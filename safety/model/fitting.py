@@ -7,12 +7,9 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.obstacle import rotate
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import (
-    MATRIX_ZONOTOPE,
-    RESIDUAL,
-    SET_MEMBERSHIP,
     ErrorBound,
     envelopes,
     least_squares,
@@ -21,21 +18,28 @@ from brakeline.safety.model.error_bounds import (
     set_membership,
     whitening,
 )
-from brakeline.safety.model.model_set import DIRECT, RECURSION, ModelConfig, ModelSet
+from brakeline.safety.model.model_config import (
+    DIRECT,
+    FREE,
+    MATRIX_ZONOTOPE,
+    PLAN,
+    RECURSION,
+    RESIDUAL,
+    SET_MEMBERSHIP,
+    ModelConfig,
+)
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.turning_in_place import InPlace, inside, over_plan, standing_limits, turning
 from brakeline.safety.model.windows import (
-    FREE,
-    PLAN,
     Windows,
     check_regressors,
     periods_until_standing,
     predicted_outputs,
+    recorded_domain,
     resting_periods_at_end,
     stopping_distances,
     windows,
 )
-
-Array = NDArray[np.float64]
 
 FEWEST_STOPS = 5  # with fewer stops, the bound of the stopping distance would mean little
 FEWEST_IN_PLACE = 100  # windows in place; they have fewer regressors than others
@@ -81,8 +85,6 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         stopping_distance = _stopping_distance_of_plans(whole, model_config)
     else:
         stopping_distance = np.zeros(nz), stopping_distance_of_stops(data, model_config)
-    known = windows(data, 1).z[:, : robot.regressor_dim]
-    domain = np.stack([known.min(0), known.max(0)])
     about = data.about | {"data": data.digest(), "periods": str(data.periods)}
     return ModelSet(
         robot,
@@ -90,7 +92,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         tuple(steps),
         _scalar(chord_deviations, nz),
         _scalar([stopping_distance], nz),
-        domain,
+        recorded_domain(data),
         whitening(whole.z),
         about,
         stands=periods_until_standing(whole, data, kind),

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import Array, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import percent
@@ -24,7 +23,6 @@ from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_d
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN
-from brakeline.safety.model.model_config import MODES as MODES
 from brakeline.safety.model.model_config import ONE_STEP as ONE_STEP
 from brakeline.safety.model.model_config import RECURSION as RECURSION
 from brakeline.safety.model.model_config import ModelConfig as ModelConfig
@@ -32,8 +30,6 @@ from brakeline.safety.model.one_step import OneStep
 from brakeline.safety.model.tensor_file import content, pack, unpack
 from brakeline.safety.model.turning_in_place import InPlace
 from brakeline.safety.model.windows import plan_regressor_map
-
-Array = NDArray[np.float64]
 
 ENTRY = "model_set"
 SHIPPED = Path(__file__).parents[2] / "robots"  # model sets lie beside the descriptions of their robots
@@ -154,12 +150,8 @@ class ModelSet:
             raise BadModel("the model set's basis is none")
 
     def _stack(self, steps: Sequence[ErrorBound], plans: bool = True) -> Tube:
-        d, chord_deviations, stopping_distance, more = (
-            self.robot.position_dim,
-            self.chord_deviations,
-            self.stopping_distance,
-            extra_coordinates(self.robot),
-        )
+        d, more = self.robot.position_dim, extra_coordinates(self.robot)
+        chord_deviations, stopping_distance = self.chord_deviations, self.stopping_distance
         if plans and self.model_config.windows == FREE:
             T = plan_regressor_map(self.robot)
             chord_deviations, stopping_distance = chord_deviations.through(T), stopping_distance.through(T)
@@ -327,16 +319,14 @@ def scored_coordinates(robot: Robot) -> tuple[int, ...]:
 
 
 def whitening_of(step: ErrorBound, basis: Array) -> Array:
-    """Return the basis B for a step; regressors of the recursion have more coordinates than z (the heading)."""
+    """Return the basis B for a step; regressors of the recursion have more coordinates than z (the heading).
+
+    Their basis comes from the step's rows W, those of Z⁺, whose second moment is the inverse of the regressors'.
+    """
     if step.C.shape[1] == len(basis):
         return basis
-    return np.eye(step.C.shape[1]) if not len(step.W) else whitening_from(step.W)
-
-
-def whitening_from(pseudo: Array) -> Array:
-    """Return a whitening basis from the rows of Z⁺, whose second moment is the inverse of the regressors'."""
-    inverse = pseudo.T @ pseudo
+    inverse = step.W.T @ step.W
     used = np.diag(inverse) > 0.0
-    basis = np.eye(len(inverse))
-    basis[np.ix_(used, used)] = np.linalg.cholesky(inverse[np.ix_(used, used)]).T
-    return basis
+    own = np.eye(len(inverse))
+    own[np.ix_(used, used)] = np.linalg.cholesky(inverse[np.ix_(used, used)]).T
+    return own

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadModel
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Predictor = tuple[Array, Array, Array, Index, Index, int, Array, int, int]
 

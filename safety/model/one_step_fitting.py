@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.errors import ErrorBoundError
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples, samples_of
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import driving_kinds
-from brakeline.safety.model.error_bounds import RESIDUAL, ErrorBound
+from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.fitting import stopping_distance_of_stops
-from brakeline.safety.model.model_config import FREE, ONE_STEP, ModelConfig
+from brakeline.safety.model.model_config import FREE, ONE_STEP, RESIDUAL, ModelConfig
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.one_step import features_for
 from brakeline.safety.model.one_step_regression import PENALTIES, Candidate, Regression
@@ -35,9 +34,6 @@ from brakeline.safety.model.set_shape import (
     stop_from_full_speed,
     typical_plans,
 )
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 Progress = Callable[[float], None]  # called with the share of the work that is done
 TRIED, CHOSEN, SCORED = 0.4, 0.8, 0.95  # shares of the work that are done after each part

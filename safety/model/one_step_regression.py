@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples
 from brakeline.safety.model.feature_selection import SelectionPath
 from brakeline.safety.model.one_step import Features, OneStep
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PENALTIES = (1.0, 3.0)  # of the selection

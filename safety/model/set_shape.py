@@ -6,14 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.error_bounds import ErrorBound, envelopes
 from brakeline.safety.model.one_step import OneStep
 from brakeline.safety.model.windows import plan_regressor_map
-
-Array = NDArray[np.float64]
 
 # Weight of a stop from full speed among the plans for which a shape is tightest: of positions, which decide about
 # obstacles, and of the other coordinates, which must hold whatever the inputs do within a period.

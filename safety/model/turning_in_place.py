@@ -12,10 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
+from brakeline.messaging.robot import INPUT_TOLERANCE, Array, Robot
 from brakeline.safety.model.error_bounds import ErrorBound
-
-Array = NDArray[np.float64]
 
 OUTSIDE_DOMAIN = 0.02  # share of the recorded range by which a regressor may exceed it: rounding, not extrapolation
 STANDING = 0.01  # share of an input's range; a robot stands below this speed, or below the measurement error if larger

@@ -6,6 +6,7 @@ The resulting statement holds for the recorded distribution only.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from brakeline.safety.model.error_causes import (
     regimes,
     state_parts,
 )
-from brakeline.safety.model.facet_normals import facet_normals
 from brakeline.safety.model.model_set import DIRECT, ModelSet, extra_coordinates
 from brakeline.safety.model.one_step_fitting import Calibration
 from brakeline.safety.model.one_step_regression import Candidate
@@ -175,7 +175,7 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
     Returns:
         The validation report, and for each plan the largest ratio of an error to its bound (plans,).
     """
-    robot, ready, kind = model.robot, Filter(model), model.model_config.windows
+    robot, kind = model.robot, model.model_config.windows
     turning = model.turning()
     made_of = windows(fitted, robot.horizon, kind)
     figures: RegressorQuality = check_regressors(made_of.z, "plan windows", model.model_config.fewest)
@@ -210,29 +210,16 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
                 first[members] = shares.max(1)
                 take(places, shares, state_parts(robot, shares.shape[1] - robot.state_dim))
             take(places, *_excess(of, tube, group, k))
-    full = np.asarray(robot.high())
     outside, steps_outside = int((~(excess <= 1.0)).sum()), int((~(first <= 1.0)).sum())
-    bound_step = upper_bound(steps_outside, len(plans))
     turns, turns_outside = int(in_place.sum()), int((~(excess[in_place] <= 1.0)).sum())
-    statement = ValidationReport(
-        certificate=model.model_config.certificate,
-        mode=model.model_config.mode,
-        version=model.version,
+    statement = _statement(
+        model,
+        (outside, len(plans)),
+        (steps_outside, len(plans)),
         samples=figures.samples,
         rank=figures.rank,
         smallest_singular=figures.smallest,
         condition=figures.condition,
-        windows=len(plans),
-        violations=outside,
-        step_violations=steps_outside,
-        bound_step=bound_step,
-        bound_plan=upper_bound(outside, len(plans)),
-        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
-        outside_episode=bound_step * EPISODE,
-        outside_hour=bound_step * HOUR / robot.period,
-        half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
-        half_width_full=ready.half_width(full),
-        clearance_margin=ready.clearance_margin,
         excess=float(excess.max(initial=0.0)),
         in_place_windows=turns,
         in_place_violations=turns_outside,
@@ -249,31 +236,17 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
     Every window was predicted without its fold. The bounds at 99 % confidence count windows that do not overlap: plans
     for `bound_plan`, periods for `bound_step`.
     """
-    robot, s, ready = model.robot, calibration.samples, Filter(model)
+    robot, s = model.robot, calibration.samples
     apart = non_overlapping_starts(s.start, robot.horizon)
-    plans, steps = int(apart.sum()), len(s.z)
     outside, first_outside = calibration.scores > 1.0, calibration.first_scores > 1.0
-    steps_outside = int(first_outside.sum())
-    bound_step = upper_bound(steps_outside, steps)
-    return ValidationReport(
-        certificate=model.model_config.certificate,
-        mode=model.model_config.mode,
-        version=model.version,
+    return _statement(
+        model,
+        (int(outside[apart].sum()), int(apart.sum())),
+        (int(first_outside.sum()), len(s.z)),
         samples=len(s.v),
         rank=calibration.chosen.features,
         smallest_singular=calibration.smallest_singular,
         condition=calibration.condition,
-        windows=plans,
-        violations=int(outside[apart].sum()),
-        step_violations=steps_outside,
-        bound_step=bound_step,
-        bound_plan=upper_bound(int(outside[apart].sum()), plans),
-        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
-        outside_episode=bound_step * EPISODE,
-        outside_hour=bound_step * HOUR / robot.period,
-        half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
-        half_width_full=ready.half_width(np.asarray(robot.high())),
-        clearance_margin=ready.clearance_margin,
         excess=float(calibration.scores.max(initial=0.0)),
         inflation=calibration.factor,
         marginal=_marginal(outside),
@@ -295,6 +268,28 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
         unit="m" if robot.position_dim else "1",
         chosen=calibration.chosen,
         candidates=calibration.candidates,
+    )
+
+
+def _statement(model: ModelSet, plans: tuple[int, int], steps: tuple[int, int], **more: Any) -> ValidationReport:
+    """Return the statement. plans, steps: the number of those outside, and of all; more: the other attributes."""
+    robot, config, ready, bound_step = model.robot, model.model_config, Filter(model), upper_bound(*steps)
+    return ValidationReport(
+        certificate=config.certificate,
+        mode=config.mode,
+        version=model.version,
+        windows=plans[1],
+        violations=plans[0],
+        step_violations=steps[0],
+        bound_step=bound_step,
+        bound_plan=upper_bound(*plans),
+        bound_episode=1.0 - (1.0 - bound_step) ** EPISODE,
+        outside_episode=bound_step * EPISODE,
+        outside_hour=bound_step * HOUR / robot.period,
+        half_width_rest=ready.half_width(np.zeros(robot.action_dim)),
+        half_width_full=ready.half_width(np.asarray(robot.high())),
+        clearance_margin=ready.clearance_margin,
+        **more,
     )
 
 
@@ -344,3 +339,25 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, lis
             parts.append(shares_of(w.stopping_distance[i : i + CHUNK, None], sizes[:, -1, None]))
         found[i : i + CHUNK] = np.concatenate(parts, axis=1)
     return found, names
+
+
+def facet_normals(generators: Array) -> Array:
+    """Return the normals (facets, n) of a full-dimensional zonotope with generators (n, g), n <= 3.
+
+    A point lies in the set exactly if it passes the support test in these directions and their opposites.
+
+    Raises:
+        ValueError: the zonotope has more than three dimensions.
+    """
+    n, count = generators.shape
+    if n == 1:
+        return np.ones((1, 1))
+    if n == 2:
+        normals = np.stack([-generators[1], generators[0]], axis=1)
+    elif n == 3:
+        pairs = list(combinations(range(count), 2))
+        normals = np.cross(generators[:, [i for i, _ in pairs]].T, generators[:, [j for _, j in pairs]].T)
+    else:
+        raise ValueError(f"facets are enumerated up to 3 dimensions, not {n}")
+    length = np.linalg.norm(normals, axis=1)
+    return np.asarray(normals[length > 1e-14] / length[length > 1e-14, None])

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadData
 from brakeline.messaging.obstacle import rotate
-from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
+from brakeline.messaging.robot import INPUT_TOLERANCE, Array, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_config import FREE as FREE
 from brakeline.safety.model.model_config import PLAN as PLAN
 from brakeline.safety.model.model_config import ModelConfig
-
-Array = NDArray[np.float64]
 
 FEWEST_WINDOWS = ModelConfig.fewest
 WORST_CONDITION = 1e4  # of the whitened regressors' second moment
@@ -83,12 +81,16 @@ def windows(data: Dataset, k: int, kind: str = PLAN) -> Windows:
     )
 
 
+def recorded_domain(data: Dataset) -> Array:
+    """Return the smallest and the largest [x_0; input in force] (2, regressor_dim) in the data."""
+    known = windows(data, 1).z[:, : data.robot.regressor_dim]
+    return np.stack([known.min(0), known.max(0)])
+
+
 def plan_regressor_map(robot: Robot) -> Array:
     """Return T with z' = T z, from the regressors of a plan window to those of a free window."""
-    known = robot.regressor_dim
-    S = robot.plan_matrix()
-    T = np.zeros((known + len(S), known + S.shape[1]))
-    T[:known, :known] = np.eye(known)
+    known, S = robot.regressor_dim, robot.plan_matrix()
+    T = np.eye(known + len(S), known + S.shape[1])
     T[known:, known:] = S
     return T
 
@@ -125,9 +127,7 @@ def _free_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Arr
 
 def _windows_of(data: Dataset, t: Trajectory, k: int, number: int, start: NDArray[np.intp], chosen: Array) -> Windows:
     robot = data.robot
-    earlier = np.zeros(robot.action_dim) if t.before is None else t.before
-    before = np.vstack([earlier, t.inputs])[start]
-    z = np.hstack([t.states[start][:, list(robot.regressor)], before, chosen])
+    z = np.hstack([t.states[start][:, list(robot.regressor)], t.in_force()[start], chosen])
     y = displacement(robot, t.states[start], t.states[start + k])
     off, travel = ways(robot, t)
     chord_deviation = (off + data.chord_deviation)[start + k - 1]
@@ -159,8 +159,7 @@ _found: WeakKeyDictionary[Trajectory, tuple[Robot, Array, Array]] = WeakKeyDicti
 
 def _braked(robot: Robot, t: Trajectory) -> Array:
     """Return the inputs (T, m) that the stop rules give for each state while braking."""
-    earlier = np.zeros((1, robot.action_dim)) if t.before is None else t.before[None]
-    return robot.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], np.vstack([earlier, t.inputs[:-1]]))
+    return robot.stop_by_feedback(np.zeros_like(t.inputs), t.states[:-1], t.in_force())
 
 
 def stop_input_periods(robot: Robot, t: Trajectory) -> NDArray[np.bool_]:

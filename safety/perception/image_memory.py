@@ -70,10 +70,8 @@ class ImageMemory(VisibilityMemory[RangeImage]):
     def _store(self, scan: RangeImage) -> None:
         if self._stored and math.dist(self._stored[-1].image.at, scan.at) < SPACING:
             return
-        if len(self._stored) == CAPACITY:
-            self._ages.pop(0)
         self._stored.append(_StoredImage(scan))
-        self._ages.append(scan.age)
+        self._ages = [*self._ages, scan.age][-CAPACITY:]
 
     def _free_along(self, scan: RangeImage, beams: NDArray[np.bool_]) -> Array:
         elevations = scan.low + scan.step[0] * np.arange(len(scan.ranges))

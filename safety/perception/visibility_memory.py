@@ -172,10 +172,8 @@ class FanMemory(VisibilityMemory[Scan]):
             moved = math.dist(last[:2], scan.pose[:2]) + 0.25 * abs(math.remainder(scan.pose[2] - last[2], math.tau))
             if moved < SPACING:
                 return
-        if len(self._stored) == CAPACITY:
-            self._ages.pop(0)
         self._stored.append(_StoredScan(scan, *scan.sensor(), _range_minima(minimum_by_sector(*gaps(scan), SECTORS))))
-        self._ages.append(scan.age)
+        self._ages = [*self._ages, scan.age][-CAPACITY:]
 
     def _free_along(self, scan: Scan, beams: NDArray[np.bool_]) -> Array:
         at, heading = scan.sensor()

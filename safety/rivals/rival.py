@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from brakeline.messaging.robot import Array
-from brakeline.safety.filter.backup_plan import NO_PREDICTION
-from brakeline.safety.filter.braking import brake, braking_plan
-from brakeline.safety.filter.request import FAILSAFE, NOT_FINITE, Decision, Request, check_for_rival
+from brakeline.safety.filter.backup_plan import NO_PREDICTION, brake, braking_plan
+from brakeline.safety.filter.request import FAILSAFE, NOT_FINITE, Decision, Request, check_motion
 from brakeline.safety.rivals.pretrained import Pretrained
 
 
@@ -42,10 +41,10 @@ class Rival(ABC):
         Raises:
             BadRequest: a value is missing, not finite, or has the wrong size; `field` names it.
         """
-        check_for_rival(self.robot, request, self.observed)
+        check_motion(self.robot, request, {"observation": (request.observation, (self.observed,))})
 
     def braking(self, request: Request, started: int, reason: str) -> Decision:
-        """Return the failsafe: the backup policy from now on (`safety/filter/braking.py`)."""
+        """Return the failsafe: the backup policy from now on (`backup_plan.brake`)."""
         before = request.input_in_force
         plan = braking_plan(self.robot, self.robot.clip_input(brake(self.robot, before), before))
         return self.decision(FAILSAFE, plan, 0.0, started, reason=reason)

@@ -6,8 +6,8 @@ the expected cost of action a followed by the backup policy μ, and V(s) is the 
     intervene  ⟺  Q(s, a) − V(s) > η                 (their eq. 6: the advantage of a over μ); then execute μ(s)
 
 Q and V are learned beforehand, with two networks each: the larger Q and the smaller V count. μ brakes
-(`safety/filter/braking.py`). In training, an intervention ends the episode: the learner sees a terminal step with the
-lowest reward (`actors/episode_runner.py`, `learner/n_step.py`). In use, the rule applies anew at every step.
+(`backup_plan.brake`). In training, an intervention ends the episode: the learner sees a terminal step with the lowest
+reward (`actors/episode_runner.py`, `learner/n_step.py`). In use, the rule applies anew at every step.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadModel
 from brakeline.messaging.robot import Array, Robot
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.request import ALLOWED, Decision, Request
-from brakeline.safety.model.model_config import SAILR as SAILR
+from brakeline.safety.model.model_config import SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
 

@@ -22,10 +22,10 @@ from brakeline.errors import BadModel
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.robot import Array, Robot, shipped_robots
 from brakeline.messaging.task import robot_with_task
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
-from brakeline.safety.model.model_config import SECAS as SECAS
+from brakeline.safety.model.model_config import SECAS
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.rival import Rival
 

@@ -15,10 +15,10 @@ import math
 import numpy as np
 
 from brakeline.messaging.robot import Array
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
-from brakeline.safety.model.model_config import CBF as CBF
+from brakeline.safety.model.model_config import CBF
 from brakeline.safety.rivals.model_by_hand import RivalByHand, is_unicycle
 from brakeline.safety.rivals.pretrained import Pretrained
 

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from brakeline.messaging.robot import Array
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.filter.qp_solver import QuadraticProgram, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, Decision, Request
 from brakeline.safety.model.model_config import CBF

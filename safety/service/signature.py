@@ -34,11 +34,12 @@ from cryptography.hazmat.primitives.serialization import (
 
 from brakeline.errors import BadModel, Untrusted
 from brakeline.messaging.atomic_files import write_atomically, write_secret
+from brakeline.messaging.robot import Array
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.methods import Model, decode
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.model_set import Array, ModelSet
-from brakeline.safety.model.windows import windows
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.windows import recorded_domain
 
 log = logging.getLogger("brakeline.safety")
 
@@ -210,13 +211,7 @@ class TrustedSigners:
         raise Untrusted("no trusted signer signed the model")
 
 
-def recorded_domain(data: Dataset) -> Array:
-    """Return the smallest and the largest [x_0; input in force] (2, regressor_dim) in the data."""
-    known = windows(data, 1).z[:, : data.robot.regressor_dim]
-    return np.stack([known.min(0), known.max(0)])
-
-
-def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = (ANY,)) -> None:
+def write_signer(folder: Path, robots: tuple[str, ...] = (ANY,)) -> None:
     """Write a new private key, and its public key among the trusted ones, if the folder has none yet."""
     if (folder / KEY).exists():
         return
@@ -224,7 +219,7 @@ def write_signer(folder: Path, name: str = "certify", robots: tuple[str, ...] = 
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     write_secret(folder / KEY, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     signer = {"key": public.hex(), "robots": list(robots)}
-    write_atomically(folder / SIGNERS / f"{name}.json", json.dumps(signer, indent=2).encode())
+    write_atomically(folder / SIGNERS / "certify.json", json.dumps(signer, indent=2).encode())
 
 
 def _claim(signed: SignedModel) -> dict[str, Any]:

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 
 from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
+from brakeline.messaging.task import ArenaKind, Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
-from brakeline.sim.batch.batch_factory import vehicle_batch
 from brakeline.sim.batch.batch_support import check_batch
+from brakeline.sim.batch.ground_batch import GroundBatch
 from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.batch.observation_batch import GroundObservationBatch, ObservationBatch, QuadrotorObservationBatch
-from brakeline.sim.batch.vehicle_batch import PeriodBatch
+from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
+from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.ground_estimator import wrap
 from brakeline.sim.navigation_env import OBSERVED_LIMIT
 from brakeline.sim.sim_conditions import Conditions
@@ -261,3 +262,12 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "speed": self._observations.speeds(period.true),
             "episode_seed": self._seeds[rows],
         }
+
+
+def vehicle_batch(
+    robot: RobotWithTask, size: int, kind: ArenaKind, conditions: Conditions, threads: int, streams: NormalStreams
+) -> VehicleBatch:
+    """Return `size` robots, each for an arena of this kind. threads: for the physics. streams: of all sensor errors."""
+    if robot.position_dim == 3:
+        return QuadrotorBatch(size, kind, conditions, streams)
+    return GroundBatch(size, kind, conditions, threads if threads > 1 else 0, streams)

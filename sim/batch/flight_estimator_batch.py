@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array
-from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.autopilot.ned_frames import attitude
+from brakeline.sim.batch.normal_streams import NormalStreams, Rows
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.kernels.flight_kernels import GRAVITY
 
-Rows = NDArray[np.intp]
-
-HALF_ROOT = np.sqrt(0.5)
 CONJUGATE, FORWARD_RIGHT_DOWN = np.array([1.0, -1.0, -1.0, -1.0]), np.array([1.0, -1.0, -1.0])
 
 
@@ -81,6 +78,6 @@ def _tilted(q: Array, angles: Array) -> Array:
 
 
 def _to_ned(q: Array) -> Array:
-    """Convert attitudes (rows, 4) from (ENU, forward-left-up) to (NED, forward-right-down): `ned_frames.attitude`."""
+    """Convert attitudes (rows, 4) from (ENU, forward-left-up) to (NED, forward-right-down)."""
     w, x, y, z = q.T
-    return np.asarray(HALF_ROOT * np.column_stack([w + z, x + y, x - y, w - z]))
+    return np.column_stack(attitude((w, x, y, z)))

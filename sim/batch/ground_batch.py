@@ -19,7 +19,7 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
-from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.normal_streams import NormalStreams, Rows
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
@@ -39,8 +39,6 @@ from brakeline.sim.ground_robot import (
     wheel_speeds,
 )
 from brakeline.sim.sim_conditions import Conditions
-
-Rows = NDArray[np.intp]
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
@@ -130,8 +128,7 @@ class GroundBatch(VehicleBatch):
             far = rows[~near]
             coordinates[~near] = self._roll(far, controls[~near], forces[~near])
             clearance[~near] = self.obstacles.clearance(far, coordinates[~near, :, :2]) - GROUND.footprint
-            doubtful = clearance.min(axis=1) < SAFE_GAP
-            near |= doubtful & ~near
+            near |= clearance.min(axis=1) < SAFE_GAP
         for i in np.flatnonzero(near):
             self._state[rows[i]], self._warmstart[rows[i]] = before[0][i], before[1][i]
             collision[i] = self._advance_in_arena(int(rows[i]), coordinates[i], controls[i], forces[i])

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array
-from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.normal_streams import NormalStreams, Rows
 from brakeline.sim.ground_estimator import Estimator, steady_gain, wrap
 from brakeline.sim.sim_conditions import NoiseLevels
-
-Rows = NDArray[np.intp]
 
 
 class GroundEstimatorBatch:

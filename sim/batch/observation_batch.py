@@ -6,15 +6,12 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import RobotWithTask
-from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.normal_streams import NormalStreams, Rows
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch
 from brakeline.sim.observations import GOAL_DISTANCE_SCALE, GroundObservation, QuadrotorObservation
-
-Rows = NDArray[np.intp]
 
 
 class ObservationBatch(ABC):

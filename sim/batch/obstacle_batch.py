@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
+from brakeline.sim.batch.normal_streams import Rows
 from brakeline.sim.kernels.arena_kernels import distances_in_arenas
 from brakeline.sim.kernels.ray_kernels import cast
-
-Rows = NDArray[np.intp]
 
 FACES_IN_PLANE, FACES_IN_SPACE = 4, 6  # obstacles that bound a room
 

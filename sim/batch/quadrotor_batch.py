@@ -18,7 +18,7 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.flight_estimator_batch import FlightEstimatorBatch
-from brakeline.sim.batch.normal_streams import NormalStreams
+from brakeline.sim.batch.normal_streams import NormalStreams, Rows
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.flight_controller import Controllers, controllers_at_rest
 from brakeline.sim.kernels.flight_kernels import (
@@ -34,8 +34,6 @@ from brakeline.sim.kernels.flight_kernels import (
 )
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES, SETTLE, arena_model
 from brakeline.sim.sim_conditions import Conditions
-
-Rows = NDArray[np.intp]
 
 TICKS = round(QUADROTOR.period / (STEPS_OF_TICK * TIMESTEP))  # of the autopilot, in a period
 OUTER_STEPS = round(QUADROTOR.period / OUTER)  # of the velocity loop, in a period

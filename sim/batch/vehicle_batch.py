@@ -13,9 +13,8 @@ from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
+from brakeline.sim.batch.normal_streams import Rows
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch
-
-Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
 from tests.actors.conftest import no_answer
 from tests.robots import GROUND
+from tests.safety.asked import apart
 
 SIZE = 4
 ROUNDING = 1e-6  # m
@@ -48,7 +49,7 @@ def begin_close_together(fleet):
 def least_distance(fleet):
     """Return the least distance between two reservations [m]."""
     reservations = [r.backup_plan.reservation for r in fleet.runners if r.backup_plan.reservation is not None]
-    return min((a.distance(b) for a, b in combinations(reservations, 2)), default=np.inf)
+    return min((apart(a, b) for a, b in combinations(reservations, 2)), default=np.inf)
 
 
 def drive(fleet, ask, policy, periods, lost=0.0, seed=0):

@@ -22,7 +22,7 @@ from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadData
 from brakeline.messaging.obstacle import BOX, Obstacle
 from brakeline.messaging.task import RobotWithTask, address, robot_with_task
-from brakeline.safety.filter.braking import braking_plan
+from brakeline.safety.filter.backup_plan import braking_plan
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.validation import ValidationReport

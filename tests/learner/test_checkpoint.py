@@ -10,7 +10,7 @@ import pytest
 
 from brakeline.errors import CheckpointError
 from brakeline.learner import checkpoint
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from tests.faults.failing_calls import Died, failing, full
 from tests.fuzz.mutations import flipped
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from brakeline.errors import CheckpointError, DamagedPart
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brakeline.learner.checkpoint_state import PartState
+from brakeline.learner.checkpoint import PartState
 from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.rate_limiter import RateLimiter
 from brakeline.learner.replay import Batch, ReplayBuffer, Transition

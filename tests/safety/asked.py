@@ -1,4 +1,4 @@
-"""Requests to the ground robot's filter, and an exact check of its tubes."""
+"""Requests to the ground robot's filter, an exact check of its tubes, and the distance of reservations."""
 
 from dataclasses import fields, is_dataclass
 
@@ -6,12 +6,19 @@ import numpy as np
 
 from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
 from brakeline.safety.filter.request import Request
+from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.model.model_set import ModelSet
 from tests.robots import GROUND
 
 NONE = Shapes.of([], 2)
 STILL = np.zeros((3, 2))
 MEASURED = ("time_ms", "solve_ms", "verify_ms", "queue_ms", "plan_tokens")
+
+
+def apart(one: Reservation, other: Reservation) -> float:
+    """Return the distance [m] of two reservations in their nearest period; 0 or less if they overlap."""
+    between = np.abs(one.center - other.center) - one.half_width - other.half_width
+    return float((np.linalg.norm(np.maximum(between, 0.0), axis=1) - one.radius - other.radius).min())
 
 
 def cylinder(x, y, radius=0.1):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brakeline.messaging.obstacle import Obstacle, rotate
+from brakeline.messaging.obstacle import Obstacle, Shapes, rotate
 from brakeline.messaging.robot import Disc
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
@@ -30,24 +30,9 @@ CORRIDOR = [
 ]
 
 
-def clearance(obstacles, points):
-    """Return the least distance [m] of true positions (n, 2) to the solids, by their definitions."""
-    distances = []
-    for o in obstacles:
-        offset = points - np.array(o.position)
-        local = rotate(offset, -o.yaw)
-        if o.kind == "wall":
-            distances.append(local[:, 0])
-        elif o.kind == "cylinder":
-            distances.append(np.hypot(*offset.T) - o.size[0])
-        else:
-            distances.append(np.hypot(*np.maximum(np.abs(local) - 0.5 * np.array(o.size), 0.0).T))
-    return np.min(distances)
-
-
 def drive(ready, obstacles, policy, steps, seed):
     """Return the decisions' kinds, the least clearance of the disc, the violations and the longest wait for a turn."""
-    rng = np.random.default_rng(seed)
+    rng, shapes = np.random.default_rng(seed), Shapes.of(obstacles, 2)
     robot, safety = Unicycle((0, 0, 0), rng), InProcess(ready, accept_bound=1.0)
     counts, least, violations, waiting, longest = dict.fromkeys((ALLOWED, ADJUSTED, FAILSAFE), 0), np.inf, 0, 0, 0
     for k in range(steps):
@@ -60,7 +45,7 @@ def drive(ready, obstacles, policy, steps, seed):
         wants = abs(action[1]) > 0.3
         waiting = waiting + 1 if wants and abs(turned) < 0.01 else (0 if wants else waiting)
         longest = max(longest, waiting)
-        least = min(least, clearance(obstacles, before[:2] + rotate(path, before[2])) - GROUND.footprint)
+        least = min(least, shapes.distance(before[:2] + rotate(path, before[2])).min() - GROUND.footprint)
     return counts, least, violations, longest
 
 

@@ -21,7 +21,7 @@ from brakeline.safety.model.error_bounds import (
     set_membership,
     whitening,
 )
-from brakeline.safety.model.facet_normals import facet_normals
+from brakeline.safety.model.validation import facet_normals
 from tests.safety.linear import PUBLISHED, count_outside, double_integrator, lti5
 
 pytestmark = pytest.mark.fast

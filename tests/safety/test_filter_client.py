@@ -24,8 +24,9 @@ from brakeline.safety.service.fleet_client import FleetClient
 from brakeline.safety.service.in_process import InProcess
 from tests.messaging.conftest import endpoint, join  # noqa: F401 - fixtures
 from tests.robots import GROUND
-from tests.safety.asked import cylinder, request, same
+from tests.safety.asked import apart, cylinder, request, same
 from tests.safety.served import Service, ServiceClient
+from tests.safety.test_scan_free_space import FAN
 from tests.safety.unicycle import Unicycle
 
 LATE = GROUND.in_real_time()
@@ -64,7 +65,6 @@ def test_the_action_of_a_late_robot_is_the_input_of_the_next_period(late, ask):
     assert np.array_equal(second.action, client.backup_plan.next_input)
 
 
-FAN = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 WALL = Scan(np.full(360, 0.13), FAN, (0.0, 0.0, 0.0))  # 13 cm away all round
 
 
@@ -181,7 +181,7 @@ def test_two_robots_that_drive_at_each_other_do_not_meet(fleet):
             robot.step(answer.action)
         moved = max(moved, robots[0].state[0] + 0.25)
         one, other = (backup_plan.reservation for backup_plan in fleet.backup_plans)
-        assert one.distance(other) > 0.0
+        assert apart(one, other) > 0.0
         assert np.hypot(*(robots[0].state[:2] - robots[1].state[:2])) > 2.0 * GROUND.footprint
     assert moved > 0.02, "they stood all the time"
     fleet.reset()

@@ -9,9 +9,8 @@ from brakeline.deploy.data.excitation import excitation
 from brakeline.errors import BadData
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.safety.model.dataset import Dataset, Trajectory
-from brakeline.safety.model.error_bounds import KINDS, RESIDUAL
 from brakeline.safety.model.fitting import fit_model_set
-from brakeline.safety.model.model_set import ModelConfig
+from brakeline.safety.model.model_config import KINDS, RESIDUAL, ModelConfig
 from brakeline.safety.model.validation import validate
 from brakeline.safety.model.windows import FREE, PLAN, plan_regressor_map, windows
 

@@ -11,9 +11,10 @@ from hypothesis.extra.numpy import arrays
 
 from brakeline.errors import BadData, BadModel, BadTensors, ErrorBoundError
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.model.error_bounds import KINDS, least_squares
+from brakeline.safety.model.error_bounds import least_squares
 from brakeline.safety.model.fitting import fit_model_set
-from brakeline.safety.model.model_set import DIRECT, ENTRY, MODES, ModelConfig, ModelSet
+from brakeline.safety.model.model_config import DIRECT, KINDS, MODES, ModelConfig
+from brakeline.safety.model.model_set import ENTRY, ModelSet
 from brakeline.safety.model.tensor_file import content, has_entry, pack, unpack
 from brakeline.safety.model.validation import upper_bound, validate
 from brakeline.safety.model.windows import periods_until_standing, windows

@@ -31,13 +31,13 @@ from brakeline.messaging.topics import HEALTH, MODEL
 from brakeline.safety.methods import archive_path, decode
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
+from brakeline.safety.model.windows import recorded_domain
 from brakeline.safety.service.server import ModelRegistry
 from brakeline.safety.service.signature import (
     CONTEXT,
     ModelSigner,
     SignedModel,
     TrustedSigners,
-    recorded_domain,
     seal_of,
     write_signer,
 )

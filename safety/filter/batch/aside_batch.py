@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from brakeline.safety.filter.batch.constraint_batch import taken
+from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.batch.qp_batch import ROUNDING
 from brakeline.safety.filter.batch.search_batch import CandidateBatch, LaneBatch, SearchBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
@@ -14,8 +15,6 @@ from brakeline.safety.filter.turning_aside import BEYOND_EDGE, is_blocked, may_t
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
-
-Array = Any  # of any namespace
 
 NEARLY = 1e-5  # of an input: as blocked as this may be, the single path decides
 MOST_EDGES = 64  # of sectors; a lane with more of them in a row is left to the single path

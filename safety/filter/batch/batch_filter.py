@@ -22,15 +22,13 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.batch.decision_arrays import KINDS, BlockingArrays, DecisionArrays
 from brakeline.safety.filter.batch.lane_decisions import LaneDecisions
-from brakeline.safety.filter.batch.obstacle_arrays import on_host
+from brakeline.safety.filter.batch.obstacle_arrays import Array, on_host
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.request import Decision
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
     from brakeline.safety.methods import Method
-
-Array = Any  # of any namespace
 
 
 class BatchFilter:

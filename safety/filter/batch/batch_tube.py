@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
-
-Array = Any  # of any namespace
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
 from brakeline.safety.filter.batch.batch_tube import PathBatch, TubeBatch
-from brakeline.safety.filter.batch.obstacle_arrays import Axes, NearObstacles
+from brakeline.safety.filter.batch.obstacle_arrays import Array, Axes, NearObstacles, TurnBatch, mapped
 from brakeline.safety.filter.batch.plane_batch import EndBatch, PlaneBatch, planes_beside
-from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.constraints import TubeConstraints
 
 T = TypeVar("T")
-Array = Any  # of any namespace
 
 
 @dataclass(frozen=True)
@@ -67,17 +65,12 @@ class ConstraintBatch:
 
     # --- one batch of plans ----------------------------------------------------------------------------------------
 
-    def around(self, scene: SceneBatch, z: Array) -> PlanBatch:
-        """Return the plans with regressors z (nz, B), with the half-spaces around them."""
+    def around(self, scene: SceneBatch, z: Array, planes: list[PlaneBatch] | None = None) -> PlanBatch:
+        """Return the plans with regressors z (nz, B). planes: the half-spaces; None: those around the plans."""
         path, sizes = self.tube.path(z), self.tube.sizes(z, scene.widening)
-        planes = self._planes(scene, path)
+        if planes is None:
+            planes = self._planes(scene, path)
         return PlanBatch(z, path, sizes, planes, self.slack(planes, path, sizes), self.extent(scene, path, sizes))
-
-    def moved_to(self, scene: SceneBatch, plan: PlanBatch, z: Array) -> PlanBatch:
-        """Return the plans with regressors z (nz, B), with the half-spaces of other plans."""
-        path, sizes = self.tube.path(z), self.tube.sizes(z, scene.widening)
-        slack = self.slack(plan.planes, path, sizes)
-        return PlanBatch(z, path, sizes, plan.planes, slack, self.extent(scene, path, sizes))
 
     def _planes(self, scene: SceneBatch, path: PathBatch) -> list[PlaneBatch]:
         found = []
@@ -176,13 +169,4 @@ def taken(xp: Any, whole: T, lanes: Array) -> T:
 
     An array for all lanes, and None, stay as they are.
     """
-    part: Any = whole
-    if isinstance(part, list):
-        part = [taken(xp, one, lanes) for one in part]
-    elif isinstance(part, tuple):
-        part = type(part)(*(taken(xp, one, lanes) for one in part))
-    elif hasattr(part, "__dataclass_fields__"):
-        part = type(part)(*(taken(xp, getattr(part, f.name), lanes) for f in fields(part)))
-    elif part is not None and part.shape[-1] != 1:
-        part = xp.take(part, lanes, axis=-1)
-    return part  # type: ignore[no-any-return]
+    return mapped(whole, lambda part: xp.take(part, lanes, axis=-1) if part.shape[-1] != 1 else part)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host
+from brakeline.safety.filter.batch.obstacle_arrays import Array, ObstacleArrays, on_host
 from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision
 from brakeline.safety.filter.turning_aside import turns_aside_to
-
-Array = Any  # of any namespace
 
 KINDS = (ALLOWED, ADJUSTED, FAILSAFE, RECOVERING)  # `DecisionArrays.kind` holds their indices
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-Array = Any  # of any namespace
+from brakeline.safety.filter.batch.obstacle_arrays import Array
 
 MOST_STEPS = 60  # a lane that has not ended then counts as not solved
 TOLERANCE = 1e-12  # of unit rows in scaled variables, and of their multipliers

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,12 +12,18 @@ from brakeline.safety.filter.backup_plan import SAME_SET
 from brakeline.safety.filter.batch.aside_batch import AsideBatch
 from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch, taken
 from brakeline.safety.filter.batch.decision_arrays import KINDS
-from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host, within_reach
+from brakeline.safety.filter.batch.obstacle_arrays import (
+    Array,
+    ObstacleArrays,
+    TurnBatch,
+    mapped,
+    on_host,
+    within_reach,
+)
 from brakeline.safety.filter.batch.qp_batch import ROUNDING
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.batch.score_batch import ScoreBatch
 from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
-from brakeline.safety.filter.batch.turn_batch import TurnBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
@@ -25,8 +31,6 @@ from brakeline.safety.model.model_set import ModelSet
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
-
-Array = Any  # of any namespace
 
 # Numbers that a processor's cache can hold: a plan's rows for one obstacle, and for all near ones, of all lanes at once
 PLAN_ROWS, ROWS = 1 << 14, 1 << 17
@@ -53,13 +57,13 @@ class LaneDecisions:
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
         self._domain = constant(safety.domain[:, :, None])
         self._schedule = constant(safety.inputs.schedule)
-        self._general = _Sets(self._constraints, _NextState(safety.model, safety.tube, constant, xp))
+        self._general = _Sets(self._constraints, safety.model, safety.tube, constant, xp)
         self._box, self._turning = None, self._general
         turning = safety.model.turning()
         if safety.in_place is not None and turning is not None:
             box, own = safety.in_place
             self._box = constant(box[:, :, None])
-            self._turning = _Sets(ConstraintBatch(own, constant, xp), _NextState(turning, own.tube, constant, xp))
+            self._turning = _Sets(ConstraintBatch(own, constant, xp), turning, own.tube, constant, xp)
         rollout = self._constraints.tube.rollout
         self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
         self._lanes, self._rows = LANES_ON_DEVICE, ROWS_ON_DEVICE
@@ -162,7 +166,9 @@ class LaneDecisions:
             most = int(xp.max(xp.take(count, own, axis=0)))
             own = own[: max(FEWEST, self._rows // (rows * max(most, 1)))]
             first += own.shape[0]
-            yield taken(xp, lanes, own).with_slots(most), own
+            part = taken(xp, lanes, own)
+            near = mapped(part.scene.near, itemgetter(slice(most)))
+            yield replace(part, scene=replace(part.scene, near=near)), own
 
     def _allow(
         self, requests: RequestArrays, lanes: LaneBatch, rows: Array, answers: dict[str, Any]
@@ -222,10 +228,8 @@ class LaneDecisions:
             getattr(answers["blocked"], name)[to] = value
         z = xp.where(goes_on, xp.concat([lanes.z_0, lanes.committed]), found.z)
         plan = c.around(scene, xp.take(z, done, axis=-1))
-        margin = xp.where(goes_on, 0.0, found.margin)
-        margin = xp.where(
-            xp.take(goes_on, done, axis=0), c.least(scene, plan.slack, plan.extent), xp.take(margin, done)
-        )
+        least, own = c.least(scene, plan.slack, plan.extent), xp.take(found.margin, done, axis=0)
+        margin = xp.where(xp.take(goes_on, done, axis=0), least, own)
         self._write(self._general, requests, scene, plan, margin, to, answers)
         kept = xp.take(rows, xp.nonzero(goes_on)[0], axis=0)
         answers["plan"][kept] = xp.take(requests.plan, kept, axis=0)
@@ -301,12 +305,8 @@ class LaneDecisions:
         xp, predicted, heading = self._xp, requests.predicted, self._robot.heading
         if predicted is None:
             return xp.ones_like(rows, dtype=xp.bool)
-        center, half, turned, given = (xp.take(part, rows, axis=0) for part in vars(predicted).values())
-        off = [state[:, i] - center[:, i] for i in range(state.shape[1])]
-        if heading is not None:
-            off = TurnBatch(xp.cos(turned), xp.sin(turned)).to_robot(off)
-            off[heading] = xp.remainder(off[heading] + math.pi, math.tau) - math.pi
-        return xp.all(xp.abs(xp.stack(off, axis=1)) <= half + SAME_SET, axis=1) | ~given
+        own = mapped(predicted, lambda part: xp.take(part, rows, axis=0))
+        return xp.all(own.errors(xp, state, heading) <= own.half_width + SAME_SET, axis=1) | ~own.given
 
     def _write_scores(self, requests: RequestArrays, state: Array, to: Array, answers: dict[str, Any]) -> None:
         """Write the scores of past windows."""
@@ -359,17 +359,11 @@ class LaneDecisions:
         }
 
 
-class _Sets(NamedTuple):
+class _Sets:
     """The sets of plans of one kind: of all plans, or of those that turn in place."""
 
-    constraints: ConstraintBatch
-    of_next_state: _NextState
-
-
-class _NextState:
-    """The predicted sets of the next measured states: `TubeConstraints.predict` for a batch."""
-
-    def __init__(self, model: ModelSet, tube: Tube, constant: Any, xp: Any) -> None:
+    def __init__(self, constraints: ConstraintBatch, model: ModelSet, tube: Tube, constant: Any, xp: Any) -> None:
+        self.constraints = constraints
         robot, nz, first = model.robot, tube.position.shape[2], model.first
         n = robot.state_dim
         self._xp, self._d, self._heading = xp, robot.position_dim, robot.heading
@@ -378,8 +372,11 @@ class _NextState:
         self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])
         self._widths = constant(np.abs(first.generators[:n]))
 
-    def __call__(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
-        """Return centers and half-widths (n, B), the position in the world; the heading is the change of heading."""
+    def of_next_state(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
+        """Return the predicted sets of the next measured states: `TubeConstraints.predict` for a batch.
+
+        They are centers and half-widths (n, B), the position in the world; the heading is the change of heading.
+        """
         xp, d = self._xp, self._d
         window = self._regressor @ plan.z
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)

@@ -1,10 +1,10 @@
-"""The obstacles of a batch of requests: padded arrays, and the distances from points to them (docs/method.md §3)."""
+"""The arrays of a batch: obstacles, the distances from points to them (docs/method.md §3), and rotations."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import array_api_compat
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Shapes
 
+T = TypeVar("T")
 Array = Any  # of any namespace
 Axes = list[Array]  # one array for each axis
 
@@ -22,6 +23,39 @@ def on_host(array: Array) -> NDArray[Any]:
     """Return a copy of an array of any namespace and device as NumPy's own."""
     numbers = array if isinstance(array, np.ndarray) else np.from_dlpack(array_api_compat.to_device(array, "cpu"))
     return np.array(numbers)
+
+
+def mapped(whole: T, change: Callable[[Array], Array]) -> T:
+    """Return a nested value with every array changed. Flags, texts, plain tuples and None stay as they are."""
+    part: Any = whole
+    if isinstance(part, list):
+        part = [mapped(one, change) for one in part]
+    elif hasattr(part, "_fields"):  # a named tuple
+        part = type(part)(*(mapped(one, change) for one in part))
+    elif hasattr(part, "__dataclass_fields__"):
+        part = type(part)(*(mapped(getattr(part, field.name), change) for field in fields(part)))
+    elif not (part is None or isinstance(part, bool | str | tuple)):
+        part = change(part)
+    return part  # type: ignore[no-any-return]
+
+
+class TurnBatch(NamedTuple):
+    """The cosines and sines (B,) of the headings; None for robots without a heading, whose frame is the world's."""
+
+    cos: Array
+    sin: Array
+
+    def to_world(self, robot: Axes) -> Axes:
+        """Return vectors, per axis (..., B), in the world from vectors in the robots' frames."""
+        if self.cos is None:
+            return robot
+        return [self.cos * robot[0] - self.sin * robot[1], self.sin * robot[0] + self.cos * robot[1], *robot[2:]]
+
+    def to_robot(self, world: Axes) -> Axes:
+        """Return vectors, per axis (..., B), in the robots' frames from vectors in the world."""
+        if self.cos is None:
+            return world
+        return [self.cos * world[0] + self.sin * world[1], self.cos * world[1] - self.sin * world[0], *world[2:]]
 
 
 @dataclass(frozen=True)
@@ -92,20 +126,6 @@ class NearObstacles:
         """Return which lanes (B,) have no obstacle; `lanes` is any array (B,) of them."""
         return xp.all(~self.used, axis=0) if self.used.shape[0] else xp.ones_like(lanes, dtype=xp.bool)
 
-    def first(self, most: int) -> NearObstacles:
-        """Return the first `most` slots."""
-        return self._each(lambda part: part[:most])
-
-    def nearest(self, xp: Any, slots: Array, most: int) -> NearObstacles:
-        """Return the first `most` of the slots in the order `slots` (K, B)."""
-        return self._each(lambda part: xp.take_along_axis(part, slots[:most], axis=0))
-
-    def _each(self, change: Any) -> NearObstacles:
-        def through(part: Any) -> Any:
-            return [through(one) for one in part] if isinstance(part, list) else change(part)
-
-        return NearObstacles(*(through(getattr(self, field.name)) for field in fields(self)))
-
 
 def within_reach(xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array) -> tuple[NearObstacles, Array]:
     """Return the obstacles within reach (B,) of positions `start` (per axis, (B,)), and the distance to the next one.
@@ -130,7 +150,7 @@ def within_reach(xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array) 
     most = int(xp.max(xp.sum(xp.astype(near, xp.int64), axis=0))) if rho.shape[0] else 0
     order = xp.argsort(xp.astype(~near, xp.int8), axis=0, stable=True) if rho.shape[0] else slot
     whole = NearObstacles(parts[0], axes, parts[1], rho, parts[2], margin, near, slot, away)
-    return whole.nearest(xp, order, most), beyond
+    return mapped(whole, lambda part: xp.take_along_axis(part, order[:most], axis=0)), beyond
 
 
 def towards(xp: Any, near: NearObstacles, points: Axes) -> tuple[Axes, Array]:

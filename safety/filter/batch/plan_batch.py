@@ -8,7 +8,6 @@ plans.reset(ended)                                       # the robots whose epis
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -137,21 +136,12 @@ class BackupPlanBatch:
     def contains(self, states: Array) -> Flags:
         """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""
         sets = self.predicted
-        return np.asarray(sets.given & (self._errors(states) <= sets.half_width + SAME_SET).all(axis=1))
-
-    def _errors(self, states: Array) -> Array:
-        """Return the distances (B, n) of measured states from the centers of the predicted sets."""
-        sets, away = self.predicted, states - self.predicted.center
-        if (heading := self.robot.heading) is not None:
-            cos, sin = np.cos(sets.heading), np.sin(sets.heading)
-            x, y = away[:, 0].copy(), away[:, 1].copy()
-            away[:, 0], away[:, 1] = cos * x + sin * y, cos * y - sin * x
-            away[:, heading] = (away[:, heading] + math.pi) % math.tau - math.pi
-        return np.asarray(np.abs(away))
+        errors = sets.errors(np, states, self.robot.heading)
+        return np.asarray(sets.given & (errors <= sets.half_width + SAME_SET).all(axis=1))
 
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
-        errors = self._errors(states)
+        errors = self.predicted.errors(np, states, self.robot.heading)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(errors == 0.0, 0.0, errors / self.predicted.half_width)
         return np.asarray(shares.max(axis=1))  # `_judge` takes NaN as infinite

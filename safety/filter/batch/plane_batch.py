@@ -9,11 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from brakeline.safety.filter.batch.obstacle_arrays import Axes, NearObstacles, towards
-from brakeline.safety.filter.batch.turn_batch import TurnBatch
+from brakeline.safety.filter.batch.obstacle_arrays import Array, Axes, NearObstacles, TurnBatch, towards
 from brakeline.safety.filter.halfspaces import TOUCHING
-
-Array = Any  # of any namespace
 
 UNUSED = 1e6  # m: offset of the half-space in an empty slot, which nothing ever comes near
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch
 from brakeline.safety.filter.batch.dual_active_set import BatchSolution, solve_batch
+from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.qp import ROW_TIGHTENING, QPBuilder
-
-Array = Any  # of any namespace
 
 ROUNDING = 1e-9  # m: a comparison that is closer than this may turn out otherwise in another order of the sums
 

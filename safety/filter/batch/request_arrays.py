@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import array_api_compat
 import numpy as np
 
 from brakeline.errors import BadRequest
 from brakeline.safety.filter.backup_plan import Prediction
-from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays, on_host
+from brakeline.safety.filter.batch.obstacle_arrays import Array, ObstacleArrays, TurnBatch, mapped, on_host
 from brakeline.safety.filter.request import FastRequestCheck, Request
 from brakeline.safety.filter.widening import PastWindow
-
-Array = Any  # of any namespace
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,17 @@ class PredictionArrays:
     half_width: Array
     heading: Array
     given: Array
+
+    def errors(self, xp: Any, states: Array, heading: int | None) -> Array:
+        """Return the distances (B, n) of measured states from the centers, in the predicted frames.
+
+        heading: its index in a state, as `Robot.heading`.
+        """
+        off = [states[:, i] - self.center[:, i] for i in range(states.shape[1])]
+        if heading is not None:
+            off = TurnBatch(xp.cos(self.heading), xp.sin(self.heading)).to_robot(off)
+            off[heading] = xp.remainder(off[heading] + math.pi, math.tau) - math.pi
+        return xp.abs(xp.stack(off, axis=1))
 
 
 @dataclass(frozen=True)
@@ -145,15 +155,7 @@ class RequestArrays:
         >>> RequestArrays.of([request]).mapped(lambda array: array[:0]).plan.shape
         (0, 3, 2)
         """
-
-        def through(part: Any) -> Any:
-            if part is None or isinstance(part, bool | str | list | tuple):
-                return part
-            if hasattr(part, "__dataclass_fields__"):
-                return type(part)(**{name: through(value) for name, value in vars(part).items()})
-            return change(part)
-
-        return cast(RequestArrays, through(self))
+        return mapped(self, change)
 
     def rows(self, rows: list[int]) -> RequestArrays:
         """Return some of the requests, as NumPy arrays."""

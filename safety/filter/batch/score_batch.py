@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from brakeline.safety.filter.batch.batch_tube import RolloutBatch
-from brakeline.safety.filter.batch.turn_batch import TurnBatch
+from brakeline.safety.filter.batch.obstacle_arrays import Array, TurnBatch
 from brakeline.safety.model.model_set import ModelSet, scored_coordinates
-
-Array = Any  # of any namespace
 
 
 class ScoreBatch:

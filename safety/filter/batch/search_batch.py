@@ -6,17 +6,16 @@ another order of the sums, or a QP is not surely solved, the lane is left to the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from brakeline.safety.filter.batch.constraint_batch import ConstraintBatch, PlanBatch, SceneBatch, taken
+from brakeline.safety.filter.batch.obstacle_arrays import Array
 from brakeline.safety.filter.batch.qp_batch import ROUNDING, QPBatch, RowBatch
 from brakeline.safety.filter.plan_search import AS_PROPOSED, LINEARIZATIONS
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
-
-Array = Any  # of any namespace
 
 FEW = 12  # lanes, below which the single path is faster than a further step of the search
 
@@ -29,10 +28,6 @@ class LaneBatch:
     z_0: Array  # (known, B): known regressors
     proposal: Array  # (m, B): within bounds and slew
     committed: Array  # (F·m, B): free inputs of the committed plan
-
-    def with_slots(self, most: int) -> LaneBatch:
-        """Return the lanes with the first `most` slots for near obstacles."""
-        return replace(self, scene=replace(self.scene, near=self.scene.near.first(most)))
 
 
 @dataclass(frozen=True)
@@ -251,7 +246,7 @@ class SearchBatch:
             free, close = self._as_proposed(lanes, self._within(lanes.z_0, xp.take(f, go, axis=-1)))
             unsure[index[close]] = True
             if c.tube.linear:
-                plan = c.moved_to(lanes.scene, taken(xp, plan, go), free)
+                plan = c.around(lanes.scene, free, taken(xp, plan.planes, go))
                 tight = taken(xp, rows, go)
                 inside = None if inside is None else xp.take(inside, go, axis=-1)
             else:

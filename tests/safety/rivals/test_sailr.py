@@ -6,7 +6,7 @@ import pytest
 from brakeline.errors import BadModel, BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.perceptrons import Perceptrons
-from brakeline.safety.filter.braking import brake
+from brakeline.safety.filter.backup_plan import brake
 from brakeline.safety.filter.request import NOT_FINITE, Request
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.sailr import Sailr

@@ -11,7 +11,6 @@ from brakeline.errors import BadModel, BadRequest
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import planar_rays
 from brakeline.safety.filter.backup_plan import UNVERIFIED
-from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.rivals.pretrained import Pretrained
 from brakeline.safety.rivals.secas import Constraints, Secas, closed_form, quadratic
 from tests.robots import GROUND, QUADROTOR
@@ -155,12 +154,6 @@ def test_a_request_that_cannot_be_decided_on_is_refused(field, wrong):
     with pytest.raises(BadRequest) as refused:
         Secas(known()).decide(request(**values))
     assert refused.value.field == field
-
-
-def test_a_proposal_that_is_not_finite_brakes():
-    decision = Secas(known()).decide(request((np.inf, np.nan), observation=seen(3.0), before=(0.2, 0.1)))
-    assert (decision.kind, decision.reason, decision.verified) == ("failsafe", NOT_FINITE, False)
-    assert not decision.plan.any(), "the ground robot stops at once"
 
 
 def test_a_model_of_another_shape_or_method_is_refused():
