@@ -56,7 +56,7 @@ class RunAnalysis:
         self.intervention_maps: dict[str, InterventionMap] = {}
         self.samplers: dict[str, EpisodeSampler] = {}
         self.timeline = ProcessTimeline()
-        self._received = 0  # when the recorder received the message in hand, on the run's axis [ns]
+        self._received = 0  # when the recorder received the message in hand, without jumps of its clock [ns]
         self._buffers: dict[LogChannel, tuple[EpisodeSampler, ActorBuffer]] = {}
         self._read(log)
         for sampler in self.samplers.values():
@@ -159,13 +159,19 @@ class RunAnalysis:
 
         A count of published messages would miss the latter if an actor ended while no recorder ran.
         """
-        return [*map(str, self.log.cuts), *self._unrecorded_steps()]
+        return [*cuts_in(self.log), *self._unrecorded_steps()]
 
     def _unrecorded_steps(self) -> Iterator[str]:
         for robot, metrics in self.metrics.learners.items():
             recorded = self.training[robot].recorded
             if (lost := metrics.steps - recorded) > 0:
                 yield f"{lost} of the {metrics.steps} steps that the learner of {robot} had are not in the log"
+
+
+def cuts_in(log: Log) -> list[str]:
+    """Return the damage of a log that has been read, one line each."""
+    jumps = [f"the recorder's clock jumped by {jump:+.0f} s: the figures leave that out" for jump in log.clock.jumps]
+    return [*(str(cut) for cut in log.cuts), *jumps]
 
 
 def perception_in(conditions: Mapping[str, str]) -> str:

@@ -31,7 +31,7 @@ from brakeline.logs.mcap_container import (
 )
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.run_clock import RunClock
-from brakeline.logs.segment import being_written, name_of, number_of
+from brakeline.logs.segment import ABOUT, CLOCK, STEADY, being_written, name_of, number_of
 from brakeline.messaging.bus.stated_names import check_names
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.message_checks import check
@@ -158,6 +158,8 @@ class Log:
                         self.cuts.append(replace(item, path=path, reason=reason))
                     elif isinstance(item, Metadata):
                         self.metadata[item.name] = dict(item.metadata)
+                        if item.name == ABOUT and item.metadata.get(CLOCK) == STEADY:
+                            self.clock.trust()
                         if item.name == "robots":
                             self.robots.describe(item.metadata)
                     elif isinstance(item, Attachment):

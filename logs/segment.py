@@ -32,8 +32,9 @@ Metadata = Mapping[str, Mapping[str, str]]
 Attachments = Mapping[str, bytes]  # file contents by name, e.g. model sets
 
 ABOUT = "brakeline"  # metadata of each log
+CLOCK, STEADY = "clock", "steady"  # an entry of the metadata of a log
 TIMES = {
-    "clock": "steady",
+    CLOCK: STEADY,
     "log_time": "ns since the Unix epoch, when the recorder received the message, by the clock at the recorder's "
     "start: later jumps of the computer's clock do not show",
     "publish_time": "ns of simulated (or the robot's) time where the message has one, header.time > 0; "
@@ -75,8 +76,8 @@ def name_of(path: Path | str, number: int) -> str:
 
 def number_of(path: Path) -> tuple[str, int]:
     """Return the run's name and the segment's number: ("run", 2) for run_0002.mcap, ("run", 0) for run.mcap."""
-    numbered = re.fullmatch(r"(.+?)_(\d{4,})", path.stem)
-    return (numbered[1], int(numbered[2])) if numbered else (path.stem, 0)
+    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: the names of earlier versions
+    return (numbered[1], int(numbered[2] or numbered[3])) if numbered else (path.stem, 0)
 
 
 def being_written(path: Path) -> bool:

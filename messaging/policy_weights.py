@@ -166,7 +166,7 @@ def _robot(about: Any, robot: RobotWithTask | None) -> RobotWithTask:
         robot = robot_with_task(about["robot"])
     if about["robot"] != robot.name:
         raise BadWeights(f"robot: {about['robot']!r}, not {robot.name!r}")
-    if about.get("layout") != robot.learning_layout():
+    if not robot.accepts_learning_layout(about.get("layout")):
         raise BadWeights(f"layout: {about.get('layout')!r}, but {robot.name} has {robot.learning_layout()!r}")
     return robot
 

@@ -330,6 +330,19 @@ class Robot:
         text = json.dumps([shared, self.late])  # not sorted: the order of the coordinates matters
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    def accepts_layout(self, layout: object) -> bool:
+        """Return whether a layout is this robot's, or the one it had before robots were files."""
+        return isinstance(layout, str) and layout in (self.layout(), FORMER_LAYOUTS.get(self.name))
+
+
+# Layouts of logs, model sets and policies from before robots were files.
+FORMER_LAYOUTS = {
+    "ground": "746231dcb2e4fad7",
+    "ground-late": "d013241bb63d32ac",
+    "quadrotor": "82b53a84411b2bee",
+    "quadrotor-late": "296e1f047a7fcc62",
+}
+
 
 def shipped_robots() -> tuple[str, ...]:
     """Return the names of the robots that are shipped with Brakeline."""

@@ -25,7 +25,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from brakeline.errors import UnknownName, UnknownTask
 from brakeline.extras import missing_extra
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
-from brakeline.messaging.robot import Robot, robot_named
+from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, robot_named
 from brakeline.messaging.robot_files import (
     REAL_TIME_SUFFIX,
     ROBOTS_FOLDER,
@@ -178,7 +178,7 @@ class Task:
             MissingExtra: the object needs a package that an extra brings.
             UnknownTask: the object cannot be imported.
         """
-        module, _, name = place.partition(":")
+        module, _, name = FORMER_PLACES.get(place, place).partition(":")
         try:
             if module.endswith(".py"):
                 return getattr(_module_in(self.folder / module), name)
@@ -187,6 +187,27 @@ class Task:
             if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
                 raise missing from error
             raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
+
+
+# Where task files of version 0.2 look for code, and where it is now.
+FORMER_PLACES = {
+    "deploy.quadrotors:behind_px4": "brakeline.deploy.quadrotor_vehicles:behind_px4",
+    "deploy.quadrotors:embedded": "brakeline.deploy.quadrotor_vehicles:embedded",
+    "sim.ground:simulated": "brakeline.sim.ground_robot:simulated",
+    "sim.senses:AirSenses": "brakeline.sim.observations:QuadrotorObservation",
+    "sim.senses:GroundSenses": "brakeline.sim.observations:GroundObservation",
+    "sim.senses:PlanarSenses": "brakeline.sim.observations:PlanarObservation",
+    "sim.senses:TrackingSenses": "brakeline.sim.observations:TrackingObservation",
+    "sim.policies:RandomInputs": "brakeline.sim.scripted_policies:RandomPolicy",
+    "sim.policies:Greedy": "brakeline.sim.scripted_policies:GroundGreedyPolicy",
+    "sim.policies:Adversary": "brakeline.sim.scripted_policies:GroundAdversary",
+    "sim.policies:MapDriver": "brakeline.sim.scripted_policies:GroundRoutePolicy",
+    "sim.policies:CarefulDriver": "brakeline.sim.scripted_policies:GroundCarefulPolicy",
+    "sim.pilots:GreedyPilot": "brakeline.sim.quadrotor_policies:QuadrotorGreedyPolicy",
+    "sim.pilots:HostilePilot": "brakeline.sim.quadrotor_policies:QuadrotorAdversary",
+    "sim.pilots:MapPilot": "brakeline.sim.quadrotor_policies:QuadrotorRoutePolicy",
+    "sim.pilots:CarefulPilot": "brakeline.sim.quadrotor_policies:QuadrotorCarefulPolicy",
+}
 
 
 def _module_in(path: Path) -> Any:
@@ -218,6 +239,10 @@ class RobotWithTask(Robot):
         """Return the hash of what an actor and a learner must share: the robot's layout and the observation."""
         text = json.dumps([self.layout(), *self.task.observed])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def accepts_learning_layout(self, layout: object) -> bool:
+        """Return whether a layout is this learning layout, or the one from before robots were files."""
+        return isinstance(layout, str) and layout in (self.learning_layout(), FORMER_LAYOUTS.get(self.name))
 
 
 NO_SPACE = (

@@ -213,7 +213,7 @@ class Dataset:
             raise BadData(f"{path}: {error}") from error
         if robot.name != name:
             raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
-        if about.get("layout") != robot.layout():
+        if not robot.accepts_layout(about.get("layout")):
             raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
         lengths = tensors.pop("lengths")
         tensors = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items()}

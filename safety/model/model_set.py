@@ -14,7 +14,7 @@ import numpy as np
 
 from brakeline.errors import BadModel, UnknownRobot
 from brakeline.messaging.atomic_files import write_atomically
-from brakeline.messaging.robot import Array, Robot, refuse_shipped_name, robot_named
+from brakeline.messaging.robot import FORMER_LAYOUTS, Array, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import percent
@@ -35,13 +35,6 @@ ENTRY = "model_set"
 SHIPPED = Path(__file__).parents[2] / "robots"  # model sets lie beside the descriptions of their robots
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
-# Layouts of the model sets in logs from before robots were files.
-FORMER_LAYOUTS = {
-    "ground": "746231dcb2e4fad7",
-    "ground-late": "d013241bb63d32ac",
-    "quadrotor": "82b53a84411b2bee",
-    "quadrotor-late": "296e1f047a7fcc62",
-}
 
 
 @dataclass(frozen=True)
@@ -218,7 +211,7 @@ class ModelSet:
             stands = int(about.get("stands", 0))
         except Exception as error:  # whatever a hostile file makes a parser raise
             raise BadModel(f"no model set: {error!r}") from error
-        if about.get("layout") not in (robot.layout(), FORMER_LAYOUTS.get(robot.name, robot.layout())):
+        if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
         layout = "" if about["layout"] == robot.layout() else str(about["layout"])
         if not all(t.dtype == np.float64 and np.isfinite(t).all() for t in tensors.values()):

@@ -19,7 +19,7 @@ from brakeline.errors import BadModel
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.ray_directions import LidarRays
-from brakeline.messaging.robot import Robot
+from brakeline.messaging.robot import Robot, robot_named
 from brakeline.safety.model.model_set import robot_in
 from brakeline.safety.model.tensor_file import pack, unpack
 
@@ -75,14 +75,14 @@ class Pretrained:
         """Return the model in the bytes of a file. Raises BadModel if they hold none, or one for another layout."""
         try:
             tensors, about = unpack(payload, ENTRY)
-            robot = robot_in(about)
+            robot = robot_in(about) if "description" in about else robot_named(str(about["robot"]))  # older files
             networks = {str(name): Perceptrons.of(tensors, name) for name in about["networks"]}
             settings = {str(name): float(value) for name, value in about["settings"].items()}
             rays = _rays(tensors, about)
             model = Pretrained(robot, str(about["method"]), networks, settings, dict(about["about"]), rays)
         except Exception as error:  # whatever a hostile file makes a parser raise
             raise BadModel(f"no pretrained model: {error!r}") from error
-        if about.get("layout") != robot.layout():
+        if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model is for another layout of {robot.name}: pretrain it again")
         if not np.isfinite(list(settings.values())).all():
             raise BadModel("the model's settings hold NaN or infinity")

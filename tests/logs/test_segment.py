@@ -65,8 +65,8 @@ def test_our_reader_gives_the_messages_of_every_segment_in_order(tmp_path: Path,
 
 
 def test_names_of_segments() -> None:
-    names = ("run.mcap", "run_0002.mcap", "a.b.mcap", "a_12.mcap")
-    numbers = [("run", 0), ("run", 2), ("a.b", 0), ("a_12", 0)]
+    names = ("run.mcap", "run_0002.mcap", "run.2.mcap", "a.b.mcap", "a_12.mcap")
+    numbers = [("run", 0), ("run", 2), ("run", 2), ("a.b", 0), ("a_12", 0)]
     assert [number_of(Path(name)) for name in names] == numbers
     first = [name_of("run.mcap", number) for number in range(200)]
     assert first == sorted(first)
