@@ -15,7 +15,7 @@ from mcap.reader import NonSeekingReader
 from mcap_protobuf.decoder import DecoderFactory
 from rich.console import Console, RenderableType
 
-from brakeline.logs.segment import Entry, open_segment
+from brakeline.logs.segment import Attachments, Entry, Metadata, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import robot_named
 
@@ -133,6 +133,20 @@ class Writer:
         return segment.path
 
 
+def written(
+    path: Path,
+    messages: Iterable[tuple[str, Any, int]],
+    metadata: Metadata | None = None,
+    attachments: Attachments | None = None,
+) -> Path:
+    """Write messages, each with its key and time of receipt [ns], to one file and return its path."""
+    segment = open_segment(path, metadata or {}, attachments)
+    for number, (key, message, at) in enumerate(messages):
+        segment.save([Entry(key, type(message), message.SerializeToString(), at, at, number)])
+    segment.finish()
+    return segment.path
+
+
 def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -> Path:
     """Write the log of a run with three actors, two robot kinds, a restart and two segments, started `later` [s]."""
     writer = Writer(seed)
@@ -156,7 +170,7 @@ def mixed(folder: Path, seed: int = 0, episodes: int = 30, later: float = 0.0) -
     return folder
 
 
-def printed(renderable: RenderableType, width: int = 160, **console: Any) -> str:
+def printed(renderable: RenderableType, width: int | None = 160, **console: Any) -> str:
     """Return what a console shows."""
     file = io.StringIO()
     Console(file=file, width=width, **console).print(renderable)
