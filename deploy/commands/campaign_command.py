@@ -85,15 +85,15 @@ class CampaignCommand:
         searches = [CampaignSearch(cell, self.search) for cell in searched.values()]
         found = complete(searches, self.runs, self.runs, self.engine, self.again, say)
         driven = cells_of(parts, results)
-        table = {"robot": robot.name, "cells": driven, "searches": found}
+        table, own = {"robot": robot.name, "cells": driven, "searches": found}, robot.task.name
         self.results.mkdir(parents=True, exist_ok=True)
-        (self.results / f"{robot.name}.md").write_text(campaign.markdown(robot.name, driven, found))
-        (self.results / f"{robot.name}.json").write_text(json.dumps(table, indent=1) + "\n")
+        (self.results / f"{own}.md").write_text(campaign.markdown(own, driven, found))
+        (self.results / f"{own}.json").write_text(json.dumps(table, indent=1) + "\n")
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
             if found:
                 console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
-            console.print(f"[dim]{self.results}: {robot.name}.md, {robot.name}.json[/]")
+            console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
         return table
 
     def _perturbations(self, dimensions: int) -> list[str]:

@@ -84,6 +84,7 @@ class CompareCommand:
         """Train, evaluate and write the tables. Returns the exit status."""
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.experiments.results_page import page, stored_cells
+        from brakeline.deploy.experiments.task_engine import robot_folder
         from brakeline.deploy.experiments.tuning_trials import tuning_jobs
         from brakeline.messaging.task import address, robot_with_task
         from brakeline.safety.model.model_config import ModelConfig
@@ -95,7 +96,7 @@ class CompareCommand:
         tables: dict[str, Any] = {}
         for robot in map(address, self.robots):
             if self.table:
-                tables[robot] = self._write(stored_cells(results, robot), [], results / robot)
+                tables[robot] = self._write(stored_cells(results, robot), [], robot_folder(results, robot))
                 continue
             if self.tune:
                 trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]
@@ -108,7 +109,7 @@ class CompareCommand:
             finished = complete(jobs, results, runs, self.engine, self.again or self.quick, say)
             cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
-            tables[robot] = self._write(cells, others, results / robot)
+            tables[robot] = self._write(cells, others, robot_folder(results, robot))
         if not self.quick:
             (results / "README.md").write_text(page(results, [p.name for p in sorted(results.iterdir()) if p.is_dir()]))
         if self.json:

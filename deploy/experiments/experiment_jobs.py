@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, unsaid
+from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
 from brakeline.errors import ResultError
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.structured_text import parse_json
@@ -28,7 +28,7 @@ def configuration(job: Job) -> dict[str, Any]:
 
 def result_path(results: Path, job: Job) -> Path:
     """Return the path of a job's result file."""
-    return results / job.robot / f"{job.name}.json"
+    return robot_folder(results, job.robot) / f"{job.name}.json"
 
 
 def read(results: Path, job: Job) -> dict[str, Any] | None:

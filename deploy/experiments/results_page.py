@@ -17,6 +17,7 @@ import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
+from brakeline.deploy.experiments.task_engine import robot_folder
 from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
 from brakeline.deploy.policy_loading import TRAINED
 from brakeline.errors import ResultError
@@ -39,7 +40,7 @@ def stored_cells(results: Path, robot: str) -> list[Result]:
     Raises:
         ResultError: cells differ in more than the method and its settings.
     """
-    paths = sorted((results / robot).glob("*-s*.json"))
+    paths = sorted(robot_folder(results, robot).glob("*-s*.json"))
     cells = [parse_json(path.read_text()) for path in paths if CELL.search(path.name)]
     order = list(METHODS)
     cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
@@ -123,7 +124,7 @@ def page(results: Path, robots: Sequence[str]) -> str:
 
 
 def _section(results: Path, found: RobotResults) -> str:
-    robot = robot_with_task(found.name)
+    robot = robot_with_task(found.study["robot"])
     parts = [
         f"## {found.name}\n\n### Setup\n",
         _setup(robot, found),

@@ -85,7 +85,16 @@ IN_THIS_PROCESS = Engine()
 
 def folder_of(runs: Path, task: StudyTask) -> Path:
     """Return the folder of a task's files."""
-    return runs / task.robot / task.name
+    return robot_folder(runs, task.robot) / task.name
+
+
+def robot_folder(root: Path, robot: str) -> Path:
+    """Return the folder of a robot's files, by its name or the path of its description.
+
+    >>> robot_folder(Path("results"), "ground+tracks").name, robot_folder(Path("results"), "/home/me/my.toml").name
+    ('ground+tracks', 'my')
+    """
+    return root / Path(robot).stem
 
 
 def _run_in_processes(tasks: Sequence[T], workers: int, runs: Path, say: Say) -> Iterator[tuple[T, Any]]:

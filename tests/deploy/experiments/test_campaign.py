@@ -102,6 +102,19 @@ def test_a_collision_behind_the_filter_is_an_exit_status(driven, monkeypatch, tm
     assert cell["collisions"] == 1
 
 
+def test_each_task_and_each_robot_of_ones_own_has_a_table_of_its_own(driven, monkeypatch, tmp_path):
+    _, (first, _), _ = driven
+    monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [first] if jobs else [])
+    CampaignCommand(
+        robots=("ground", "ground+tracks"), arenas=("dense",), policies=("random",), model_sets=("none",), episodes=4,
+        engine=IN_THIS_PROCESS, results=tmp_path / "results", runs=tmp_path / "runs", json=True,
+    ).run()  # fmt: skip
+    tables = {path.name for path in (tmp_path / "results").iterdir()}
+    assert tables == {"ground.md", "ground.json", "ground+tracks.md", "ground+tracks.json"}
+    own = replace(CELL, robot=str(tmp_path / "my.toml"))
+    assert experiment_jobs.result_path(tmp_path / "runs", own) == tmp_path / "runs" / "my" / f"{own.name}.json"
+
+
 def test_walkers_that_run_into_a_standing_robot_are_no_collisions_and_have_a_column_where_there_are_any(driven):
     parts, results, _ = driven
     heads, _ = cell_table(cells_of(parts, results))
