@@ -85,7 +85,8 @@ class CampaignCommand:
         searches = [CampaignSearch(cell, self.search) for cell in searched.values()]
         found = complete(searches, self.runs, self.runs, self.engine, self.again, say)
         driven = cells_of(parts, results)
-        table, own = {"robot": robot.name, "cells": driven, "searches": found}, robot.task.name
+        own = robot.task.name  # additional tasks of a robot have tables of their own
+        table = {"robot": own, "cells": driven, "searches": found}
         self.results.mkdir(parents=True, exist_ok=True)
         (self.results / f"{own}.md").write_text(campaign.markdown(own, driven, found))
         (self.results / f"{own}.json").write_text(json.dumps(table, indent=1) + "\n")

@@ -111,6 +111,7 @@ def test_each_task_and_each_robot_of_ones_own_has_a_table_of_its_own(driven, mon
     ).run()  # fmt: skip
     tables = {path.name for path in (tmp_path / "results").iterdir()}
     assert tables == {"ground.md", "ground.json", "ground+tracks.md", "ground+tracks.json"}
+    assert json.loads((tmp_path / "results" / "ground+tracks.json").read_text())["robot"] == "ground+tracks"
     own = replace(CELL, robot=str(tmp_path / "my.toml"))
     assert experiment_jobs.result_path(tmp_path / "runs", own) == tmp_path / "runs" / "my" / f"{own.name}.json"
 
