@@ -62,9 +62,14 @@ class VectorSafetyWrapper(VectorWrapper):
         self._scans: list[RangeMeasurement | None] = [None] * env.num_envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._now = self.env.reset(seed=seed, options=options)
-        self._begin((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        self._remember(self._now[1])
+        which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        # Gymnasium takes the mask out of the options that it gets.
+        observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        if self._now is not None:
+            infos = with_earlier_rows(infos, self._now[1], ~which)
+        self._now = observations, infos
+        self._begin(which)
+        self._remember(infos, which)
         return self._now
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
@@ -107,7 +112,7 @@ class VectorSafetyWrapper(VectorWrapper):
             penalty[i] = correction_penalty(robot, proposed[i], before[i], executed[i], self.penalty)
         self._ended = np.asarray(terminated | truncated)
         self._begin(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
-        self._remember(infos)
+        self._remember(infos, np.ones(self.num_envs, dtype=bool))
         safety = np.array([decided.get(i) for i in range(self.num_envs)], dtype=object)
         figures = [diagnostics(answer, "" if answer is not None else "reset") for answer in safety]
         infos = infos | {
@@ -125,10 +130,33 @@ class VectorSafetyWrapper(VectorWrapper):
             self._memories[i].reset()
             self._ended[i] = False
 
-    def _remember(self, infos: dict[str, Any]) -> None:
-        """Fill in the scans from memory, if the environments have any."""
-        by_environment = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
+    def _remember(self, infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
+        """Fill in the scans of the chosen environments (k,) from memory, if the environments have any."""
         period = self.client.robot.period
-        self._scans = [
-            filled(memory, info, period) for memory, info in zip(self._memories, by_environment, strict=True)
-        ]
+        for i in np.flatnonzero(which):
+            info = {"scan": infos["scan"][i]} if "scan" in infos else {}
+            self._scans[i] = filled(self._memories[i], info, period)
+
+
+def with_earlier_rows(infos: dict[str, Any], before: dict[str, Any], which: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the infos after a masked reset, with the earlier rows of the environments (k,) that were not reset.
+
+    Gymnasium leaves these rows out: the values are zeros, and `_name` is False. An environment that fills in all rows
+    itself has no `_name`.
+    """
+    joined = dict(infos)
+    for name, values in before.items():
+        given, now = before.get(f"_{name}"), infos.get(name)
+        if given is None or name.startswith("final_"):
+            continue
+        if isinstance(values, dict):
+            joined[name] = with_earlier_rows(now or {}, values, which)
+        elif now is None:
+            joined[name] = values
+        elif f"_{name}" in infos and now.shape == values.shape:
+            kept = (which & given & ~infos[f"_{name}"]).reshape(-1, *[1] * (values.ndim - 1))
+            joined[name] = np.where(kept, values, now)
+        else:
+            continue
+        joined[f"_{name}"] = infos.get(f"_{name}", False) | (which & given)
+    return joined

@@ -232,6 +232,36 @@ def test_one_environment_and_a_vector_decide_by_scans(ready):
     assert margins[0] == margins[1] < 0.3, "the wall is near"
 
 
+class Mapped(Walled):
+    """An environment with the state, the obstacles and a scan in its info."""
+
+    def _with_scan(self, info):
+        return super()._with_scan(info | {"obstacles": self.obstacles})
+
+
+def test_a_masked_reset_leaves_the_other_robots_as_they_are(ready):
+    ends = (2, 60)
+    vector = gymnasium.vector.SyncVectorEnv(
+        [lambda steps=steps: Mapped(CAR, discs(), steps=steps) for steps in ends],
+        autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED,
+    )
+    env = VectorSafetyWrapper(vector, ready, accept_bound=1.0, actions=normalised(CAR))
+    env.reset(seed=[0, 1])
+    for _ in range(ends[0]):
+        observations, _, _, ended, infos = env.step(np.ones((2, 2), np.float32))
+    plan, predicted, scan, options = env.backup_plans[1].plan, env.backup_plans[1].predicted, env._scans[1], {}
+    options["reset_mask"] = ended.copy()
+    observations, after = env.reset(options=options)
+    assert options["reset_mask"].tolist() == [True, False], "the caller's options stay"
+    assert not env.backup_plans[0].input_in_force.any() and env.backup_plans[0].predicted is None
+    assert env.backup_plans[1].plan is plan and env.backup_plans[1].predicted is predicted
+    assert np.array_equal(after["state"], observations) and after["_state"].all()
+    assert np.array_equal(after["state"][1], infos["state"][1]) and after["obstacles"][1] is infos["obstacles"][1]
+    assert env._scans[1] is scan, "no time passes"
+    *_, infos = env.step(np.ones((2, 2), np.float32))
+    assert infos["safety"][1].compared and infos["safety"][1].contained
+
+
 def test_a_vector_view_without_lists_is_refused(ready):
     env = wrapped(Toy(CAR, discs()), ready, many=True, obstacles=lambda *_: [], **SCANNED)
     with pytest.raises(Mismatch, match="0 lists for 1 environments: give a list for each"):
