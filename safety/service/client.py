@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import secrets
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -27,10 +28,19 @@ from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
+from brakeline.safety.service.filter_client import (
+    Answer,
+    accept,
+    known_free_in,
+    observation_in,
+    obstacles_in,
+    scan_in,
+    vector_in,
+)
 from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
 
 DEADLINE = 0.1  # s
+LONGEST_DEADLINE = 86400.0  # s
 NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding error allowed between two equal inputs
 
@@ -51,11 +61,12 @@ def request_message(
     fleet: Sequence[str] = (),
 ) -> pb.Request:
     """Return the message that requests a decision on an action. Raises BadRequest if a value has another type."""
-    backup_plan.measured(np.asarray(state, float))
+    measured = vector_in("state", state)
+    backup_plan.measured(measured)
     message = pb.Request(
         robot=backup_plan.robot.name,
-        state=np.asarray(state, float).tolist(),
-        action=np.asarray(action, float).tolist(),
+        state=measured.tolist(),
+        action=vector_in("action", action).tolist(),
         input_in_force=backup_plan.input_in_force.tolist(),
         plan=backup_plan.plan.ravel().tolist(),
         model=backup_plan.model,
@@ -163,10 +174,34 @@ class BusClient:
     """A client over a bus, for robots of one kind. It closes the bus if it opened it."""
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
-        # deadline: longest wait for a decision [s]
+        """Make a client.
+
+        Args:
+            bus: the bus.
+            robot: the robot, its name, or the path of its description.
+            deadline: longest wait for a decision [s].
+
+        Raises:
+            ValueError: the deadline is not above 0 and at most `LONGEST_DEADLINE`.
+            UnknownRobot: no robot has this name.
+        """
+        if not (isinstance(deadline, Real) and 0.0 < deadline <= LONGEST_DEADLINE):  # NaN fails too
+            raise ValueError(f"a deadline is a time above 0 and at most {LONGEST_DEADLINE:g} s, not {deadline!r}")
         self.bus, self.deadline = bus, deadline
         self.robot = robot_named(robot) if isinstance(robot, str) else robot
         self._owned = False
+
+    @classmethod
+    def _opened(cls, connect: str | Sequence[str], keys: Path | str | None, name: str, *more: Any) -> Self:
+        """Return a client with a bus of its own; more: the other arguments of the constructor."""
+        bus = bus_at(connect, keys, name)
+        try:
+            client = cls(bus, *more)
+        except BaseException:
+            bus.close()
+            raise
+        client._owned = True
+        return client
 
     def close(self) -> None:
         if self._owned:
@@ -215,10 +250,9 @@ class SafetyClient(BusClient):
         Raises:
             Unreachable: there is no router at the endpoints.
             BadKeys: the folder has no keys of that name.
+            ValueError: the deadline is not above 0 and at most a day.
         """
-        client = cls(bus_at(connect, keys, name), robot, deadline)
-        client._owned = True
-        return client
+        return cls._opened(connect, keys, name, robot, deadline)
 
     def decide(
         self,
