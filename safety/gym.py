@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Self
 import gymnasium
 import numpy as np
 
-from brakeline.errors import BusError
-from brakeline.messaging.robot import Array
+from brakeline.errors import BadRequest, BusError
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from brakeline.safety.methods import Method
 
 
-UNANSWERED = "unanswered"  # in place of a decision's kind: no service answered, so the backup plan continued
+# In place of a decision's kind: no service answered, or the state could not be used, so the backup plan continued.
+UNANSWERED = "unanswered"
 
 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -44,7 +45,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     `info` may hold `scan` (a `Scan`, or a `RangeImage` in space) instead of obstacles. `step` adds to `info`:
 
-        safety: the `Answer`; None if a service did not answer.
+        safety: the `Answer`; None if a service did not answer, or if the measured state is missing, not finite or not
+            plausible. Then the robot continues its backup plan.
         proposed: the action that the policy proposed.
         penalty: subtracted from the reward.
         diagnostics: a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the
@@ -139,14 +141,28 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 state, proposed, near, scan=self._scan, observation=observation, known_free=known_free
             )
             return answer, ""
+        except BadRequest as error:
+            if not is_measurement_fault(error, self.client.robot, state):
+                raise
+            reason = str(error)
         except BusError as error:
-            self.client.fallback()
-            return None, str(error)
+            reason = str(error)
+        self.client.fallback()
+        return None, reason
 
     def _remember(self) -> None:
         """Fill in the scan from memory, if the environment has one."""
         assert self._now is not None
         self._scan = filled(self._memory, self._now[1], self.client.robot.period)
+
+
+def is_measurement_fault(error: BadRequest, robot: Robot, state: Any) -> bool:
+    """Return whether a request was refused because its state is missing, not finite or not plausible.
+
+    Each other refusal is a mistake in the program, such as a state of the wrong size.
+    """
+    sized = state is None or np.asarray(state, dtype=object).shape == (robot.state_dim,)
+    return error.field == "state" and sized
 
 
 def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:

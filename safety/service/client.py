@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import secrets
 from collections.abc import Iterable, Sequence
-from numbers import Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -185,7 +184,7 @@ class BusClient:
             ValueError: the deadline is not above 0 and at most `LONGEST_DEADLINE`.
             UnknownRobot: no robot has this name.
         """
-        if not (isinstance(deadline, Real) and 0.0 < deadline <= LONGEST_DEADLINE):  # NaN fails too
+        if not (isinstance(deadline, int | float | np.number) and 0.0 < deadline <= LONGEST_DEADLINE):  # NaN fails too
             raise ValueError(f"a deadline is a time above 0 and at most {LONGEST_DEADLINE:g} s, not {deadline!r}")
         self.bus, self.deadline = bus, deadline
         self.robot = robot_named(robot) if isinstance(robot, str) else robot
