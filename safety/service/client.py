@@ -64,6 +64,7 @@ def request_message(
     backup_plan.measured(measured)
     message = pb.Request(
         robot=backup_plan.robot.name,
+        layout=backup_plan.robot.layout(),
         state=measured.tolist(),
         action=vector_in("action", action).tolist(),
         input_in_force=backup_plan.input_in_force.tolist(),
