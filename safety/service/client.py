@@ -26,7 +26,7 @@ from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.filter.backup_plan import BackupPlan
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.service.filter_client import (
     Answer,
     accept,
@@ -101,7 +101,7 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
 
     Raises:
         SafetyError: the reply is an error, or its plan is not possible for this robot after the input in force, or its
-            prediction is not valid.
+            prediction is not valid, or it contradicts itself.
     """
     if reply.WhichOneof("result") != "decision":
         raise SafetyError(reply.error)
@@ -125,6 +125,10 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     numbers = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
     if not all(map(math.isfinite, numbers)) or min(decision.predicted_half_width, default=0.0) < 0.0:
         raise _bad_reply("predicted_center", "a predicted state or a margin that is not valid")
+    if decision.verified and decision.model in ("", UNVERIFIED):  # an empty one would say that the robot stands
+        raise _bad_reply("model", "a verified plan without the model that verified it")
+    if decision.verified and decision.kind == pb.RECOVERING:
+        raise _bad_reply("kind", "a verified plan to recover: nothing verifies such plans")
     try:
         if request.fleet:
             reservation_of(decision.reservation, robot)

@@ -211,6 +211,10 @@ def test_the_client_refuses_a_bad_reply(service):
         (lambda d: setattr(d, "margin", NAN), "predicted_center"),
         (lambda d: d.tube_center.pop(), "tube_center"),
         (lambda d: d.tube_half_width.__setitem__(0, INF), "tube_center"),
+        (lambda d: d.tube_half_width.__setitem__(0, -0.1), "tube_center"),
+        (lambda d: setattr(d, "model", ""), "model"),
+        (lambda d: setattr(d, "model", UNVERIFIED), "model"),
+        (lambda d: setattr(d, "kind", pb.RECOVERING), "kind"),
     ):
         damaged = pb.Reply()
         damaged.CopyFrom(reply)
