@@ -49,7 +49,7 @@ def was_cut(episodes: dict[str, list[float]]) -> NDArray[np.bool_]:
     if "timeout" not in episodes:
         return np.zeros(len(episodes["goal"]), dtype=bool)
     ends = [np.array(episodes[name], bool) for name in ENDS if name in episodes]
-    return ~np.logical_or.reduce(ends)
+    return np.asarray(~np.logical_or.reduce(ends), dtype=bool)
 
 
 def without_cuts(episodes: dict[str, list[float]]) -> dict[str, list[float]]:
