@@ -56,6 +56,8 @@ class LaneDecisions:
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
         self._domain = constant(safety.domain[:, :, None])
+        ends = robot.low(), robot.high(), safety.inputs.low, safety.inputs.high
+        self._recorded = tuple(constant(end[None]) for end in ends) if safety.inputs.narrower else ()
         self._schedule = constant(safety.inputs.schedule)
         self._general = _Sets(self._constraints, safety.model, safety.tube, constant, xp)
         self._box, self._turning = None, self._general
@@ -99,6 +101,10 @@ class LaneDecisions:
         whole = xp.permute_dims(whole, (1, 0))
         good = xp.all((whole >= self._bounds[0]) & (whole <= self._bounds[1]), axis=0)
         good &= xp.all(xp.abs(requests.action) < HUGE, axis=1)
+        if self._recorded:  # a proposal that was never recorded is not allowed as it stands
+            low, high, least, most = self._recorded
+            wanted = xp.minimum(xp.maximum(requests.action, low), high)
+            good &= xp.all((wanted >= least) & (wanted <= most), axis=1)
         obstacles = requests.obstacles
         parts = obstacles.center, obstacles.axes, obstacles.half, obstacles.rho, obstacles.round, obstacles.margin
         for part in parts:
