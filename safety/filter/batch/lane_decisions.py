@@ -18,6 +18,7 @@ from brakeline.safety.filter.batch.obstacle_arrays import (
     TurnBatch,
     mapped,
     on_host,
+    plausible,
     within_reach,
 )
 from brakeline.safety.filter.batch.qp_batch import ROUNDING
@@ -105,6 +106,7 @@ class LaneDecisions:
             low, high, least, most = self._recorded
             wanted = xp.minimum(xp.maximum(requests.action, low), high)
             good &= xp.all((wanted >= least) & (wanted <= most), axis=1)
+        good &= plausible(xp, requests.obstacles)
         obstacles = requests.obstacles
         parts = obstacles.center, obstacles.axes, obstacles.half, obstacles.rho, obstacles.round, obstacles.margin
         for part in parts:
@@ -140,7 +142,7 @@ class LaneDecisions:
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
         obstacles = ObstacleArrays(*(xp.take(part, rows, axis=0) for part in vars(requests.obstacles).values()))
-        near, beyond = within_reach(xp, obstacles, start, reach)
+        near, beyond = within_reach(xp, obstacles, start, reach, robot.least_margin)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
         scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, asked)
