@@ -12,6 +12,7 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -85,7 +86,13 @@ class Filter:
     observed = 0  # the filter reads no observation
 
     def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
-        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs."""
+        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs.
+
+        Raises:
+            ValueError: the clearance margin is negative or not finite.
+        """
+        if clearance_margin is not None and not 0.0 <= clearance_margin < math.inf:  # NaN fails too
+            raise ValueError(f"a clearance margin is a finite number of at least 0, not {clearance_margin:g}")
         self.model = model
         self.version = model.version
         self.bound = stated_bound(model.about)

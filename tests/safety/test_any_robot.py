@@ -112,10 +112,11 @@ def decisions_at_the_edge(clearance_margin, count, post=False):
         yield filter.decide(Request(state, driving, driving, plan, Shapes.of(posts, 2), known_free=not post))
 
 
-def test_a_limit_is_kept_with_any_clearance_margin():
-    """A negative margin concerns obstacles, not limits."""
+@pytest.mark.parametrize("margin", [0.0, 0.05, 1.0])
+def test_a_limit_is_kept_with_any_clearance_margin(margin):
+    """The margin concerns obstacles, not limits."""
     kinds = set()
-    for decision in decisions_at_the_edge(-0.05, 200):
+    for decision in decisions_at_the_edge(margin, 200):
         kinds.add(decision.kind)
         assert decision.margin >= -1e-9 or decision.kind == FAILSAFE
     assert {ALLOWED, ADJUSTED} <= kinds

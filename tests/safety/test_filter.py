@@ -89,6 +89,12 @@ def test_an_input_that_was_never_recorded_is_not_verified(model):
     assert other.kind == FAILSAFE and not other.plan.any() and other.verified, "braking is verified, 0.9 m/s is not"
 
 
+@pytest.mark.parametrize("margin", [-0.05, np.nan, np.inf])
+def test_a_clearance_margin_is_finite_and_not_negative(model, margin):
+    with pytest.raises(ValueError, match="clearance margin"):
+        Filter(model, clearance_margin=margin)
+
+
 def test_adjusted_is_the_closest_input_that_can_be_verified(ready):
     """Compare with a fine grid of inputs, each checked by the exact check of its own tube."""
     rng = np.random.default_rng(0)
