@@ -411,11 +411,15 @@ class Filter:
             return None
         return self._score(request.past, request.state)
 
-    def standing_reservation(self, state: Array) -> Reservation:
-        """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""
+    def standing_reservation(self, state: Array, widening: float = 1.0) -> Reservation:
+        """Return the reservation of a robot that stands in a measured state (n,) and goes on standing.
+
+        widening: the factor on every set that its request asks for.
+        """
+        widening = self.constraints.plan_widening(widening * self.start)
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        start, constraints = state[: self.robot.position_dim], self.constraints_for(z, self.start)
+        start, constraints = state[: self.robot.position_dim], self.constraints_for(z, widening)
         return self._reserve(constraints, start, *constraints.sets(start, constraints.turn(heading), z), z)
 
     def _reserve(
