@@ -18,6 +18,7 @@ from brakeline.safety.filter.batch.batch_filter import BatchFilter
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.dual_active_set import solve_batch
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
 from brakeline.safety.filter.qp_solver import SOLVED, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
@@ -204,6 +205,15 @@ def test_past_windows_are_scored():
         requests.append(replace(request, past=past if rng.random() < 0.5 else None))
     answers = check_same(ready, requests)
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
+
+
+def test_row_by_row_a_filter_states_what_it_states_in_each_row():
+    ready = one_step()
+    requests = RequestArrays.of(scenes(ready, 3))
+    answers, whole = RowByRow(ready).decide_batch(requests), ready.decide_batch(requests)
+    for name in ("bound", "judges", "outside_share"):
+        assert getattr(answers, name) == getattr(whole, name) == getattr(answers.row(2), name)
+    assert answers.judges and answers.bound > 0.0 and answers.outside_share > 0.0
 
 
 @pytest.mark.parametrize(("crowd", "rows"), [(0.9, 40), (0.0, 5)])
