@@ -52,12 +52,15 @@ class MovingObstacles:
         """Return the displacements c·t (n, T, d) since the measurement [m] at times from now (T,) [s]."""
         return np.asarray(self.drift[:, None] * (self.age[:, None] + times)[..., None])
 
-    def least_distance(self, point: Array, within: float) -> Array:
-        """Return a lower bound (n,) on the distance to a point (d,) at all times up to `within` seconds from now."""
+    def least_distance(self, point: Array, within: float, least_margin: float) -> Array:
+        """Return a lower bound (n,) on the distance to a point (d,) at all times up to `within` seconds from now.
+
+        The obstacles' margins are subtracted. One below `least_margin` [m] counts as that (`Robot.least_margin`).
+        """
         t = self.age + within
         reach = np.sqrt(np.einsum("nd,nd->n", self.drift, self.drift)) * t
         reach += self.growth[:, 0] + self.growth[:, 1] * t + self.growth[:, 2] * t * t
-        return np.asarray(self.shapes.distance(point) - self.shapes.margin - reach)
+        return np.asarray(self.shapes.distance(point) - np.maximum(self.shapes.margin, least_margin) - reach)
 
 
 def split_moving(obstacles: Sequence[Obstacle], dim: int) -> tuple[Shapes, MovingObstacles | None]:

@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 # overflow makes no obstacle smaller than it is.
 FARTHEST = 1e4  # largest coordinate of an obstacle's position, and largest size [m]
 WALL_DEPTH = 1e5  # half the edge of the box that represents a wall [m]
+LARGEST = FARTHEST + WALL_DEPTH  # largest coordinate, size or margin in `Shapes` [m]
+ORTHONORMAL = 1e-6  # largest error of the products of two axes in `Shapes`
 BOX, CYLINDER, SPHERE, WALL = "box", "cylinder", "sphere", "wall"
 KINDS = (BOX, CYLINDER, SPHERE, WALL)
 

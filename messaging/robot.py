@@ -179,6 +179,11 @@ class Robot:
         return replace(self, name=self.kind, late=False, horizon=self.horizon - 1, free_steps=self.free_steps - 1)
 
     @cached_property
+    def least_margin(self) -> float:
+        """The least margin of an obstacle that has an effect [m]: minus the radius of the body's smallest disc."""
+        return -min((disc.radius for disc in self.body), default=0.0)
+
+    @cached_property
     def footprint(self) -> float:
         """Radius of the disc (sphere) about the position that contains the body in every attitude [m]."""
         return max((disc.arm + disc.radius for disc in self.body), default=0.0)

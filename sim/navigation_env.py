@@ -244,7 +244,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             return []
         measured = self._crowd_sensor.measure(self._time)
         horizon = self.robot.horizon * self.robot.period
-        nearest = MovingObstacles.of(measured, self.robot.position_dim).least_distance(position, horizon)
+        moving = MovingObstacles.of(measured, self.robot.position_dim)
+        nearest = moving.least_distance(position, horizon, self.robot.least_margin)
         return [measured[i] for i in np.flatnonzero(nearest <= self.robot.sight)]
 
     def _info(self, period: Period) -> Info:

@@ -147,6 +147,7 @@ class CertifyCommand:
                 console.print(group_table(report))
         lines = [bounds_in_words(models[0][1], data.robot.period)] if models else []
         lines += dict.fromkeys((*notes, *filter(None, (widening(report) for _, report in models))))
+        lines += dict.fromkeys(filter(None, (unrecorded(model) for model, _ in models)))
         lines += [f"missing: {text}" for text in recording_advice(models[0][1], data)] if models else []
         for line in lines:
             console.print(line, markup=False)
@@ -212,6 +213,22 @@ def widening(report: ValidationReport) -> str:
         f"{report.certificate}, {report.mode}: every envelope is widened by {report.inflation:.3g}, not by "
         f"{usual:g}, so that no more than {report.violations} of {report.windows} held-out plans leave their sets"
     )
+
+
+def unrecorded(model: ModelSet) -> str:
+    """Say which part of an input's range was recorded, if it is not all of it. Empty if all inputs were recorded."""
+    from brakeline.deploy.data.sources.quantity_names import column_names, column_units
+    from brakeline.safety.filter.plan_inputs import PlanInputs, recorded_inputs
+
+    robot, units = model.robot, column_units(model.robot)
+    inputs = PlanInputs(robot, recorded_inputs(model))
+    parts = zip(column_names(robot)[1], inputs.low, inputs.high, robot.low(), robot.high(), strict=True)
+    told = [
+        f"{name} from {low:.3g} to {high:.3g} {units[name]} ({percent((high - low) / (most - least))} of its range)"
+        for name, low, high, least, most in parts
+        if low > least or high < most
+    ]
+    return f"the filter verifies recorded inputs alone: {', '.join(told)}" if told else ""
 
 
 def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:

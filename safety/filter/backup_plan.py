@@ -170,16 +170,21 @@ class BackupPlan:
         """Return the next input of the committed plan, since no decision came.
 
         No service compared the measured state with its predicted set. If the state is outside, the plan no longer
-        counts as verified.
+        counts as verified. Neither does that of a robot that stops by feedback, without a state to feed back: the
+        robot then executes the plan's input as it is, which is zero once the robot brakes.
         """
-        if not self.still_verified:
+        robot, blind = self.robot, bool(self.robot.feedback) and not self._compare
+        if blind or not self.still_verified:
             self.model, self._plan_tokens = UNVERIFIED, ()
         self.predicted = None
-        if self.robot.feedback:
-            self.plan[0] = self.robot.stop_by_feedback(self.plan[0], self.seen, self.input_in_force)
-        return self._advance()
+        if blind:
+            self.plan[0] = robot.clip_input(self.plan[0], self.input_in_force)
+        elif robot.feedback:
+            self.plan[0] = robot.stop_by_feedback(self.plan[0], self.seen, self.input_in_force)
+        return self._advance(blind)
 
-    def _advance(self) -> Array:
+    def _advance(self, blind: bool = False) -> Array:
+        """Begin the next period of the plan. blind: nobody knows whether the robot stands, for want of a state."""
         robot = self.robot
         now: Array = self.plan[0].copy()
         if self._compare:
@@ -189,7 +194,7 @@ class BackupPlan:
         self._compare = False
         self._plan_tokens = self._plan_tokens[1:] or self._plan_tokens
         self.reservation = None if self.reservation is None else self.reservation.later()
-        rests = robot.is_stopping(now, self.seen, self.input_in_force)
+        rests = not blind and robot.is_stopping(now, self.seen, self.input_in_force)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[-1])
         self.plan = np.vstack([self.plan[1:], last[None]])
         self.input_in_force = now

@@ -88,7 +88,8 @@ def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes
             return BlockingConstraint.nowhere(ROBOT, room, T * min(period + 1, N))
         number -= len(around.other_reservations) * rows_each
     period, limit = divmod(number, len(robot.limits))
-    after = min(period + 1, N) if period <= N else period - N - 1  # ends, stop, in joint space also starts
+    first = 1 if robot.position_dim else 0  # the first period with a row for its start
+    after = min(period + 1, N) if period <= N else period - N - 1 + first  # ends, stop, starts: see `StateLimits`
     return BlockingConstraint.nowhere(robot.limits[limit].name, room, T * after)
 
 

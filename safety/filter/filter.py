@@ -12,6 +12,7 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -28,7 +29,7 @@ from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
-from brakeline.safety.filter.plan_inputs import PlanInputs
+from brakeline.safety.filter.plan_inputs import PlanInputs, recorded_inputs
 from brakeline.safety.filter.plan_search import DecisionRecord, PlanCandidate, PlanSearch
 from brakeline.safety.filter.qp import QPBuilder
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 
 
 WORTH_A_BATCH = 20  # requests for each period of a plan; fewer are decided sooner one by one
+NOT_RECORDED = "the proposed action is outside the inputs that were recorded"
 BROKEN = "an obstacle was seen outside of what its bounds allow: nothing is known of where it will be"
 
 
@@ -72,7 +74,8 @@ class Filter:
         in_place: bounds of z (2, nz), and the constraints for plans in place within them; None without such plans.
         standing (m,): inputs that leave the robot in place.
         translating (nz,): the regressors that are free inputs and move it.
-        domain (2, r): recorded range of [x_0; input in force], with room for rounding.
+        domain (2, known): recorded range of [x_0; input in force; inputs that are decided], with room for rounding.
+        inputs: the plans that the filter may verify, of recorded inputs. executable: all that the robot may follow.
         clearance_margin: distance to obstacles that the QP keeps [m].
         reach: an obstacle farther away than this cannot change a decision [m].
         bound: the share of plans outside their tubes that the model set states.
@@ -83,25 +86,33 @@ class Filter:
     observed = 0  # the filter reads no observation
 
     def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
-        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs."""
+        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs.
+
+        Raises:
+            ValueError: the clearance margin is negative or not finite.
+        """
+        if clearance_margin is not None and not 0.0 <= clearance_margin < math.inf:  # NaN fails too
+            raise ValueError(f"a clearance margin is a finite number of at least 0, not {clearance_margin:g}")
         self.model = model
         self.version = model.version
         self.bound = stated_bound(model.about)
         self.robot = robot = model.robot
         self.tube, outer = model.tube(), model.outer_tube()
-        self.builder = QPBuilder(robot, outer)
-        self.domain = widened(model.domain)
+        recorded = widened(model.domain)
+        of_inputs = recorded_inputs(model)
+        self.inputs, self.executable = PlanInputs(robot, of_inputs), PlanInputs(robot)
+        self.builder = QPBuilder(self.inputs, outer)
+        self.domain = np.hstack([recorded, np.tile(of_inputs, robot.committed_steps)])
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
         margin = turning_extent(robot, in_place) if clearance_margin is None else clearance_margin
-        self.constraints = TubeConstraints(model, self.tube, outer, self.domain, margin)
+        self.constraints = TubeConstraints(model, self.tube, outer, recorded, margin)
         self.in_place: tuple[Array, TubeConstraints] | None = None
         if turning is not None and model.in_place is not None:
             box = np.ascontiguousarray(model.in_place.domain(in_place.position.shape[2], robot.regressor_dim))
             known = box[:, : robot.regressor_dim]
             own = TubeConstraints(turning, in_place, in_place, known, margin, self.constraints.reach)
             self.in_place = box, own
-        self.inputs = PlanInputs(robot)
         self.ordinary = FastRequestCheck(robot)
         self.standing = np.array([not moves for moves in robot.translates])
         driven = np.tile(robot.translates, robot.free_steps)
@@ -189,7 +200,9 @@ class Filter:
             record.reason = blind
         elif in_domain:
             committed = request.plan[self.robot.committed_steps : self.robot.free_steps].ravel()
-            candidate = find_plan(PlanSearch(self, local_map, z_0, proposal, record), committed, request.turn_aside)
+            search = PlanSearch(self, local_map, z_0, proposal, record)
+            candidate = find_plan(search, committed, request.turn_aside)
+            self._note_unrecorded(request.action, search, candidate)
         else:
             record.reason = "the state is outside the domain that was recorded"
         if candidate is None:
@@ -244,6 +257,15 @@ class Filter:
         decided = {i: answers.row(row) for row, i in enumerate(fitting)}
         return [decided[i] if i in decided else self.decide(request) for i, request in enumerate(requests)]
 
+    def _note_unrecorded(self, wanted: Array, search: PlanSearch, candidate: PlanCandidate | None) -> None:
+        """If the proposal itself (m,) is outside the recorded range, say that the candidate adjusts it."""
+        recorded = not self.inputs.narrower or (search.proposal == self.executable.limited(wanted, search.before)).all()
+        if candidate is None or recorded:
+            return
+        candidate.for_clearance = False  # the filter can verify no such proposal
+        if candidate.kind == ALLOWED:
+            candidate.kind, search.record.reason, search.record.find_blocking = ADJUSTED, NOT_RECORDED, None
+
     def _committed(
         self, request: Request, local_map: LocalMap, z_0: Array, record: DecisionRecord, in_domain: bool
     ) -> PlanCandidate:
@@ -269,13 +291,13 @@ class Filter:
             constraints = self.constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
             return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
-        brake = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
-        as_committed[len(z_0) :] = self.inputs.within(chosen, before)
+        brake = self.inputs.regressors(z_0, self.executable.stop(request.state, before))
+        as_committed[len(z_0) :] = self.executable.within(chosen, before)
         candidates = list[PlanCandidate]()
         for z in (brake, as_committed):
             constraints = self.constraints_for(z, local_map.widening)
             margin = constraints.margin_in(local_map, z)
-            verified = in_domain and margin >= 0.0
+            verified = in_domain and self.inputs.allows(z[len(z_0) :]) and margin >= 0.0
             candidates.append(PlanCandidate(FAILSAFE, self.inputs.plan(z), z, margin, verified, constraints))
         if candidates[-1].verified:
             return candidates[-1]
@@ -288,7 +310,7 @@ class Filter:
         where it stands (docs/method.md §11).
         """
         robot, m = self.robot, self.robot.action_dim
-        slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(self.inputs.high, -self.inputs.low)
+        slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(robot.high(), -robot.low())
         going = np.vstack([request.input_in_force, request.plan[: robot.committed_steps]])
         on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
         if not (request.still(robot) or on_a_way):
@@ -296,7 +318,7 @@ class Filter:
         if isinstance(request.scan, Scan) and not shows_free(request.scan, local_map.start):
             return None
         before = z_0[-m:]
-        stand = self.inputs.regressors(z_0, self.inputs.stop(request.state, before))
+        stand = self.inputs.regressors(z_0, self.executable.stop(request.state, before))
         parked = local_map.parked
         seeming = 0.0
         if not on_a_way:
@@ -389,11 +411,15 @@ class Filter:
             return None
         return self._score(request.past, request.state)
 
-    def standing_reservation(self, state: Array) -> Reservation:
-        """Return the reservation of a robot that stands in a measured state (n,) and goes on standing."""
+    def standing_reservation(self, state: Array, widening: float = 1.0) -> Reservation:
+        """Return the reservation of a robot that stands in a measured state (n,) and goes on standing.
+
+        widening: the factor on every set that its request asks for.
+        """
+        widening = self.constraints.plan_widening(widening * self.start)
         z = np.concatenate([state[self.regressor], np.tile(self.inputs.nothing, 1 + self.robot.free_steps)])
         heading = float(state[self.robot.heading]) if self.robot.heading is not None else 0.0
-        start, constraints = state[: self.robot.position_dim], self.constraints_for(z, self.start)
+        start, constraints = state[: self.robot.position_dim], self.constraints_for(z, widening)
         return self._reserve(constraints, start, *constraints.sets(start, constraints.turn(heading), z), z)
 
     def _reserve(

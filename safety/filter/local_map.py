@@ -70,13 +70,14 @@ def local_map(
     start, whole_plan = np.ascontiguousarray(request.state[:d]), robot.horizon * robot.period
     heading = float(request.state[robot.heading]) if robot.heading is not None else 0.0
     if len(near):
-        away = shape_kernels.distances(*near.parts, start) - near.margin
+        away = shape_kernels.distances(*near.parts, start) - np.maximum(near.margin, robot.least_margin)
         beyond, counts, number = shape_kernels.parted(away, beyond, reach)
         if number < len(near):
             near = near.take(counts) if number else _nothing(d)
     moving = request.movers
     if moving is not None:
-        beyond, counts, number = shape_kernels.parted(moving.least_distance(start, whole_plan), beyond, reach)
+        nearest = moving.least_distance(start, whole_plan, robot.least_margin)
+        beyond, counts, number = shape_kernels.parted(nearest, beyond, reach)
         moving = moving.take(counts) if number else None
     other_reservations = request.other_reservations
     if other_reservations is not None:

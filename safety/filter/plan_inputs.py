@@ -6,6 +6,8 @@ import numpy as np
 
 from brakeline.compilation import compiled
 from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.model.turning_in_place import widened
 
 
 @compiled("f8[::1](f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
@@ -32,6 +34,11 @@ def regressors_of_braking(z_0: Array, braking: Array, action: Array) -> Array:
     return z
 
 
+def recorded_inputs(model: ModelSet) -> Array:
+    """Return the least and the largest input in force (2, m) in a model set's data, with room for rounding."""
+    return widened(model.domain)[:, len(model.robot.regressor) :]
+
+
 class PlanInputs:
     """A robot's plans and their regressors z = [z_0; f].
 
@@ -40,21 +47,39 @@ class PlanInputs:
 
     Attributes:
         low, high, slew (m,): bounds of the inputs, and of their change from one period to the next.
+        width (m,): range of each input by the robot's description.
+        narrower: the inputs that were recorded leave out some of those that the description allows.
         nothing (m,): zero input.
         schedule (N·m, (F + given)·m): S of docs/method.md §2, from the chosen inputs to all inputs of a plan.
         braking (F, m): share of its value that an input still has in each free period while the robot brakes.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, recorded: Array | None = None) -> None:
+        """Prepare the plans of a robot.
+
+        Args:
+            robot: its description bounds every input.
+            recorded: least and largest recorded inputs (2, m), which bound the inputs further. Zero stays possible.
+        """
         self.robot = robot
         self.low, self.high, self.slew = robot.low(), robot.high(), np.asarray(robot.action_slew, dtype=float)
+        self.width = self.high - self.low
         self.schedule = robot.plan_matrix()
         self.nothing = robot.zero_input()
+        if recorded is not None:
+            self.low = np.maximum(self.low, np.minimum(recorded[0], self.nothing))
+            self.high = np.minimum(self.high, np.maximum(recorded[1], self.nothing))
+        self.narrower = bool((self.low > robot.low()).any() or (self.high < robot.high()).any())
         self.braking = np.ascontiguousarray(robot.stop_profile()[: robot.free_steps - robot.committed_steps])
 
     def limited(self, wanted: Array, before: Array) -> Array:
         """Return the input (m,) closest to the wanted one within bounds and slew of `before` (m,)."""
         return clip_to_bounds(wanted, before, self.low, self.high, self.slew)
+
+    def allows(self, free: Array) -> bool:
+        """Return whether free inputs (F·m,) lie within the bounds."""
+        inputs = free.reshape(-1, self.robot.action_dim)
+        return not self.narrower or bool(((inputs >= self.low) & (inputs <= self.high)).all())
 
     def within(self, free: Array, before: Array) -> Array:
         """Clip free inputs (F·m,) to bounds and slew, one after the other."""

@@ -241,7 +241,7 @@ class PlanSearch:
         """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""
         inputs, m = self.safety.inputs, len(self.proposal)
         first = z[len(self.z_0) : len(self.z_0) + m]
-        return float(np.linalg.norm((first - self.proposal) / (inputs.high - inputs.low)))
+        return float(np.linalg.norm((first - self.proposal) / inputs.width))
 
     def _closest(self, rows: ConstraintRows) -> Array | None:
         """Solve the QP; return its answer, clipped to bounds and slew, as regressors, or None without an answer."""

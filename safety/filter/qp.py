@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.robot import Array
 from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels, tube_kernels
+from brakeline.safety.filter.plan_inputs import PlanInputs
 from brakeline.safety.filter.qp_solver import QuadraticProgram
 from brakeline.safety.filter.reachable_tube import Tube
 
@@ -85,8 +86,8 @@ class QPBuilder:
     took ten milliseconds.
     """
 
-    def __init__(self, robot: Robot, tube: Tube) -> None:
-        self.robot = robot
+    def __init__(self, allowed: PlanInputs, tube: Tube) -> None:
+        self.robot = robot = allowed.robot
         self.tube = tube
         m, steps = robot.action_dim, robot.free_steps - robot.committed_steps
         free = steps * m
@@ -101,7 +102,7 @@ class QPBuilder:
         self.W_known, self.W_f = whole(W_t[:, : self.known]), whole(W_t[:, self.known :])
         self.abs_W_f = np.abs(self.W_f)
         atoms = len(W_t)
-        width = np.tile(robot.high() - robot.low(), steps)
+        width = np.tile(allowed.width, steps)
         self.scale = np.concatenate([width, self.abs_W_f @ width])
         self.h = np.full(free + atoms, REGULARIZATION)
         self.h[:m] = 1.0
@@ -115,11 +116,11 @@ class QPBuilder:
         self.length = np.linalg.norm(fixed, axis=1)
         self.fixed = fixed / self.length[:, None]
         self.limited = limited
-        self.low, self.high = robot.low(), robot.high()
+        self.low, self.high = allowed.low, allowed.high
         # Largest change of each free input against the input in force.
         self.change = np.arange(1.0, steps + 1.0)[:, None] * np.asarray(robot.action_slew)
         self.slew = np.tile(robot.action_slew, steps)[limited]
-        self.box = np.concatenate([np.tile(robot.high(), steps), -np.tile(robot.low(), steps)])
+        self.box = np.concatenate([np.tile(allowed.high, steps), -np.tile(allowed.low, steps)])
         # The bounds of the fixed rows are affine in z_0: the first free input changes from the input in force.
         first = np.eye(free, m)[limited] @ np.eye(m, self.known, k=self.known - m)
         slope = np.vstack([-self.W_known, self.W_known, np.zeros((2 * free, self.known)), first, -first])

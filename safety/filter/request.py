@@ -29,6 +29,10 @@ NOTHING_KNOWN = (
     "nothing is known of the space around the robot: give obstacles, or a scan, or say known_free if a map says that "
     "all space within reach is free"
 )
+IMPOSSIBLE = (
+    "an obstacle has a negative size, axes that are not orthonormal, a rounding that is not 0 or 1, or a number that "
+    "is infinite or too large"
+)
 STOPPED = 0.9e-9  # an input below it surely belongs to a stop (`Robot.is_stop_input`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
@@ -211,10 +215,19 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         raise BadRequest("obstacles", f"a {robot.name} robot's obstacles have {robot.position_dim} coordinates")
     if request.movers is not None and request.movers.drift.shape[1] != robot.position_dim:
         raise BadRequest("obstacles", f"a {robot.name} robot's movers have {robot.position_dim} coordinates")
+    for shapes in (request.obstacles, None if request.movers is None else request.movers.shapes):
+        if shapes is not None and len(shapes) and not _plausible(shapes):
+            raise BadRequest("obstacles", IMPOSSIBLE)
     if isinstance(request.scan, Scan) and (robot.position_dim != 2 or robot.heading is None):
         raise BadRequest("scan", f"a {robot.name} robot has no fan in the plane: give obstacles, or a range image")
     if isinstance(request.scan, RangeImage) and robot.position_dim != 3:
         raise BadRequest("image", f"a {robot.name} robot has no range image in space: give obstacles, or a scan")
+
+
+def _plausible(shapes: Shapes) -> bool:
+    from brakeline.safety.filter.kernels import shape_kernels  # here, since clients need no compiled code
+
+    return shape_kernels.plausible(*shapes.parts, np.ascontiguousarray(shapes.margin))
 
 
 def _check_no_space(robot: Robot, request: Request) -> None:

@@ -20,11 +20,14 @@ class StateLimits:
 
         weights · y_k = a·p_0 + b θ_0 + (aᵀR) p_k + rest        a: weights of the position, b: of the heading
 
-    so each period gives a row `gradient z + spread m(z) <= most - a·p_0 - b θ_0 - |weights|·Z_v`.
+    so each period gives a row `gradient z + spread m(z) <= most - a·p_0 - b θ_0 - |weights|·Z_v`. Each period but the
+    first also gives a row for its start, with its own chord deviation. The start of the first period is where the robot
+    is: without a row for it, a robot that was pushed beyond a limit may return. In that period it exceeds the limit by
+    at most the chord deviation and what it is beyond the limit already.
 
     In joint space, every limit holds within the periods and after the stop: the chord deviation of a period is how far
-    a limit's value exceeds its values at both ends of the period, in units of `Robot.limit_scales`. So each period also
-    gives a row for its start. The order of the rows is: ends, stop, starts; each for all limits.
+    a limit's value exceeds its values at both ends of the period, in units of `Robot.limit_scales`. There the first
+    period has a row for its start, too. The order of the rows is: ends, stop, starts; each for all limits.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
@@ -45,6 +48,8 @@ class StateLimits:
             self.now[0, :, : len(robot.regressor)] = weights[:, list(robot.regressor)]
             starts = np.append(N, np.arange(N - 1))  # row N of the maps is the one of now
             self.ends, self.extra = np.append(self.ends, starts), np.vstack([self.extra, self.extra[:N]])
+        elif self.place.any():
+            self.ends, self.extra = np.append(self.ends, np.arange(N - 1)), np.vstack([self.extra, self.extra[1:N]])
         self._around(tube)
 
     def _around(self, tube: Tube) -> None:

@@ -31,7 +31,7 @@ from brakeline.safety.model.tensor_file import content, pack, unpack
 from brakeline.safety.model.turning_in_place import InPlace
 from brakeline.safety.model.windows import plan_regressor_map
 
-ENTRY = "model_set"
+ENTRY, CHECKSUM = "model_set", "checksum"  # old files have no checksum
 SHIPPED = Path(__file__).parents[2] / "robots"  # model sets lie beside the descriptions of their robots
 TENSORS = ("C", "W", "M", "kappa", "w", "generators")
 IN_PLACE, BOX = "in_place.step", "in_place.box"  # optional
@@ -179,7 +179,7 @@ class ModelSet:
         return {f"{n}.{t}": getattr(c, t) for n, c in named.items() for t in TENSORS} | more
 
     def encode(self) -> bytes:
-        """Return the bytes of a safetensors file, with configuration and version as metadata."""
+        """Return the bytes of a safetensors file, with configuration, version and a checksum of both as metadata."""
         about = {
             "robot": self.robot.name,
             "layout": self.layout or self.robot.layout(),
@@ -190,7 +190,7 @@ class ModelSet:
         }
         if not self.layout:
             about["description"] = json.dumps(self.robot.description)  # a text: the order of its names counts
-        return pack(self._tensors(), ENTRY, about)
+        return pack(self._tensors(), ENTRY, about | {CHECKSUM: checksum(about)})
 
     def save(self, path: Path | str) -> None:
         write_atomically(Path(path), self.encode())
@@ -231,6 +231,8 @@ class ModelSet:
         model._check_sizes()
         if model.version != about.get("version"):
             raise BadModel("the model set's content is not what its version says")
+        if about.get(CHECKSUM, whole := checksum(about)) != whole:
+            raise BadModel("what the model set states about itself is not what its checksum says")
         return model
 
     @staticmethod
@@ -269,6 +271,12 @@ class ModelSet:
             stated = "no bound stated"
         kind = f"{self.model_config.certificate}, {self.model_config.mode}"
         return f"ModelSet({self.robot.name!r}, {kind}, version {self.version!r}, {stated})"
+
+
+def checksum(about: dict[str, Any]) -> str:
+    """Return the hash of a model set's metadata. It shows damage to the stated bound, which no version covers."""
+    stated = {name: value for name, value in about.items() if name != CHECKSUM}
+    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
 
 def robot_in(about: dict[str, Any]) -> Robot:

@@ -53,12 +53,17 @@ class SetFactors:
 
     def shares(self, plan: Array, first: Array, kinds: dict[str, Mask]) -> Array:
         """Return how much of its sets each window used (T,), from its scores; above 1, it is outside."""
-        both = np.maximum(plan / self.plan, first / self.first)
-        return np.asarray(both / np.where(kinds[START], self.start, 1.0))
+        with np.errstate(invalid="ignore"):
+            both = np.maximum(plan / self.plan, first / self.first) / np.where(kinds[START], self.start, 1.0)
+        return np.where(np.isnan(both), np.inf, both)
 
 
 def _quantile(scores: Array, outside: float) -> float:
-    """Return the ⌈(n + 1)(1 - outside)⌉-th of n scores, and the largest one if they are few; at least 1."""
+    """Return the ⌈(n + 1)(1 - outside)⌉-th of n scores, and the largest one if they are few; at least 1.
+
+    A score that is no number counts as infinite.
+    """
     if not len(scores):
         return 1.0
+    scores = np.where(np.isnan(scores), np.inf, scores)
     return max(1.0, float(np.sort(scores)[min(math.ceil((len(scores) + 1) * (1.0 - outside)), len(scores)) - 1]))

@@ -172,9 +172,13 @@ def _tightest(features: Array, values: Array, inflation: float, plans: Array, sh
 
 
 def shares(errors: Array, widths: Array) -> Array:
-    """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0."""
+    """Return the ratio of errors to half-widths: 0 without an error, infinite where only the half-width is 0.
+
+    It is also infinite where an error or a half-width is no number: then nothing says that the set holds the error.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(errors > 0.0, errors / widths, 0.0)
+        ratios = np.where(errors <= 0.0, 0.0, errors / widths)
+    return np.where(np.isnan(ratios) | np.isnan(widths), np.inf, ratios)
 
 
 def shape_with_chords(robot: Robot, z: Array, errors: Array, chords: Array, full: Array, level: int) -> Shape:

@@ -238,7 +238,8 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
     """
     robot, s = model.robot, calibration.samples
     apart = non_overlapping_starts(s.start, robot.horizon)
-    outside, first_outside = calibration.scores > 1.0, calibration.first_scores > 1.0
+    scores = np.where(np.isnan(calibration.scores), np.inf, calibration.scores)
+    outside, first_outside = ~(scores <= 1.0), ~(calibration.first_scores <= 1.0)  # NaN is outside
     return _statement(
         model,
         (int(outside[apart].sum()), int(apart.sum())),
@@ -247,7 +248,7 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
         rank=calibration.chosen.features,
         smallest_singular=calibration.smallest_singular,
         condition=calibration.condition,
-        excess=float(calibration.scores.max(initial=0.0)),
+        excess=float(scores.max(initial=0.0)),
         inflation=calibration.factor,
         marginal=_marginal(outside),
         groups=tuple(
@@ -258,7 +259,7 @@ def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationRe
                 int((kind & apart & outside).sum()),
                 _marginal(outside[kind]),
                 upper_bound(int((kind & apart & outside).sum()), int((kind & apart).sum())),
-                float(calibration.scores[kind].max(initial=0.0)),
+                float(scores[kind].max(initial=0.0)),
                 int((kind & first_outside).sum()),
                 upper_bound(int((kind & first_outside).sum()), int(kind.sum())),
             )
@@ -336,7 +337,8 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, lis
             shares_of(w.chord_deviation[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
         ]
         if k == tube.horizon:
-            parts.append(shares_of(w.stopping_distance[i : i + CHUNK, None], sizes[:, -1, None]))
+            stopped = w.stopping_distance[i : i + CHUNK, None]
+            parts.append(np.where(np.isnan(stopped), 0.0, shares_of(stopped, sizes[:, -1, None])))  # NaN: no stop
         found[i : i + CHUNK] = np.concatenate(parts, axis=1)
     return found, names
 

@@ -230,7 +230,7 @@ class BatchHandler:
         if not request.still(robot):
             why = f"{message.actor} moves without a reservation: no robot can keep away from it"
             raise BadRequest("reservation", why)
-        return method.standing_reservation(request.state)
+        return method.standing_reservation(request.state, request.widening)
 
     def _decide(
         self, message: pb.Request, receipt: Receipt, reservations: dict[str, Reservation] | None = None

@@ -20,7 +20,7 @@ from rich.console import Console
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
 from brakeline.deploy.cli import COMMANDS, command_class, main
-from brakeline.deploy.commands.certify_command import validation_table
+from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
 from brakeline.errors import BadScan
@@ -32,6 +32,7 @@ from brakeline.messaging.scan import Scan
 from brakeline.messaging.stated_share import percent
 from brakeline.safety import methods
 from brakeline.safety.model import model_config
+from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.validation import ValidationReport
 from tests.deploy.data.porter import FILE, drive, write_csv
 from tests.waiting import until
@@ -231,6 +232,14 @@ def test_the_validation_table_is_complete_at_any_width(columns):
     words = ("certificate", "matrix-zonotope", "≤ per plan", "2 %", "≤ per episode", "96 %", "≤ 180 steps", "1.5 m")
     assert [word for word in words if word not in shown] == []
     assert shown.count("diverges") == 2 and "149810" not in shown and "1.2 mm" in shown
+
+
+def test_certify_says_which_inputs_were_not_recorded():
+    ground = ModelSet.load("ground")
+    assert unrecorded(ground) == ""
+    fast = replace(ground, robot=replace(ground.robot, name="fast", action_high=(1.0, 0.5)))
+    said = "the filter verifies recorded inputs alone: command speed from 0 to 0.255 m/s (26 % of its range)"
+    assert unrecorded(fast) == said
 
 
 def test_only_the_innermost_of_nested_work_prints_its_progress(monkeypatch, capsys):

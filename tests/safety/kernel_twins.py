@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import LARGEST, ORTHONORMAL, Shapes
 from brakeline.safety.filter.batch.dual_active_set import solve_batch
 from brakeline.safety.filter.halfspaces import TOUCHING
 
@@ -265,6 +265,16 @@ def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
 def distances(center, axes, half, rho, rounded, point):
     """`shape_kernels.distances`."""
     return Shapes(center, axes, half, rho, rounded, np.zeros(len(rho))).distance(point)
+
+
+def plausible(center, axes, half, rho, rounded, margin):
+    """`shape_kernels.plausible`."""
+    large = [np.abs(part).max(initial=0.0, where=~np.isnan(part)) > LARGEST for part in (center, half, rho, margin)]
+    small = [(part < 0.0).any() for part in (half, rho)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = axes.transpose(0, 2, 1) @ axes - np.eye(axes.shape[1])
+    odd = ~np.isnan(rounded) & (rounded != 0.0) & (rounded != 1.0)
+    return not (any(large) or any(small) or odd.any() or (np.abs(off) > ORTHONORMAL).any())
 
 
 def parted(away, beyond, reach):

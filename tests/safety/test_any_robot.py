@@ -14,6 +14,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.filter.state_limits import StateLimits
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
@@ -102,6 +103,28 @@ def test_limits_hold_between_periods_and_in_the_stop(name):
     assert farthest > 0.6, "so is the room"
 
 
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_limit_of_the_position_holds_within_every_period_after_the_first(name):
+    filter, rng = limited(name), np.random.default_rng(3)
+    robot, tube = filter.robot, filter.tube
+    N, d = robot.horizon, robot.position_dim
+    start, turn = rng.uniform(-0.2, 0.2, d), filter.constraints.turn(0.4)
+    speeds = robot.state_at_inputs(robot.high())[list(robot.regressor)]
+    z = np.concatenate([speeds, np.tile(robot.high(), 1 + robot.free_steps)])
+    for period in range(1, N):
+        chords = tube.m_0.copy()
+        chords[tube.generators + period] += 0.05  # the path of this period may bend more than the others
+        bent = replace(tube, m_0=chords)
+        rows = StateLimits(robot, bent).rows(start, 0.4, turn, 1.0)
+        slack = (rows.bound - rows.support(bent, z)).reshape(-1, len(robot.limits))[:, : 2 * d].min(axis=0)
+        for at in (period - 1, period):  # the sets at its start and at its end
+            center, sizes = start + turn @ bent.centers(z)[at], bent.magnitudes(z)
+            half = np.abs(turn @ bent.directions[at]) @ sizes[: tube.generators]
+            beyond = half + sizes[tube.generators + period] + np.array(robot.measurement_bound[:d])
+            room = 0.8 - np.array([center, -center]).T - beyond[:, None]  # to +x, -x, +y and -y
+            assert (slack <= room.ravel() + 1e-9).all()
+
+
 def decisions_at_the_edge(clearance_margin, count, post=False):
     """Yield decisions of the boxed car that drives near its limit in x, and optionally beside a post."""
     filter = limited("car", clearance_margin=clearance_margin)
@@ -112,10 +135,11 @@ def decisions_at_the_edge(clearance_margin, count, post=False):
         yield filter.decide(Request(state, driving, driving, plan, Shapes.of(posts, 2), known_free=not post))
 
 
-def test_a_limit_is_kept_with_any_clearance_margin():
-    """A negative margin concerns obstacles, not limits."""
+@pytest.mark.parametrize("margin", [0.0, 0.05, 1.0])
+def test_a_limit_is_kept_with_any_clearance_margin(margin):
+    """The margin concerns obstacles, not limits."""
     kinds = set()
-    for decision in decisions_at_the_edge(-0.05, 200):
+    for decision in decisions_at_the_edge(margin, 200):
         kinds.add(decision.kind)
         assert decision.margin >= -1e-9 or decision.kind == FAILSAFE
     assert {ALLOWED, ADJUSTED} <= kinds

@@ -10,6 +10,7 @@ from brakeline.safety.filter.plan_search import DecisionRecord
 from brakeline.safety.filter.request import ALLOWED, FAILSAFE
 from tests.robots import GROUND
 from tests.safety.asked import STILL, cylinder, request
+from tests.safety.toys import puck
 
 ELSEWHERE = Prediction(np.full(5, 3.0), np.full(5, 0.01), 0.0)
 
@@ -108,6 +109,19 @@ def test_a_robot_outside_its_predicted_set_has_no_verified_plan_after_a_missing_
     backup_plan.fallback()
     assert backup_plan.model == (ready.version if verified else UNVERIFIED)
     assert bool(backup_plan.plan_token) == verified
+
+
+def test_without_a_measured_state_nothing_is_fed_back():
+    backup_plan = BackupPlan(puck("puck"))
+    plan, state = np.zeros((backup_plan.robot.horizon, 2)), np.array([0.0, 0.0, 0.5, 0.0])
+    plan[0] = 0.3, 0.0
+    backup_plan.measured(state)
+    backup_plan.accept(plan, "v1", None, True)
+    backup_plan.measured(state)
+    assert backup_plan.fallback()[0] < 0.0 and backup_plan.model == "v1", "it brakes by the measured speed"
+    for _ in range(2 * len(plan)):
+        backup_plan.measured(np.full(4, np.nan))
+        assert not backup_plan.fallback().any() and backup_plan.model == UNVERIFIED
 
 
 @pytest.mark.parametrize("bad", [np.full(5, np.nan), np.zeros(4), np.array([0.0, 0.0, np.inf, 0.0, 0.0])])

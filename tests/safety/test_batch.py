@@ -18,6 +18,7 @@ from brakeline.safety.filter.batch.batch_filter import BatchFilter
 from brakeline.safety.filter.batch.decision_arrays import KINDS
 from brakeline.safety.filter.batch.dual_active_set import solve_batch
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
+from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
 from brakeline.safety.filter.qp_solver import SOLVED, solve
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
@@ -25,12 +26,14 @@ from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
+from tests.robots import GROUND
 from tests.safety.test_one_step import CONFIG, ROBOT, driven, two_inputs
 from tests.safety.test_qp_solver import crowded
 
 SAME = 1e-6
 WORTH = 3 * WORTH_A_BATCH  # of the ground robot
 FORMS = ("ground direct", "ground recursion", "two discs", "two inputs", "one-step", "real time", "quadrotor direct")
+POST = Obstacle("cylinder", (0.26, 0.0), (0.1,))
 LONG = Disc((0.08, 0.02), 0.07), Disc((-0.08, 0.0), 0.09)
 EQUAL = ("kind", "verified", "at_least", "contained", "compared", "for_clearance", "model", "bound", "judges", "reason")
 
@@ -204,6 +207,15 @@ def test_past_windows_are_scored():
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
 
 
+def test_row_by_row_a_filter_states_what_it_states_in_each_row():
+    ready = one_step()
+    requests = RequestArrays.of(scenes(ready, 3))
+    answers, whole = RowByRow(ready).decide_batch(requests), ready.decide_batch(requests)
+    for name in ("bound", "judges", "outside_share"):
+        assert getattr(answers, name) == getattr(whole, name) == getattr(answers.row(2), name)
+    assert answers.judges and answers.bound > 0.0 and answers.outside_share > 0.0
+
+
 @pytest.mark.parametrize(("crowd", "rows"), [(0.9, 40), (0.0, 5)])
 def test_torch_gives_the_same_answers_in_its_own_tensors(crowd, rows):
     torch = pytest.importorskip("torch")
@@ -244,13 +256,44 @@ def test_numbers_that_are_not_finite_verify_nothing(value):
 @pytest.mark.parametrize("part", ["center", "rho", "half", "margin", "axes"])
 def test_an_obstacle_that_is_not_finite_is_no_free_space(part):
     ready = ground()
-    post = Shapes.of([Obstacle("cylinder", (0.26, 0.0), (0.1,))], 2)
+    post = Shapes.of([POST], 2)
     one = plain(ready, np.zeros(5), np.array([0.25, 0.0]), np.zeros(2), np.zeros((3, 2)))
     requests = RequestArrays.of([replace(one, obstacles=post) for _ in range(4)])
     getattr(requests.obstacles, part)[2] = np.nan
     answers = ready.decide_batch(requests)
     assert 2 in answers.singly and KINDS[answers.kind[2]] in (FAILSAFE, RECOVERING)
     assert {KINDS[kind] for kind in answers.kind[[0, 1, 3]]} == {ADJUSTED}
+
+
+IMPOSSIBLE = {"center": (np.inf, 1e90), "axes": (1e90, 0.5, 0.0), "half": (-1.0, 1e200), "rho": (-0.3, np.inf)}
+IMPOSSIBLE |= {"round": (0.5, -1.0), "margin": (-np.inf, 1e90)}
+
+
+@pytest.mark.parametrize("part", IMPOSSIBLE)
+def test_an_impossible_obstacle_is_refused_as_such(part):
+    ready = ground()
+    one = plain(ready, np.zeros(5), np.array([0.25, 0.0]), np.zeros(2), np.zeros((3, 2)))
+    for value in IMPOSSIBLE[part]:
+        requests = RequestArrays.of([replace(one, obstacles=Shapes.of([POST], 2)) for _ in range(3)])
+        getattr(requests.obstacles, part).reshape(3, -1)[2, 0] = value
+        with pytest.raises(BadRequest, match="row 2") as refusal:
+            ready.decide_batch(requests)
+        assert refusal.value.field == "obstacles"
+
+
+@pytest.mark.parametrize("margin", [-0.15, -0.3, -1e3])
+@pytest.mark.parametrize("motion", [None, Motion((-1.0, 0.0), position_error=0.03, acceleration=1.0)])
+def test_the_robots_centre_keeps_out_of_an_obstacle_with_any_margin(margin, motion):
+    ready, decided = ground(), []
+    one = plain(ready, np.zeros(5), np.array([0.25, 0.0]), np.zeros(2), np.zeros((3, 2)))
+    for each in (-GROUND.footprint, margin):
+        post = Obstacle("cylinder", (0.12, 0.0), (0.1,), margin=each, motion=motion)
+        standing, moving = split_moving([post], 2)
+        asked = replace(one, obstacles=standing, movers=moving)
+        decided.append(ready.decide(asked))
+        if motion is None:
+            decided.append(ready.decide_batch(RequestArrays.of([asked] * 2)).row(1))
+    assert len({(d.kind, d.verified, d.margin, *d.plan[0]) for d in decided}) == 1 and decided[0].kind != ALLOWED
 
 
 def test_an_invalid_batch_is_refused_with_the_fields_name():

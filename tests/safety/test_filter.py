@@ -12,12 +12,14 @@ from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Limit
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
+from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.blocking_constraint import SIGHT
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, MOST_OBSERVED, NOT_FINITE
 from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import decision_reply
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.asked import cylinder, fits, random_request, request, same
@@ -66,6 +68,31 @@ def test_a_slew_limit_is_kept(model):
             assert 0.1 - 1e-12 <= decision.plan[0][0] <= 0.2 + 1e-12
             assert abs(decision.plan[0][1]) <= 0.1 + 1e-12
     assert ADJUSTED in kinds
+
+
+def test_an_input_that_was_never_recorded_is_not_verified(model):
+    fast, state = Filter(replace(model, robot=replace(GROUND, name="fast", action_high=(1.0, 0.5)))), np.zeros(5)
+    most = model.domain[1, 2] + 0.02 * np.ptp(model.domain[:, 2])
+    session = InProcess(fast, accept_bound=1.0)
+    for speed, kind in ((0.2, ALLOWED), (1.0, ADJUSTED), (1.0, ADJUSTED), (0.2, ALLOWED)):
+        decision = session.decide(state, (speed, 0.0), known_free=True)
+        assert (decision.kind, decision.verified) == (kind, True) and decision.action[0] == min(speed, most)
+        assert ("recorded" in decision.reason) == (kind == ADJUSTED) and decision.blocked_by is None
+        state = decision.predicted.center
+    for way in np.linspace(0.23, 0.5, 9):
+        asked = request(action=(1.0, 0.1), obstacles=[cylinder(way, 0.02)])
+        alone, among = fast.decide(asked), fast.decide_batch(RequestArrays.of([asked] * 2)).row(1)
+        assert alone.kind == among.kind != ALLOWED and np.array_equal(alone.plan, among.plan)
+        assert alone.plan[0, 0] <= most and not alone.for_clearance
+    committed = np.array([(0.9, 0.0), (0.0, 0.0), (0.0, 0.0)])
+    other = fast.decide(request(action=(np.nan, 0.0), plan=committed, model="another"))
+    assert other.kind == FAILSAFE and not other.plan.any() and other.verified, "braking is verified, 0.9 m/s is not"
+
+
+@pytest.mark.parametrize("margin", [-0.05, np.nan, np.inf])
+def test_a_clearance_margin_is_finite_and_not_negative(model, margin):
+    with pytest.raises(ValueError, match="clearance margin"):
+        Filter(model, clearance_margin=margin)
 
 
 def test_adjusted_is_the_closest_input_that_can_be_verified(ready):

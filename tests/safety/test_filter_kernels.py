@@ -88,6 +88,15 @@ def shapes(rng, d):
     return Shapes.of(found, d)
 
 
+def impaired(rng, near):
+    """Return the arrays of obstacles, one number of which is often wrong."""
+    parts = [part.copy() for part in (*near.parts, near.margin)]
+    part = parts[rng.integers(len(parts))].reshape(-1)
+    place = rng.integers(len(part))
+    part[place] = rng.choice([part[place], np.nan, np.inf, -1e6, -1.0, 0.5, 1e200])
+    return parts
+
+
 def cases(rng, d):
     """Arguments for each kernel, by its name."""
     W_t, M_t, m_0, position, offset, directions, widening = tube = tube_parts(rng, d)
@@ -137,6 +146,7 @@ def cases(rng, d):
         ),
         "linearized": (predictor, *plan),
         "distances": (*near.parts, start),
+        "plausible": (*impaired(rng, near),),
         "parted": (rng.choice([0.1, 0.5, 0.7, np.nan], 6), 0.6, 0.3),
         "roomiest_planes": (rng.normal(size=(6, 2 * N + 1, d)), rng.normal(size=(6, 2 * N + 1)) + 1.0, path),
         "planes_beside": (*near.parts, near.margin, start, start + path[1:], 0.1, measured),

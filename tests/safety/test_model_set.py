@@ -178,6 +178,20 @@ def test_tampered_model_sets_are_refused(model):
             ModelSet.decode(edited(model, metadata))
 
 
+def test_a_flipped_bit_in_what_a_model_set_states_is_noticed(model):
+    stated = replace(model, about=model.about | {"bound_plan": "0.0376"})
+    whole = stated.encode()
+    assert ModelSet.decode(whole).about == stated.about
+    for bit in range(3):
+        damaged = bytearray(whole)
+        damaged[whole.index(b"0.0376") + 3] ^= 1 << bit
+        with pytest.raises(BadModel, match="checksum"):
+            ModelSet.decode(bytes(damaged))
+    tensors, about = unpack(whole, ENTRY)
+    earlier = pack(tensors, ENTRY, {name: value for name, value in about.items() if name != "checksum"})
+    assert ModelSet.decode(earlier).version == model.version and ModelSet.decode(earlier).encode() == whole
+
+
 def test_invalid_configurations_and_data_that_support_no_model_are_refused(data):
     for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
         with pytest.raises(ValueError, match=r"certificate|mode|envelope"):

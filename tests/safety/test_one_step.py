@@ -24,8 +24,9 @@ from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.one_step_fitting import fit_one_step
 from brakeline.safety.model.set_factors import SetFactors
-from brakeline.safety.model.set_shape import Shape, spread_features, typical_plans
-from brakeline.safety.model.windows import FREE
+from brakeline.safety.model.set_shape import Shape, shares, spread_features, typical_plans
+from brakeline.safety.model.validation import validate_one_step
+from brakeline.safety.model.windows import FREE, non_overlapping_starts
 from tests.safety.asked import cylinder
 from tests.safety.test_turning_in_place import ROBOT, record
 from tests.safety.toys import puck
@@ -277,6 +278,26 @@ def test_each_kind_of_driving_has_its_share_outside_and_only_starts_have_a_facto
     assert (factors.plan, factors.first, factors.start) == (2.0, 1.0, 1.5)
     assert factors.shares(plan, first, kinds).max() == 1.0
     assert SetFactors.of(plan, first, kinds, 0.05).plan == 2.0  # of the hundred rare ones, five may be outside
+
+
+def test_an_error_that_is_no_number_counts_as_outside():
+    errors, widths = np.array([np.nan, 0.1, np.inf, 0.0, 0.0, 0.1]), np.array([0.2, 0.2, np.inf, 0.0, np.inf, np.nan])
+    assert shares(errors, widths).tolist() == [np.inf, 0.5, np.inf, 0.0, 0.0, np.inf]
+    first = np.full(2000, 0.5)
+    kinds = {START: np.arange(2000) < 50, JUMPING: np.zeros(2000, dtype=bool)}
+    for place in (7, 1400):
+        plan = np.full(2000, 2.0)
+        plan[place] = np.nan
+        factors = SetFactors.of(plan, first, kinds, 0.01)
+        assert factors.plan == 2.0 and np.flatnonzero(factors.shares(plan, first, kinds) > 1.0).tolist() == [place]
+        assert max(SetFactors.of(plan, first, kinds, 0.0).plan, SetFactors.of(plan, first, kinds, 0.0).start) == np.inf
+    model, calibration = fit_one_step(driven(trajectories=3), CONFIG)
+    apart = np.flatnonzero(non_overlapping_starts(calibration.samples.start, N))
+    before = validate_one_step(model, calibration)
+    calibration.scores[apart[:5]] = calibration.first_scores[apart[:5]] = np.nan
+    report = validate_one_step(model, calibration)
+    assert report.violations == before.violations + 5 and report.step_violations >= before.step_violations + 5
+    assert report.bound_plan > before.bound_plan and report.excess == np.inf
 
 
 def test_inputs_that_jump_widen_the_set_of_the_next_state_but_not_those_of_plans():

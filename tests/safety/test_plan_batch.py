@@ -20,6 +20,7 @@ from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.in_process import InProcess
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from tests.safety.test_batch import one_step
 
 GROUND = robot_with_task("ground")
 SAFETY = Filter.load("ground")
@@ -115,6 +116,20 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
     assert outcome.decided.tolist() == [False, broken is not FAILING] and outcome.failure
     assert np.allclose(outcome.inputs[1], actions[1]) == (broken is not FAILING)
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
+
+
+def test_a_state_that_is_not_finite_costs_a_batch_one_period() -> None:
+    plans = BackupPlanBatch(one_step(), 2)
+    free, given = ObstacleArrays.of([Shapes.of([], 2)] * 2), []
+    for period in range(16):
+        states = np.zeros((2, 5))
+        states[1, 0] = math.nan if period == 6 else 0.0
+        outcome = plans.decide(states, np.zeros((2, 2)), free)
+        assert outcome.decided.all() == (period != 6), outcome.failure
+        past = plans.request(states, np.zeros((2, 2)), free).past
+        given.append([False, False] if past is None else past.given.tolist())
+    N = plans.robot.horizon
+    assert given[N : 6 + N] == [[True, True]] * (6 - N) + [[True, False]] * N and given[6 + N] == [True, True]
 
 
 def test_plans_of_other_robots_are_not_kept_in_batches() -> None:

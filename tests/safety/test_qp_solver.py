@@ -12,6 +12,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter import qp_solver
 from brakeline.safety.filter.halfspaces import half_spaces
 from brakeline.safety.filter.kernels.active_set_kernels import hildreth_active_set
+from brakeline.safety.filter.plan_inputs import PlanInputs
 from brakeline.safety.filter.qp import ObstacleRows, QPBuilder
 from brakeline.safety.filter.qp_solver import ACCURACY, QuadraticProgram, Solution, solve
 from brakeline.safety.model.model_set import ModelSet
@@ -22,7 +23,7 @@ def programs(model: ModelSet, count, seed=0):
     """QPs as the filter builds them, of proposals near obstacles."""
     rng = np.random.default_rng(seed)
     tube, outer = model.tube(), model.outer_tube()
-    layout, builder = ObstacleRows(tube.directions), QPBuilder(model.robot, outer)
+    layout, builder = ObstacleRows(tube.directions), QPBuilder(PlanInputs(model.robot), outer)
     for _ in range(count):
         angles, distance = rng.uniform(-np.pi, np.pi, 4), rng.uniform(0.26, 0.36, 4)
         posts = [cylinder(r * np.cos(a), r * np.sin(a)) for a, r in zip(angles, distance, strict=True)]

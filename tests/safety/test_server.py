@@ -46,6 +46,17 @@ def test_each_request_of_a_batch_has_its_reply_in_order(service, model):
     assert (figures["decisions"], figures["errors"]) == (2, 1) and figures["decide_ms"] > 0.0
 
 
+def test_a_standing_robot_with_widened_sets_reserves_as_much_as_they_take(service):
+    backup_plan, replies = BackupPlan(GROUND), {}
+    for factor in (1.0, 10.0):
+        backup_plan.widening.factor = factor
+        asked = request_message(backup_plan, np.zeros(5), [NAN, 0.0], known_free=True, actor="a", fleet=["a"])
+        replies[factor] = read_reply(service.replies(asked)[0], asked, GROUND)
+        reserved = replies[factor].reservation
+        assert (reserved.half_width[-1] >= replies[factor].tube_half_width[-1] - 1e-12).all()
+    assert (replies[10.0].reservation.half_width > replies[1.0].reservation.half_width).all()
+
+
 def bad(**changes):
     message = good()
     for name, value in changes.items():

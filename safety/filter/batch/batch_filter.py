@@ -4,9 +4,9 @@
     answers = batch.decide(RequestArrays.of(requests))     # or arrays of your own; torch tensors may lie on a GPU
 
 The batch decides the rows whose answer is the proposal or the input of a QP, among obstacles that stand still. It
-leaves every other row to `Filter.decide`, the *single path*: a state outside the recorded domain, a proposal that is
-not finite, a robot that may turn in place and whose proposal is not allowed at once, most failsafes, every recovery,
-and every comparison whose result rounding could change.
+leaves every other row to `Filter.decide`, the *single path*: a state or a proposal outside the recorded domain, a
+proposal that is not finite, a robot that may turn in place and whose proposal is not allowed at once, most failsafes,
+every recovery, and every comparison whose result rounding could change.
 """
 
 from __future__ import annotations

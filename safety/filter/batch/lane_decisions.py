@@ -18,6 +18,7 @@ from brakeline.safety.filter.batch.obstacle_arrays import (
     TurnBatch,
     mapped,
     on_host,
+    plausible,
     within_reach,
 )
 from brakeline.safety.filter.batch.qp_batch import ROUNDING
@@ -56,6 +57,8 @@ class LaneDecisions:
         self._regressor = constant(np.array(robot.regressor))
         self._bounds = constant(FastRequestCheck(robot).bounds[:, :, None])
         self._domain = constant(safety.domain[:, :, None])
+        ends = robot.low(), robot.high(), safety.inputs.low, safety.inputs.high
+        self._recorded = tuple(constant(end[None]) for end in ends) if safety.inputs.narrower else ()
         self._schedule = constant(safety.inputs.schedule)
         self._general = _Sets(self._constraints, safety.model, safety.tube, constant, xp)
         self._box, self._turning = None, self._general
@@ -99,6 +102,11 @@ class LaneDecisions:
         whole = xp.permute_dims(whole, (1, 0))
         good = xp.all((whole >= self._bounds[0]) & (whole <= self._bounds[1]), axis=0)
         good &= xp.all(xp.abs(requests.action) < HUGE, axis=1)
+        if self._recorded:  # a proposal that was never recorded is not allowed as it stands
+            low, high, least, most = self._recorded
+            wanted = xp.minimum(xp.maximum(requests.action, low), high)
+            good &= xp.all((wanted >= least) & (wanted <= most), axis=1)
+        good &= plausible(xp, requests.obstacles)
         obstacles = requests.obstacles
         parts = obstacles.center, obstacles.axes, obstacles.half, obstacles.rho, obstacles.round, obstacles.margin
         for part in parts:
@@ -134,7 +142,7 @@ class LaneDecisions:
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
         obstacles = ObstacleArrays(*(xp.take(part, rows, axis=0) for part in vars(requests.obstacles).values()))
-        near, beyond = within_reach(xp, obstacles, start, reach)
+        near, beyond = within_reach(xp, obstacles, start, reach, robot.least_margin)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
         scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, asked)

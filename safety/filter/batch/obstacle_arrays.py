@@ -10,7 +10,7 @@ import array_api_compat
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import LARGEST, ORTHONORMAL, Shapes
 
 T = TypeVar("T")
 Array = Any  # of any namespace
@@ -127,10 +127,13 @@ class NearObstacles:
         return xp.all(~self.used, axis=0) if self.used.shape[0] else xp.ones_like(lanes, dtype=xp.bool)
 
 
-def within_reach(xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array) -> tuple[NearObstacles, Array]:
+def within_reach(
+    xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array, least_margin: float
+) -> tuple[NearObstacles, Array]:
     """Return the obstacles within reach (B,) of positions `start` (per axis, (B,)), and the distance to the next one.
 
-    The distance (B,) [m] is that of the nearest obstacle beyond reach, or infinity.
+    The distance (B,) [m] is that of the nearest obstacle beyond reach, or infinity. A margin below `least_margin` [m]
+    counts as that (`Robot.least_margin`).
     """
     d = len(start)
 
@@ -144,13 +147,28 @@ def within_reach(xp: Any, obstacles: ObstacleArrays, start: Axes, reach: Array) 
     used = slot < obstacles.count
     whole = NearObstacles(parts[0], axes, parts[1], rho, parts[2], margin, used, slot, rho)
     _, distance = towards(xp, whole, [axis[None] for axis in start])
-    away = distance[0] - margin
+    away = distance[0] - xp.maximum(margin, xp.full_like(margin, least_margin))
     near = used & ~(away > reach)
     beyond = xp.min(xp.where(used & ~near, away, xp.inf), axis=0) if rho.shape[0] else xp.full_like(reach, xp.inf)
     most = int(xp.max(xp.sum(xp.astype(near, xp.int64), axis=0))) if rho.shape[0] else 0
     order = xp.argsort(xp.astype(~near, xp.int8), axis=0, stable=True) if rho.shape[0] else slot
     whole = NearObstacles(parts[0], axes, parts[1], rho, parts[2], margin, near, slot, away)
     return mapped(whole, lambda part: xp.take_along_axis(part, order[:most], axis=0)), beyond
+
+
+def plausible(xp: Any, obstacles: ObstacleArrays) -> Array:
+    """Return the requests (B,) whose obstacles all have possible numbers, as `shape_kernels.plausible` of `Shapes`."""
+    count, d = obstacles.count[:, None], obstacles.center.shape[2]
+    slot = xp.arange(obstacles.rho.shape[1], device=obstacles.rho.device)
+    good = (xp.abs(obstacles.margin) <= LARGEST) & (obstacles.rho >= 0.0) & (obstacles.rho <= LARGEST)
+    for i in range(d):
+        half, rounded = obstacles.half[..., i], obstacles.round[..., i]
+        good &= (xp.abs(obstacles.center[..., i]) <= LARGEST) & (half >= 0.0) & (half <= LARGEST)
+        good &= (rounded == 0.0) | (rounded == 1.0)
+        for k in range(i + 1):
+            product = _summed([obstacles.axes[..., j, i] * obstacles.axes[..., j, k] for j in range(d)])
+            good &= xp.abs(product - float(i == k)) <= ORTHONORMAL
+    return xp.all(good | (slot >= count), axis=1)
 
 
 def towards(xp: Any, near: NearObstacles, points: Axes) -> tuple[Axes, Array]:

@@ -190,7 +190,7 @@ class BackupPlanBatch:
         robot, now = self.robot, self.plan[:, 0].copy()
         self._states = np.concatenate([self._states[:, 1:], states[:, None]], axis=1)
         self._inputs = np.concatenate([self._inputs[:, 1:], now[:, None]], axis=1)
-        self._periods += 1
+        self._periods = np.where(np.isfinite(states).all(axis=1), self._periods + 1, 0)  # a gap ends the window
         rests = robot.is_stop_input(now)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[:, -1])
         self.plan = np.concatenate([self.plan[:, 1:], last[:, None]], axis=1)

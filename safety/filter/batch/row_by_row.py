@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter_ns
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from brakeline.safety.filter.batch.request_arrays import RequestArrays
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
     from brakeline.safety.methods import Method
+
+
+STATED: dict[str, Any] = {"bound": None, "judges": False, "outside_share": 0.0}  # without a decision: see `Decision`
 
 
 class RowByRow:
@@ -35,7 +39,9 @@ class RowByRow:
         """Decide on NumPy arrays. Raises BadRequest: a value is missing, not finite, or has the wrong size."""
         started, every = perf_counter_ns(), np.ones(len(requests), dtype=bool)
         answers = blank_answers(self.robot, requests, np, "cpu")
-        return completed(self._method, requests, answers, every, started, bound=None, judges=False, outside_share=0.0)
+        all_rows = completed(self._method, requests, answers, every, started, **STATED)
+        stated = {name: getattr(one, name) for one in [*all_rows.singly.values()][:1] for name in STATED}
+        return replace(all_rows, **stated)  # by one method, so it is the same in every row
 
 
 BatchMethod: TypeAlias = "Filter | RowByRow"  # what `BackupPlanBatch` asks

@@ -67,6 +67,7 @@ class SearchBatch:
         self._one_input = self._free == self._m
         inputs = safety.inputs
         self._low, self._high = constant(inputs.low[:, None]), constant(inputs.high[:, None])
+        self._width = constant(inputs.width[:, None])
         self._slew, self._nothing = constant(inputs.slew[:, None]), constant(inputs.nothing[:, None])
         self._braking = constant(inputs.braking.reshape(-1, 1))
         self._standing = constant(safety.standing[:, None].astype(float)) > 0.5
@@ -97,7 +98,7 @@ class SearchBatch:
     def _as_proposed(self, lanes: LaneBatch, z: Array) -> tuple[Array, Array]:
         """Return regressors (nz, B), with the proposal as first input where it is close; and unsure lanes (B,)."""
         xp, known, m = self._xp, self.known, self._m
-        off = (z[known : known + m] - lanes.proposal) / (self._high - self._low)
+        off = (z[known : known + m] - lanes.proposal) / self._width
         off = xp.sqrt(xp.sum(off * off, axis=0))
         if self._one_input:
             return z, xp.zeros_like(off, dtype=xp.bool)

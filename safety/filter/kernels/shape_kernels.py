@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.compilation import compiled
+from brakeline.messaging.obstacle import LARGEST, ORTHONORMAL
 from brakeline.safety.filter.halfspaces import TOUCHING
 
 Array = NDArray[np.float64]
@@ -55,6 +56,26 @@ def distances(center: Array, axes: Array, half: Array, rho: Array, rounded: Arra
     for i in range(len(rho)):
         away[i] = _towards(center[i], axes[i], half[i], rho[i], rounded[i], point, rest, way)
     return away
+
+
+@compiled("b1(f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1])")
+def plausible(center: Array, axes: Array, half: Array, rho: Array, rounded: Array, margin: Array) -> bool:
+    """Return whether all numbers may be those of obstacles. NaN may: an obstacle with NaN counts as everywhere.
+
+    Sizes are not negative, `axes` are orthonormal, and no number is larger than a wall needs.
+    """
+    wrong = False
+    for n in range(len(rho)):
+        wrong |= abs(margin[n]) > LARGEST or rho[n] < 0.0 or rho[n] > LARGEST
+        for i in range(center.shape[1]):
+            wrong |= abs(center[n, i]) > LARGEST or half[n, i] < 0.0 or half[n, i] > LARGEST
+            wrong |= rounded[n, i] != 0.0 and abs(rounded[n, i] - 1.0) > 0.0  # not of NaN
+            for k in range(i + 1):
+                product = -1.0 if i == k else 0.0
+                for j in range(center.shape[1]):
+                    product += axes[n, j, i] * axes[n, j, k]
+                wrong |= abs(product) > ORTHONORMAL
+    return not wrong
 
 
 @compiled("Tuple((f8, b1[::1], i8))(f8[::1], f8, f8)")
