@@ -199,6 +199,8 @@ class Metrics:
 
     def _step(self, step: pb.Step) -> None:
         _get_or_create(self.actors, step.actor, EpisodeStats).step(step)
+        if (step.terminated or step.truncated) and step.actor in self.plans:
+            self.plans[step.actor].last_step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = exchange.request.actor
