@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from brakeline.errors import ExportError
 from brakeline.logs.foxglove import FoxgloveConverter
-from brakeline.logs.reader import TYPES, Log, Paths, Record, open_log
+from brakeline.logs.reader import Log, Paths, Record, open_log
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
@@ -131,13 +131,12 @@ def to_foxglove(paths: Paths, out: Path) -> int:
 def _stored(log: Log) -> Iterator[tuple[Entry, Record]]:
     """Yield the messages of a log, as stored and decoded."""
     for series, log_time, publish_time, payload in log.rows():
-        kind = TYPES[series.schema.name]
         try:
-            message: Any = kind.FromString(payload)
+            message: Any = series.decode(payload)
         except DecodeError:
             log.malformed += 1
             continue
-        entry = Entry(series.key, kind, payload, log_time, publish_time, message.header.sequence)
+        entry = Entry(series.key, type(message), payload, log_time, publish_time, message.header.sequence)
         yield entry, Record(series.topic, series.key, message, log_time, publish_time)
 
 

@@ -168,8 +168,11 @@ class Log:
             raise LogError(f"{path} is not an MCAP file: {error}") from error
 
     @staticmethod
-    def _channel(key: str, schema: str) -> LogChannel:
-        kind, topic = TYPES.get(schema), topic_of(key)
+    def _channel(key: str, schema: str | None) -> LogChannel:
+        topic = topic_of(key)
+        kind = TYPES.get(schema or "")
+        if schema is None and topic is not None:
+            kind = topic.message
         names = {} if topic is None else names_of(topic, key)
         name = key.partition("/")[0] if topic is None else topic.name
         return LogChannel(name, key, None if kind is None else kind.FromString, names=names)
