@@ -89,6 +89,25 @@ class LogSegment:
             self.start = log_time
 
 
+@dataclass(frozen=True)
+class Damage:
+    """What could not be read of a log.
+
+    Attributes:
+        cuts: one line for each damage or missing segment.
+        malformed: number of messages that cannot be decoded or have impossible values.
+    """
+
+    cuts: list[str] = field(default_factory=list)
+    malformed: int = 0
+
+    @property
+    def lines(self) -> list[str]:
+        """One line for each damage, also for malformed messages."""
+        counted = f"{self.malformed} messages cannot be decoded, or have impossible values"
+        return [*self.cuts, *([counted] if self.malformed else [])]
+
+
 @dataclass
 class Log:
     """The segments of one or more runs, in order. Iterating over the log fills the other attributes.
@@ -108,6 +127,11 @@ class Log:
     segments: list[LogSegment] = field(default_factory=list)
     clock: RunClock = field(default_factory=RunClock)  # `clock.at(log_time)` for each message in turn
     robots: RecordedRobots = field(default_factory=RecordedRobots)
+
+    @property
+    def damage(self) -> Damage:
+        """What could not be read, once the log has been read."""
+        return Damage([str(cut) for cut in self.cuts], self.malformed)
 
     def __iter__(self) -> Iterator[Record]:
         for series, message, log_time, publish_time in self.decoded():
