@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,12 +61,16 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True)
 class MissingSegment:
-    """A missing segment of a run that has later segments."""
+    """Missing segments, one after the other, of a run that has later segments."""
 
-    path: Path
+    path: Path  # of the first one
+    last: Path  # of the last one
+    count: int = 1
 
     def __str__(self) -> str:
-        return f"{self.path}: this segment is missing"
+        if self.count == 1:
+            return f"{self.path}: this segment is missing"
+        return f"{self.path} to {self.last.name}: these {self.count} segments are missing"
 
 
 @dataclass
@@ -261,10 +265,11 @@ def count_by_key(path: Path) -> Counter[str]:
 def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
     """Yield the missing segments: gaps in the numbers of the segments at `paths`."""
     for (folder, name), files in groupby(paths, key=_run_of):
-        numbers = [number_of(path)[1] for path in files]
-        if len(numbers) > 1:
-            for number in sorted(set(range(numbers[-1])) - set(numbers)):
-                yield MissingSegment(folder / name_of(f"{name}.mcap", number))
+        numbers = [-1, *sorted(number_of(path)[1] for path in files)]
+        for before, after in pairwise(numbers if len(numbers) > 2 else ()):
+            if (count := after - before - 1) > 0:
+                first, last = (folder / name_of(f"{name}.mcap", number) for number in (before + 1, after - 1))
+                yield MissingSegment(first, last, count)
 
 
 def _run_of(path: Path) -> tuple[Path, str]:
