@@ -158,6 +158,20 @@ def test_steps_that_a_learner_had_and_nobody_recorded_are_missing(tmp_path: Path
     assert cuts == ["3 of the 8 steps that the learner of ground had are not in the log"] * (lost == 3)
 
 
+def test_steps_that_a_feeder_published_from_other_logs_are_not_missing(tmp_path: Path) -> None:
+    writer = Writer()
+    published = {"logged/ground/a": 4, "logged/ground/b": 3, "logged/quadrotor/a": 9}
+    for count in (0, 1):
+        health = pb.Health(
+            process="feeder", published={key: n * count for key, n in published.items()}, last=count == 1
+        )
+        writer.put("health/feeder", health, always=True)
+    for robot in ("ground", "quadrotor"):
+        writer.put(f"metrics/{robot}", pb.LearnerMetrics(robot=robot, steps=9), always=True)
+    cuts = analyse(writer.write(tmp_path / "run.mcap"))["cuts"]
+    assert cuts == ["2 of the 9 steps that the learner of ground had are not in the log"]
+
+
 def test_the_table_of_an_episode_has_the_recorded_values(
     log: Path, figures: dict[str, Any], messages: Messages
 ) -> None:
