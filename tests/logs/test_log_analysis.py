@@ -11,7 +11,7 @@ import pytest
 
 from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
-from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
+from brakeline.logs.learning_curve import MOST_BINS, LearningCurve, interventions_in
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
@@ -248,6 +248,25 @@ def test_bins_become_wider_instead_of_more() -> None:
     assert sum(row["episodes"] for row in figures["bins"]) == 400
     times = timeline.figures()
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
+
+
+def test_curves_count_the_interventions_that_the_summary_counts() -> None:
+    curve, kinds = LearningCurve(), [pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING, pb.RECOVERING]
+    for k, kind in enumerate(kinds):
+        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4))
+    figures = curve.figures()
+    (row,) = figures["bins"]
+    assert interventions_in(row) == pytest.approx(figures["last"]["interventions"]) == 0.8
+    before = {name: value for name, value in row.items() if name != "recovering"}
+    assert interventions_in(before) == pytest.approx(0.4), "a row that an earlier version wrote"
+
+
+def test_a_cut_episode_is_not_joined_with_the_next_one_whose_first_step_is_lost() -> None:
+    curve = LearningCurve()
+    for episode, numbers in ((0, range(5)), (1, range(1, 10))):
+        for k in numbers:
+            curve.step(pb.Step(actor="a", episode=episode, step=k, reward=1.0, terminated=(episode, k) == (1, 9)))
+    assert curve.figures()["last"]["reward"] == 9.0
 
 
 def test_a_change_shows_in_the_windows_the_widening_the_widths_and_the_model_sets() -> None:
