@@ -92,7 +92,7 @@ def number_of(path: Path) -> tuple[str, int]:
 
 def _recorded_number(path: Path) -> int | None:
     """Return the segment's number in the metadata, which follow the header; None if they state none."""
-    with contextlib.suppress(OSError, NotMcap), path.open("rb") as file:
+    with contextlib.suppress(OSError, NotMcap, ValueError), path.open("rb") as file:
         for item in itertools.islice(records(file, path.stat().st_size), 2):
             if isinstance(item, McapMetadata) and item.name == ABOUT:
                 number = item.metadata.get(SEGMENT, "")
