@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from brakeline.logs.episode_stats import CONTACTS, KINDS, RUN_INTO, Figures
+from brakeline.logs.learning_curve import interventions_in
 from brakeline.logs.log_analysis import SETUP, analyse_runs
 from brakeline.logs.reader import Paths
 from brakeline.logs.stacking_table import plain_table
@@ -259,7 +260,7 @@ def _coarse(bins: list[Figures], most: int) -> list[Figures]:
     for start in range(0, len(bins), per):
         part = bins[start : start + per]
         steps, episodes = sum(row["steps"] for row in part), sum(row["episodes"] for row in part)
-        interventions = sum((row["adjusted"] + row["failsafes"]) * row["steps"] for row in part) / steps
+        interventions = sum(interventions_in(row) * row["steps"] for row in part) / steps
         ended = [row for row in part if row["episodes"]]
         means = {
             name: sum(row[name] * row["episodes"] for row in ended) / episodes if episodes else None

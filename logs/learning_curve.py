@@ -22,7 +22,12 @@ MOST_POINTS = 400  # points of a learner's curves
 MOST_MODELS = 1000  # versions whose first decision is kept
 CURVES = ("steps", "updates", "critic_loss", "actor_loss", "mean_q")  # of the learner
 
-COUNTED = {int(pb.ADJUSTED): "adjusted", int(pb.FAILSAFE): "failsafes"}
+COUNTED = {int(pb.ADJUSTED): "adjusted", int(pb.FAILSAFE): "failsafes", int(pb.RECOVERING): "recovering"}
+
+
+def interventions_in(row: Figures) -> float:
+    """Return the share of steps with an intervention in a row of `bins`. Rows of earlier versions lack `recovering`."""
+    return float(row["adjusted"] + row["failsafes"] + row.get("recovering", 0.0))
 
 
 class Bin(Counter[str]):
@@ -60,6 +65,7 @@ class Bin(Counter[str]):
 class Episode:
     """Sums over a running episode."""
 
+    number: int
     steps: int = 0
     interventions: int = 0
     reward: float = 0.0  # without the intervention penalty
@@ -103,8 +109,8 @@ class LearningCurve:
         self.staleness.add(self._newest - version)
         actor = step.actor
         episode = self._running.get(actor)
-        if episode is None or step.step == 0:
-            episode = self._running[actor] = Episode()
+        if episode is None or step.step == 0 or step.episode != episode.number:
+            episode = self._running[actor] = Episode(step.episode)
         episode.reward += step.reward
         episode.steps += 1
         episode.interventions += kind in INTERVENTIONS

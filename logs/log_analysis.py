@@ -163,8 +163,8 @@ class RunAnalysis:
 
     def _unrecorded_steps(self) -> Iterator[str]:
         for robot, metrics in self.metrics.learners.items():
-            recorded = self.training[robot].recorded
-            if (lost := metrics.steps - recorded) > 0:
+            known = self.training[robot].recorded + self.metrics.fed_to(robot)
+            if (lost := metrics.steps - known) > 0:
                 yield f"{lost} of the {metrics.steps} steps that the learner of {robot} had are not in the log"
 
 

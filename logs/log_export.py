@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from brakeline.errors import ExportError
 from brakeline.logs.foxglove import FoxgloveConverter
-from brakeline.logs.reader import TYPES, Log, Paths, Record, open_log
+from brakeline.logs.reader import Log, Record
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
@@ -28,15 +28,15 @@ INFOS = ("penalty", "goal", "collision", "decision", "clearance", "speed", "weig
 TIME = struct.Struct(">Q")  # of a frame in a .tlog file: µs since the Unix epoch
 
 
-def robot_steps(paths: Paths, robot: RobotWithTask) -> Iterator[Record]:
+def robot_steps(log: Log, robot: RobotWithTask) -> Iterator[Record]:
     """Yield the steps of a robot kind in the order of receipt.
 
     Raises:
         ExportError: the log has no step of this robot; the message lists the robots that it has.
-        LogError: as `open_log`.
+        LogError: as `Log`.
     """
     others, empty = set(), True
-    for record in open_log(paths):
+    for record in log:
         if record.topic == "step" and record.message.robot == robot.name:
             empty = False
             yield record
@@ -50,7 +50,7 @@ def robot_steps(paths: Paths, robot: RobotWithTask) -> Iterator[Record]:
         raise ExportError(f"the log has no step of {robot.name} or of any other robot")
 
 
-def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
+def to_csv(log: Log, robot: RobotWithTask, file: TextIO) -> int:
     """Write each step of a robot kind as a line, and return the number of steps. Raises as `robot_steps`.
 
     Columns: log_time [ns], header.time [s], header.source, header.run, header.sequence, and the fields of the message
@@ -66,7 +66,7 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
     titles = [f"{name}.{part}" for name, parts in vectors.items() for part in parts]
     table.writerow(["log_time", *(f"header.{name}" for name in header), *plain, *titles])
     count = 0
-    for record in robot_steps(paths, robot):
+    for record in robot_steps(log, robot):
         step = record.message
         values: list[Any] = [record.log_time, *(getattr(step.header, name) for name in header)]
         for name in plain:
@@ -82,14 +82,14 @@ def to_csv(paths: Paths, robot: RobotWithTask, file: TextIO) -> int:
     return count
 
 
-def to_tlog(paths: Paths, file: BinaryIO) -> int:
+def to_tlog(log: Log, file: BinaryIO) -> int:
     """Write all MAVLink frames, each after its time, for ground stations and pymavlink; return their number.
 
     Raises:
         ExportError: the log has no frame.
-        NoLog, NotALog: as `open_log`.
+        LogError: as `Log`.
     """
-    frames = (frame for record in open_log(paths) if record.topic == "frames" for frame in record.message.frames)
+    frames = (frame for record in log if record.topic == "frames" for frame in record.message.frames)
     count = 0
     for frame in frames:
         file.write(TIME.pack(frame.wall_time // 1000) + frame.raw)
@@ -99,17 +99,16 @@ def to_tlog(paths: Paths, file: BinaryIO) -> int:
     return count
 
 
-def to_foxglove(paths: Paths, out: Path) -> int:
+def to_foxglove(log: Log, out: Path) -> int:
     """Write a log's messages to `out` with new Foxglove scenes of all steps, and return the number of messages.
 
     Raises:
         ExportError: `out` exists, or the log has no message.
-        LogError: as `open_log`.
+        LogError: as `Log`.
         OSError: the disk is full or broken.
     """
     if out.exists():
         raise ExportError(f"{out} exists already")
-    log = open_log(paths)
     converter = FoxgloveConverter(math.inf, log.robots)
     segment: Segment | None = None
     count = 0
@@ -131,24 +130,23 @@ def to_foxglove(paths: Paths, out: Path) -> int:
 def _stored(log: Log) -> Iterator[tuple[Entry, Record]]:
     """Yield the messages of a log, as stored and decoded."""
     for series, log_time, publish_time, payload in log.rows():
-        kind = TYPES[series.schema.name]
         try:
-            message: Any = kind.FromString(payload)
+            message: Any = series.decode(payload)
         except DecodeError:
             log.malformed += 1
             continue
-        entry = Entry(series.key, kind, payload, log_time, publish_time, message.header.sequence)
+        entry = Entry(series.key, type(message), payload, log_time, publish_time, message.header.sequence)
         yield entry, Record(series.topic, series.key, message, log_time, publish_time)
 
 
-def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
+def episodes(log: Log, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     """Yield the consecutive steps of each episode of each actor, in the order of the episodes' ends.
 
     A lost step splits an episode into parts; the last step of an incomplete part does not end the episode. Duplicate
     steps are skipped.
     """
     running: dict[str, list[pb.Step]] = {}
-    for record in robot_steps(paths, robot):
+    for record in robot_steps(log, robot):
         step: pb.Step = record.message
         steps = running.setdefault(step.actor, [])
         if steps:
@@ -166,7 +164,7 @@ def episodes(paths: Paths, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     yield from (steps for steps in running.values() if steps)
 
 
-def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> dict[str, Any]:
+def to_minari(log: Log, robot: RobotWithTask, name: str) -> dict[str, Any]:
     """Write the episodes of a robot kind as the local Minari data set `name`, e.g. "brakeline/ground-v0".
 
     Returns:
@@ -178,7 +176,7 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> dict[str, Any]:
 
     Raises:
         ExportError: the data set exists, or the log has no step of this robot.
-        LogError: as `open_log`.
+        LogError: as `Log`.
     """
     import gymnasium
     import minari
@@ -196,7 +194,7 @@ def to_minari(paths: Paths, robot: RobotWithTask, name: str) -> dict[str, Any]:
         "code_permalink": "none",
         "description": f"{robot.name}: observation {robot.task.observed}; action {robot.action}",
     }
-    all_episodes = episodes(paths, robot)
+    all_episodes = episodes(log, robot)
     dataset: Any = None
     count = steps = 0
     while batch := [

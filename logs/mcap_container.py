@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -22,6 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+from mcap.well_known import MessageEncoding
 
 from brakeline.errors import NotMcap
 
@@ -115,15 +116,46 @@ class LogChannel:
         _, self.robot, self.actor = (*self.key.split("/", 2), "", "")[:3]
 
 
+MakeChannel = Callable[[str, str | None], LogChannel]  # from the topic and the name of the schema; None: it is lost
 Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload
 Item = Row | Header | Metadata | Attachment | DamagedBytes
 
 
-class _Tables:
-    """The schemas and channels that have been read."""
+class Undeclared(ValueError):
+    """Messages of a chunk that nothing readable declares a channel for.
 
-    def __init__(self, make: Callable[[str, str], LogChannel]) -> None:
+    Attributes:
+        size: of these messages, bytes.
+    """
+
+    def __init__(self, channels: Iterable[int], size: int) -> None:
+        numbers = sorted(set(channels))
+        name = "channel" if len(numbers) == 1 else "channels"
+        super().__init__(f"messages are on the undeclared {name} {', '.join(map(str, numbers))}")
+        self.size = size
+
+
+class _Tables:
+    """The schemas and channels that have been read.
+
+    Attributes:
+        summary: reads the records of the summary. They declare the channels of a damaged chunk once more.
+    """
+
+    def __init__(self, make: MakeChannel, summary: Callable[[], bytes]) -> None:
         self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
+        self.summary: Callable[[], bytes] | None = summary
+
+    def channel(self, number: int) -> LogChannel | None:
+        """Return the channel of a message; None if nothing declares it."""
+        if number not in self.series:
+            self._read_summary()
+        return self.series.get(number)
+
+    def _read_summary(self) -> None:
+        if self.summary is not None:
+            read, self.summary = self.summary, None
+            list(_unpacked(read(), self))
 
     def add(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(BytesIO(content))
@@ -132,29 +164,32 @@ class _Tables:
             self.schemas[new.id] = new
         else:
             channel = Channel.read(stream)
-            schema = self.schemas.get(channel.schema_id)
             if channel.id not in self.series:  # the summary repeats it
-                series = self.make(channel.topic, schema.name if schema is not None else "")
+                if channel.schema_id and channel.schema_id not in self.schemas:
+                    self._read_summary()
+                schema = self.schemas.get(channel.schema_id)
+                lost = None if channel.message_encoding == MessageEncoding.Protobuf else ""
+                series = self.make(channel.topic, lost if schema is None else schema.name)
                 series.schema, series.channel = schema, channel
                 self.series[channel.id] = series
 
 
-def raw_channel(key: str, schema: str) -> LogChannel:
+def raw_channel(key: str, schema: str | None) -> LogChannel:
     """Return a channel whose messages are not decoded."""
     return LogChannel(key, key, None)
 
 
-def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel] = raw_channel) -> Iterator[Item]:
+def records(file: IO[bytes], size: int, make: MakeChannel = raw_channel) -> Iterator[Item]:
     """Yield the header, messages, metadata, attachments and damage of a file, in order.
 
     Args:
         size: of the file, bytes.
-        make: creates the channel from its topic and the name of its schema.
+        make: creates the channel.
 
     Raises:
         NotMcap: the file starts with other bytes. An empty file is only damaged.
     """
-    tables = _Tables(make)
+    tables = _Tables(make, lambda: _summary_again(file, size))
     magic = file.read(len(MAGIC))
     if not MAGIC.startswith(magic):
         raise NotMcap(f"the file starts with {magic!r}")
@@ -188,23 +223,39 @@ def records(file: IO[bytes], size: int, make: Callable[[str, str], LogChannel] =
                 yield from _plain(opcode, content, tables)
         except BROKEN as error:
             checksum.damaged = True
-            yield DamagedBytes(good, end - good, str(error) or type(error).__name__, at_end=False)
+            lost = min(error.size, end - good) if isinstance(error, Undeclared) else end - good
+            yield DamagedBytes(good, lost, str(error) or type(error).__name__, at_end=False)
         good = end
 
 
 def has_whole_summary(file: IO[bytes], size: int) -> bool:
     """Return whether the summary of a file is there, and has the right checksum if the file states one."""
+    return _summary(file, size) is not None
+
+
+def _summary(file: IO[bytes], size: int, stated: bool = False) -> bytes | None:
+    """Return the records of a file's summary; None if it is missing, damaged, or `stated` and without a checksum."""
     footer = _HEAD.size + 20
     file.seek(max(0, size - len(MAGIC) - footer))
     last = file.read()
     if len(last) < footer + len(MAGIC) or not last.endswith(MAGIC) or last[0] != Opcode.FOOTER:
-        return False
-    start, stated = (int.from_bytes(last[at : at + n], "little") for at, n in ((_HEAD.size, 8), (_HEAD.size + 16, 4)))
+        return None
+    start, crc = (int.from_bytes(last[at : at + n], "little") for at, n in ((_HEAD.size, 8), (_HEAD.size + 16, 4)))
     end = size - len(MAGIC) - footer
     if not 0 < start <= end:
-        return False
+        return None
     file.seek(start)
-    return not stated or zlib.crc32(file.read(end - start) + last[: footer - 4]) == stated
+    data = file.read(end - start)
+    whole = zlib.crc32(data + last[: footer - 4]) == crc if crc else not stated
+    return data if whole else None
+
+
+def _summary_again(file: IO[bytes], size: int) -> bytes:
+    """Return the records of a whole summary with a checksum, or nothing. The position in the file stays."""
+    at = file.tell()
+    data = _summary(file, size, stated=True)
+    file.seek(at)
+    return data or b""
 
 
 def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
@@ -264,9 +315,10 @@ def _begun(content: bytes, tables: _Tables) -> Iterator[Row]:
 
 
 def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
-    """Yield the messages among the records in `data`. Raises one of `BROKEN`."""
+    """Yield the messages among the records in `data`. Raises one of `BROKEN`: `Undeclared` after all other messages."""
     series, head, message = tables.series, _HEAD.unpack_from, _MESSAGE.unpack_from
     at, end = 0, len(data)
+    undeclared: list[tuple[int, int]] = []  # channel and size
     while at < end:
         opcode, length = head(data, at)
         after = at + 9 + length
@@ -274,14 +326,17 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
             raise ValueError("a record is longer than its chunk")
         if opcode == MESSAGE:
             number, sequence, log_time, publish_time = message(data, at + 9)
-            channel = series.get(number)
+            channel = series.get(number) or tables.channel(number)
             if channel is None:
-                raise ValueError(f"a message is on the undeclared channel {number}")
-            channel.sequence = sequence
-            yield channel, log_time, publish_time, data[at + _TO_PAYLOAD : after]
+                undeclared.append((number, after - at))
+            else:
+                channel.sequence = sequence
+                yield channel, log_time, publish_time, data[at + _TO_PAYLOAD : after]
         elif opcode in (SCHEMA, CHANNEL):
             tables.add(opcode, data[at + 9 : after])
         at = after
+    if undeclared:
+        raise Undeclared((number for number, _ in undeclared), sum(size for _, size in undeclared))
 
 
 def is_ros(path: Path) -> bool:

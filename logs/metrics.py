@@ -26,7 +26,7 @@ from brakeline.logs.step_admission import StepAdmission
 from brakeline.logs.tube_stats import TubeStats
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.identity import identity_of
-from brakeline.messaging.topics import HEALTH, RECORDED, STEP, Topic, topic_of
+from brakeline.messaging.topics import HEALTH, LOGGED, RECORDED, STEP, Topic, topic_of
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -87,6 +87,7 @@ class Metrics:
         processes: by name.
         log_lines: counts by level.
         admission: decides which steps count.
+        fed: number of steps that a feeder published from logs, by key and start of the process.
         late: the steps that count since the last message of a learner, because it permitted them.
     """
 
@@ -108,6 +109,7 @@ class Metrics:
         self.processes: dict[str, ProcessFigures] = {}
         self.log_lines: Counter[str] = Counter()
         self.admission = StepAdmission()
+        self.fed: dict[tuple[str, int], int] = {}
         self.late: list[pb.Step] = []
         self._now = 0  # ns, when the message in hand was received
         self._tube_stats = partial(TubeStats, self._robots)
@@ -170,6 +172,10 @@ class Metrics:
         """Return the counts of received `messages`, `missing` messages and `duplicates`, by key."""
         return topics_of([self])
 
+    def fed_to(self, robot: str) -> int:
+        """Return how many steps of a robot kind a feeder published from other logs. They are not in this log."""
+        return sum(count for (key, _), count in self.fed.items() if key.split("/")[1:2] == [robot])
+
     @staticmethod
     def spans(streams: dict[tuple[str, int], PublisherStream]) -> dict[int, tuple[int, int]]:
         """Return the times of the first and the last message of each start of a process, ns."""
@@ -199,6 +205,8 @@ class Metrics:
 
     def _step(self, step: pb.Step) -> None:
         _get_or_create(self.actors, step.actor, EpisodeStats).step(step)
+        if (step.terminated or step.truncated) and step.actor in self.plans:
+            self.plans[step.actor].last_step(step)
 
     def _exchange(self, exchange: pb.Exchange) -> None:
         name = exchange.request.actor
@@ -227,8 +235,10 @@ class Metrics:
         process.alive = not health.last
         process.figures, process.notes = dict(health.figures), dict(health.notes)
         for key, count in health.published.items():
+            place = key, health.header.run
+            if topic_of(key) is LOGGED and (place in self.fed or len(self.fed) < MOST_STREAMS):
+                self.fed[place] = max(self.fed.get(place, 0), count)
             if count and topic_of(key) in self._topics:
-                place = key, health.header.run
                 stream = self.streams.get(place) or self._new_stream(place)
                 stream.published = max(stream.published, count)
 

@@ -51,6 +51,9 @@ class ClusteredProportion:
 
     With x_e of n_e steps in episode e = 1..E, the ratio estimator r = Σx / Σn has approximately the variance
     E/(E-1) Σ(x_e - r n_e)² / (Σn)². Episodes are independent; steps are not.
+
+    If r is 0 or 1, that variance is 0 however few episodes there are. Then each episode counts as one trial, and the
+    interval is the exact one of 0 or E successes in E trials.
     """
 
     def __init__(self) -> None:
@@ -69,6 +72,8 @@ class ClusteredProportion:
         clusters, hits, trials, xx, xn, nn = self._sums.tolist()
         if clusters < 2 or not trials:
             return None
+        if hits in (0, trials):
+            return clopper_pearson(clusters if hits else 0, clusters)
         rate = hits / trials
         squares = max(0.0, xx - 2.0 * rate * xn + rate * rate * nn)
         half = _Z * math.sqrt(squares * clusters / (clusters - 1)) / trials

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,12 +61,16 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True)
 class MissingSegment:
-    """A missing segment of a run that has later segments."""
+    """Missing segments, one after the other, of a run that has later segments."""
 
-    path: Path
+    path: Path  # of the first one
+    last: Path  # of the last one
+    count: int = 1
 
     def __str__(self) -> str:
-        return f"{self.path}: this segment is missing"
+        if self.count == 1:
+            return f"{self.path}: this segment is missing"
+        return f"{self.path} to {self.last.name}: these {self.count} segments are missing"
 
 
 @dataclass
@@ -89,6 +93,25 @@ class LogSegment:
             self.start = log_time
 
 
+@dataclass(frozen=True)
+class Damage:
+    """What could not be read of a log.
+
+    Attributes:
+        cuts: one line for each damage or missing segment.
+        malformed: number of messages that cannot be decoded or have impossible values.
+    """
+
+    cuts: list[str] = field(default_factory=list)
+    malformed: int = 0
+
+    @property
+    def lines(self) -> list[str]:
+        """One line for each damage, also for malformed messages."""
+        counted = f"{self.malformed} messages cannot be decoded, or have impossible values"
+        return [*self.cuts, *([counted] if self.malformed else [])]
+
+
 @dataclass
 class Log:
     """The segments of one or more runs, in order. Iterating over the log fills the other attributes.
@@ -108,6 +131,11 @@ class Log:
     segments: list[LogSegment] = field(default_factory=list)
     clock: RunClock = field(default_factory=RunClock)  # `clock.at(log_time)` for each message in turn
     robots: RecordedRobots = field(default_factory=RecordedRobots)
+
+    @property
+    def damage(self) -> Damage:
+        """What could not be read, once the log has been read."""
+        return Damage([str(cut) for cut in self.cuts], self.malformed)
 
     def __iter__(self) -> Iterator[Record]:
         for series, message, log_time, publish_time in self.decoded():
@@ -168,8 +196,11 @@ class Log:
             raise LogError(f"{path} is not an MCAP file: {error}") from error
 
     @staticmethod
-    def _channel(key: str, schema: str) -> LogChannel:
-        kind, topic = TYPES.get(schema), topic_of(key)
+    def _channel(key: str, schema: str | None) -> LogChannel:
+        topic = topic_of(key)
+        kind = TYPES.get(schema or "")
+        if schema is None and topic is not None:
+            kind = topic.message
         names = {} if topic is None else names_of(topic, key)
         name = key.partition("/")[0] if topic is None else topic.name
         return LogChannel(name, key, None if kind is None else kind.FromString, names=names)
@@ -234,10 +265,11 @@ def count_by_key(path: Path) -> Counter[str]:
 def missing_segments(paths: Sequence[Path]) -> Iterator[MissingSegment]:
     """Yield the missing segments: gaps in the numbers of the segments at `paths`."""
     for (folder, name), files in groupby(paths, key=_run_of):
-        numbers = [number_of(path)[1] for path in files]
-        if len(numbers) > 1:
-            for number in sorted(set(range(numbers[-1])) - set(numbers)):
-                yield MissingSegment(folder / name_of(f"{name}.mcap", number))
+        numbers = [-1, *sorted(number_of(path)[1] for path in files)]
+        for before, after in pairwise(numbers if len(numbers) > 2 else ()):
+            if (count := after - before - 1) > 0:
+                first, last = (folder / name_of(f"{name}.mcap", number) for number in (before + 1, after - 1))
+                yield MissingSegment(first, last, count)
 
 
 def _run_of(path: Path) -> tuple[Path, str]:

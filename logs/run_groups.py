@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.logs.episode_stats import Figures
+from brakeline.logs.learning_curve import interventions_in
 from brakeline.messaging.robot import Array
 
 METHOD_COLORS = {  # a palette for colour-blind readers
@@ -262,5 +263,5 @@ def _rates(bins: list[Figures], counted: str, over: str, grid: Array, window: fl
 def _count(row: Figures, name: str) -> float:
     """Return how much a bin adds to a rate."""
     if name == "interventions":
-        return float(row["adjusted"] + row["failsafes"]) * float(row["steps"])
+        return interventions_in(row) * float(row["steps"])
     return float(row[name] or 0.0) * float(row["episodes"])

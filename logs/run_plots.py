@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brakeline.logs.episode_stats import Figures
+from brakeline.logs.learning_curve import interventions_in
 from brakeline.logs.viewer import hex_color
 
 
@@ -20,7 +21,7 @@ def _value_or_nan(name: str) -> Callable[[Figures], float]:
 ROWS: tuple[tuple[str, Callable[[Figures], float]], ...] = (
     ("goals reached", _value_or_nan("goals")),
     ("reward of an episode", _value_or_nan("reward")),
-    ("interventions", lambda row: row["adjusted"] + row["failsafes"]),
+    ("interventions", interventions_in),
 )
 KINDS = (("adjusted", "adjusted"), ("failsafe", "failsafes"))  # of interventions, and their names in a row
 # Of a model set that can be adapted: what a change of the robot does to its sets.

@@ -18,9 +18,12 @@ from typing import Any, BinaryIO
 
 import mcap.writer
 from google.protobuf.message import Message
+from mcap.records import Metadata as McapMetadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from brakeline.errors import NotMcap
+from brakeline.logs.mcap_container import records
 from brakeline.messaging.steady_clock import steady_time_ns
 
 NO_SCHEMA = 0
@@ -33,6 +36,7 @@ Attachments = Mapping[str, bytes]  # file contents by name, e.g. model sets
 
 ABOUT = "brakeline"  # metadata of each log
 CLOCK, STEADY = "clock", "steady"  # an entry of the metadata of a log
+SEGMENT = "segment"  # an entry: the number of the file among those of its run
 TIMES = {
     CLOCK: STEADY,
     "log_time": "ns since the Unix epoch, when the recorder received the message, by the clock at the recorder's "
@@ -75,9 +79,25 @@ def name_of(path: Path | str, number: int) -> str:
 
 
 def number_of(path: Path) -> tuple[str, int]:
-    """Return the run's name and the segment's number: ("run", 2) for run_0002.mcap, ("run", 0) for run.mcap."""
-    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,})|\.(\d+))", path.stem)  # run.2.mcap: the names of earlier versions
-    return (numbered[1], int(numbered[2] or numbered[3])) if numbered else (path.stem, 0)
+    """Return the run's name and the segment's number: ("run", 2) for run_0002.mcap, ("run", 0) for run.mcap.
+
+    A name such as flight_2025.mcap looks like a segment's. So the number in the file itself decides, if it has one.
+    """
+    numbered = re.fullmatch(r"(.+?)(?:_(\d{4,5})|\.(\d+))", path.stem)  # run.2.mcap: the names of earlier versions
+    if numbered is None:
+        return path.stem, 0
+    number = int(numbered[2] or numbered[3])
+    return (numbered[1], number) if _recorded_number(path) in (None, number) else (path.stem, 0)
+
+
+def _recorded_number(path: Path) -> int | None:
+    """Return the segment's number in the metadata, which follow the header; None if they state none."""
+    with contextlib.suppress(OSError, NotMcap, ValueError), path.open("rb") as file:
+        for item in itertools.islice(records(file, path.stat().st_size), 2):
+            if isinstance(item, McapMetadata) and item.name == ABOUT:
+                number = item.metadata.get(SEGMENT, "")
+                return int(number) if number.isdecimal() else None
+    return None
 
 
 def being_written(path: Path) -> bool:
@@ -133,11 +153,19 @@ class Segment:
         empty: the file has no message.
     """
 
-    def __init__(self, path: Path, file: BinaryIO, metadata: Metadata, attachments: Attachments | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        file: BinaryIO,
+        metadata: Metadata,
+        attachments: Attachments | None = None,
+        number: int = 0,
+    ) -> None:
         """Start the file and write its metadata and attachments.
 
         Args:
             file: `path`, opened for writing without a buffer.
+            number: of the file among those of its run, from 0.
 
         Raises:
             OSError: the disk is full or broken.
@@ -150,7 +178,7 @@ class Segment:
         self._channels: dict[str, int] = {}
         self.empty = True
         self._writer.start(profile="", library="brakeline")
-        about = TIMES | {"segment": str(number_of(path)[1])}
+        about = TIMES | {SEGMENT: str(number)}
         for name, values in ((ABOUT, about), *metadata.items()):
             self._writer.add_metadata(name, dict(values))
         for name, data in (attachments or {}).items():
@@ -238,7 +266,8 @@ def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None 
         OSError: the file cannot be created or the disk is full; no file is left behind.
     """
     run.parent.mkdir(parents=True, exist_ok=True)
-    for path in (run.with_name(name_of(run, number)) for number in itertools.count()):
+    for number in itertools.count():
+        path = run.with_name(name_of(run, number))
         try:
             file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb", buffering=0)
         except FileExistsError:
@@ -246,7 +275,7 @@ def open_segment(run: Path, metadata: Metadata, attachments: Attachments | None 
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held until the file is closed or the process ends
         try:
-            return Segment(path, file, metadata, attachments)
+            return Segment(path, file, metadata, attachments, number)
         except OSError:
             file.close()
             path.unlink(missing_ok=True)

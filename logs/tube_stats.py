@@ -6,7 +6,8 @@ periods, and the stop is what prevents a collision. So the unit here is a plan (
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import copy
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +18,7 @@ from brakeline.logs.episode_stats import Figures
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Array
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import UNSTATED, percent
 
 SAME = 1e-6  # input units: rounding between a plan and its tail in the next request
@@ -56,6 +58,7 @@ class TubeStats:
     _tube: tuple[Array, Array] | None = None  # centers and half-widths (N, d), once the actor follows the plan
     _periods: int = 0  # since `_own`
     _worst: float = 0.0
+    _executes: bool = False  # whether the latest decision lets the robot execute the plan's input of its period
 
     def exchange(self, exchange: pb.Exchange) -> None:
         """Add the actor's next exchange."""
@@ -77,12 +80,32 @@ class TubeStats:
             if self._tube is None and not newer and decision.kind != pb.RECOVERING:
                 self._tube = _tube_of(self._own)
             if self._tube is not None:
-                self._compare(exchange.request)
+                self._compare(exchange.request.robot, exchange.request.state, slice(self._periods - 1, self._periods))
+            self._executes = self._is_input_of_plan(exchange)
         if decision.kind in _OWN and decision.verified:
             self._end()
             self._own = exchange
         elif decision.kind == pb.RECOVERING:
             self._end()
+
+    def last_step(self, step: pb.Step) -> None:
+        """Add the last step of an episode. No request follows, so only this step has the state at its period's end."""
+        own = self._own
+        if own is None or (step.header.run, step.episode) != (own.header.run, own.request.episode):
+            return
+        if step.step != own.request.step + self._periods:
+            return
+        if self._tube is not None and (step.fallback or self._executes):
+            # A robot in real time may miss periods: its state may belong to a later box.
+            last = None if step.robot.endswith(REAL_TIME_SUFFIX) else self._periods + 1
+            self._compare(step.robot, step.state, slice(self._periods, last))
+        self._end()
+
+    def ended(self) -> TubeStats:
+        """Return a copy that counts the plan in progress, as at the end of a log."""
+        part = copy.copy(self)
+        part._end()
+        return part
 
     def _goes_on(self, exchange: pb.Exchange) -> bool:
         """Return whether this is the next period of the same episode and the request has the tail of the plan."""
@@ -91,25 +114,39 @@ class TubeStats:
         same = self._own.header.run == exchange.header.run and before.episode == now.episode
         if not same or now.step != before.step + self._periods + 1:
             return False
-        inputs, following = len(now.action), self._own.reply.decision.plan
-        start = min(inputs * (self._periods + 1), len(following) - inputs)
-        tail, committed = following[max(start, 0) : start + inputs], now.plan[:inputs]
+        return self._has_input(now.plan, len(now.action), self._periods + 1)
+
+    def _is_input_of_plan(self, exchange: pb.Exchange) -> bool:
+        """Return whether the decision's first input is the plan's of this period; in real time it is fixed before."""
+        if exchange.request.robot.endswith(REAL_TIME_SUFFIX):
+            return True
+        decision = exchange.reply.decision
+        inputs = len(exchange.request.action)
+        return decision.kind == pb.FAILSAFE and self._has_input(decision.plan, inputs, self._periods)
+
+    def _has_input(self, plan: Sequence[float], inputs: int, period: int) -> bool:
+        """Return whether a plan begins with the input that the followed plan has in a period; its last input stays."""
+        assert self._own is not None
+        following = self._own.reply.decision.plan
+        start = min(inputs * period, len(following) - inputs)
+        tail, committed = following[max(start, 0) : start + inputs], plan[:inputs]
         # An infinity is the same as itself, and NaN as nothing.
         same_inputs = all(one == other or abs(one - other) <= SAME for one, other in zip(committed, tail, strict=False))
         return 0 < inputs == len(tail) == len(committed) and same_inputs
 
-    def _compare(self, request: pb.Request) -> None:
-        """Compare the measured position with the tube's box at the end of the last period."""
+    def _compare(self, name: str, state: Sequence[float], boxes: slice) -> None:
+        """Compare the measured position of a robot with one of the tube's boxes, that in which it is nearest."""
         assert self._tube is not None
-        centers, half = self._tube
-        k, d = self._periods - 1, centers.shape[1]
-        robot = self.robots.named(request.robot)
+        centers, half = (bounds[boxes] for bounds in self._tube)
+        d = centers.shape[1]
+        robot = self.robots.named(name)
         error = np.zeros(d) if robot is None else np.asarray(robot.measurement_bound[:d])
-        if k >= len(centers) or len(request.state) < d:
+        if not len(centers) or len(state) < d:
             return
         with np.errstate(invalid="ignore", over="ignore"):
-            share = np.abs(np.array(request.state[:d]) - centers[k]) / (half[k] + error + SMALLEST)
-        self._worst = max(self._worst, float(np.nan_to_num(share, nan=MOST, posinf=MOST).max(initial=0.0)))
+            share = np.abs(np.array(state[:d]) - centers) / (half + error + SMALLEST)
+        worst = np.nan_to_num(share, nan=MOST, posinf=MOST).max(axis=1, initial=0.0)
+        self._worst = max(self._worst, float(worst.min()))
 
     def _end(self) -> None:
         """Count the plan: the actor no longer follows it."""
@@ -132,8 +169,8 @@ def _tube_of(exchange: pb.Exchange) -> tuple[Array, Array] | None:
 
 
 def figures(parts: Iterable[TubeStats]) -> Figures:
-    """Return the figures of all actors."""
-    every = list(parts)
+    """Return the figures of all actors. A plan in progress counts as if it ended here."""
+    every = [part.ended() for part in parts]
     stated = [part.bound for part in every if part.flown]
     known = [bound for bound in stated if bound is not None]
     counts = ("flown", "outside", "scored", "beyond", "beyond_widened", "slowed", "slow_downs")

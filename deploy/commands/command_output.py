@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, RenderableType
 
 from brakeline.logs.json_values import finite
 from brakeline.logs.stacking_table import StackingTable, plain_table
+
+if TYPE_CHECKING:
+    from brakeline.logs.reader import Damage
 
 # The terminal breaks long lines (soft wrap); lines into a pipe stay whole.
 console = Console(highlight=False, soft_wrap=True)
@@ -25,6 +28,12 @@ def print_json(figures: dict[str, Any]) -> None:
         raise TypeError(f"JSON holds no {type(value).__name__}")
 
     print(json.dumps(finite(figures), default=path_text))
+
+
+def print_damage(damage: Damage) -> None:
+    """Print on stderr what could not be read of a log."""
+    for line in damage.lines:
+        errors.print(line, markup=False)
 
 
 def print_result(as_json: bool, figures: dict[str, Any], *lines: RenderableType) -> None:

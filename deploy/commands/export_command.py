@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.commands.command_output import print_result
+from brakeline.deploy.commands.command_output import print_damage, print_result
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet
 from brakeline.deploy.progress import under_way
+from brakeline.messaging.atomic_files import whole_or_nothing
 from brakeline.messaging.task import robot_with_task
+
+if TYPE_CHECKING:
+    from brakeline.logs.reader import Log
 
 
 @dataclass(frozen=True)
@@ -32,43 +37,47 @@ class ExportCommand:
 
     def run(self) -> int:
         """Write the files. Returns the exit status."""
-        from brakeline.logs.log_export import to_foxglove, to_tlog
+        from brakeline.logs.reader import Damage, open_log
 
-        figures: dict[str, Any] = {}
-        if self.csv is not None:
-            with under_way(f"writing {self.csv}"):
-                figures["csv"] = self._csv(self.csv)
-        if self.minari is not None:
-            from brakeline.logs.log_export import to_minari
-
-            with under_way(f"writing {self.minari}"):
-                figures["minari"] = to_minari(list(self.logs), robot_with_task(self.robot), self.minari)
-        if self.foxglove is not None:
-            with under_way(f"writing {self.foxglove}"):
-                written = to_foxglove(list(self.logs), self.foxglove)
-                figures["foxglove"] = {"path": str(self.foxglove), "messages": written}
-        if self.tlog is not None:
-            with under_way(f"writing {self.tlog}"), self.tlog.open("wb") as file:
-                figures["tlog"] = {"path": str(self.tlog), "frames": to_tlog(list(self.logs), file)}
+        figures, damage = dict[str, Any](), Damage()
+        writers: dict[str, Callable[[Log, Any], dict[str, Any]]] = {
+            **{"csv": self._csv, "minari": self._minari, "foxglove": self._foxglove, "tlog": self._tlog}
+        }
+        for name, write in writers.items():
+            if (target := getattr(self, name)) is not None:
+                log = open_log(self.logs)
+                with under_way(f"writing {target}"):
+                    figures[name] = write(log, target)
+                damage = log.damage
         if not figures:
             raise ValueError("no format to export to: give one or more of --csv, --minari, --foxglove, --tlog")
         counts = {
             written["path"]: ", ".join(f"{count} {unit}" for unit, count in written.items() if unit != "path")
             for written in figures.values()
         }
-        print_result(self.json, figures, *(f"{path}: {text}" for path, text in counts.items()))
+        print_damage(damage)
+        print_result(self.json, figures | asdict(damage), *(f"{path}: {text}" for path, text in counts.items()))
         return 0
 
-    def _csv(self, path: Path) -> dict[str, Any]:
-        from brakeline.errors import ExportError
+    def _csv(self, log: Log, out: Path) -> dict[str, Any]:
         from brakeline.logs.log_export import to_csv
 
         robot = robot_with_task(self.robot)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with path.open("w", newline="") as file:
-                return {"path": str(path), "steps": to_csv(list(self.logs), robot, file)}
-        except ExportError:
-            if path.is_file():  # it has a header alone; a pipe has no file to delete
-                path.unlink()
-            raise
+        with whole_or_nothing(out) as path, path.open("w", newline="") as file:
+            return {"path": str(out), "steps": to_csv(log, robot, file)}
+
+    def _minari(self, log: Log, name: str) -> dict[str, Any]:
+        from brakeline.logs.log_export import to_minari
+
+        return to_minari(log, robot_with_task(self.robot), name)
+
+    def _foxglove(self, log: Log, out: Path) -> dict[str, Any]:
+        from brakeline.logs.log_export import to_foxglove
+
+        return {"path": str(out), "messages": to_foxglove(log, out)}
+
+    def _tlog(self, log: Log, out: Path) -> dict[str, Any]:
+        from brakeline.logs.log_export import to_tlog
+
+        with whole_or_nothing(out) as path, path.open("wb") as file:
+            return {"path": str(out), "frames": to_tlog(log, file)}

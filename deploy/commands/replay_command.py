@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brakeline.deploy.commands.command_output import console, print_json
+from brakeline.deploy.commands.command_output import console, errors, print_damage, print_json
 from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, Quiet
 from brakeline.deploy.progress import errors_only, under_way
 from brakeline.logs.stacking_table import plain_table
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
 
 ANY_BOUND = 1.0  # the replay drives no robot, so it accepts a model set with any stated bound
-DIFFERENT = 1  # exit status: decisions differ by more than rounding although you replaced nothing
+# Exit status: decisions differ by more than rounding although you replaced nothing, or there is no request.
+DIFFERENT = 1
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,10 @@ class ReplayCommand:
             print_json(figures)
         else:
             print_comparison(figures)
+        print_damage(result.damage)
+        if not result.requests:
+            errors.print("nothing was compared: no request could be read")
+            return DIFFERENT
         return DIFFERENT if replacement is None and result.different else 0
 
     def _replacement(self) -> Replacement:

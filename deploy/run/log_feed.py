@@ -44,18 +44,21 @@ class LoggedSteps:
     """The steps of a robot kind in logs that a learner can use, each once, in the order of the log.
 
     The names of actors of the n-th run, from the second on, end in `.run<n>`. After the iteration `counts` has the
-    numbers of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values.
+    numbers of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values. `damage` has
+    a line for each part that could not be read.
     """
 
     logs: Sequence[str]
     robot: RobotWithTask
     counts: Counter[str] = field(default_factory=Counter)
+    damage: list[str] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[pb.Step]:
         intake = StepReader(self.robot)
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
             ledger = StepLedger()
-            for record in open_log(files):
+            log_of_run = open_log(files)
+            for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
                     continue
                 step: pb.Step = record.message
@@ -71,6 +74,7 @@ class LoggedSteps:
                 if number > 1:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
+            self.damage += log_of_run.damage.lines
 
 
 def count(logs: Sequence[str], robot: RobotWithTask) -> int:
@@ -102,7 +106,7 @@ def main(settings: FeederSettings) -> bool:
     """Run a feeder process until the end of the logs or of the training. Returns False if a signal stopped it.
 
     The health figures have the numbers of `published`, `known` (the learner has them already),
-    `duplicate` and `unusable` steps.
+    `duplicate` and `unusable` steps, and of the places where the logs are `damaged`.
 
     Raises:
         RefusedByLearner: the learner does not accept the actors of the log.
@@ -119,6 +123,7 @@ def _feed(process: Process, settings: FeederSettings) -> bool:
     def refresh() -> None:
         process.figures.update({name: float(figures[name]) for name in ("published", "known")})
         process.figures.update({name: float(steps.counts[name]) for name in ("duplicate", "unusable")})
+        process.figures["damaged"] = float(len(steps.damage))
 
     process.refresh = refresh
     process.announce()
@@ -141,6 +146,8 @@ def _feed(process: Process, settings: FeederSettings) -> bool:
         _renumber(step, actor)
         actor.publisher.put(step)
         figures["published"] += 1
+    for line in steps.damage:
+        log.warning("not learned from: %s", line)
     log.info("published %d logged steps; the learner knew %d", figures["published"], figures["known"])
     deadline = time.monotonic() + (LAST_UPDATES_TIMEOUT if settings.alone else 0.0)
     while time.monotonic() < deadline and not stop() and not any(p.client.done for p in actors.values()):

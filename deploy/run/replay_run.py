@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from brakeline.deploy.experiments.evaluate import asking
 from brakeline.errors import LogError
 from brakeline.logs.episode_stats import KINDS
 from brakeline.logs.mcap_container import model_attachment_name
-from brakeline.logs.reader import Log, Paths, open_log
+from brakeline.logs.reader import Damage, Log, Paths, open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.safety.filter.backup_plan import UNVERIFIED
@@ -106,6 +106,7 @@ class Comparison:
     kinds: Counter[tuple[str, str]] = field(default_factory=Counter)  # (logged, now)
     fields: dict[str, list[float]] = field(default_factory=dict)  # sizes of the differences; inf: no numbers
     examples: list[tuple[tuple[float, float], dict[str, Any]]] = field(default_factory=list)  # by size, largest first
+    damage: Damage = field(default_factory=Damage)  # of the log
 
     @property
     def different(self) -> int:
@@ -140,7 +141,8 @@ class Comparison:
         `identical`, `equal`, `different`: numbers of decisions. `rounding`: largest difference of a number in an equal
         decision. `kinds`: for each logged kind, the numbers of kinds now. `fields`: for each field, how many decisions
         differ by more than rounding, and the largest difference (inf: no numbers). `same_input`: requests after which
-        the robot gets the same input, to within rounding. `examples`: the largest differences.
+        the robot gets the same input, to within rounding. `examples`: the largest differences. `cuts`, `malformed`:
+        what could not be read of the log.
         """
         kinds: dict[str, dict[str, int]] = {}
         for (logged, now), count in sorted(self.kinds.items()):
@@ -150,7 +152,8 @@ class Comparison:
         otherwise = [*self.fields.get("input", ()), *self.fields.get("result", ())]  # a reply has one of them at most
         counts["same_input"] = counts["requests"] - counts["unanswered"] - len(otherwise)
         examples = [example for _, example in self.examples]
-        return counts | {"rounding": self.rounding, "kinds": kinds, "fields": fields, "examples": examples}
+        details = {"rounding": self.rounding, "kinds": kinds, "fields": fields, "examples": examples}
+        return counts | details | asdict(self.damage)
 
 
 def differences(
@@ -241,6 +244,7 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
         replies = ask([request for request, _ in questions]) if questions else []
         for (request, logged), reply in zip(questions, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
+    result.damage = log.damage
     return result
 
 

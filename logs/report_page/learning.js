@@ -5,7 +5,7 @@ const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"
 const CURVES = [
   { title: "goals reached", unit: "share of episodes", of: "bins", grouped: "goals", value: (b) => b.goals, form: percents, low: 0, high: 1, weight: "episodes" },
   { title: "reward of an episode", unit: "without the intervention penalty", of: "bins", grouped: "reward", value: (b) => b.reward, form: figure, weight: "episodes" },
-  { title: "interventions", unit: "share of steps", of: "bins", grouped: "interventions", value: (b) => b.adjusted + b.failsafes, form: percents, low: 0, weight: "steps" },
+  { title: "interventions", unit: "share of steps", of: "bins", grouped: "interventions", value: (b) => b.adjusted + b.failsafes + (b.recovering || 0), form: percents, low: 0, weight: "steps" },
   { title: "closest approach", unit: "cm, smallest in a bin", of: "bins", value: (b) => b.closest === null ? null : 100 * b.closest, form: figure, most: 0 },
   { title: "windows outside their sets", unit: "share, without widening", of: "bins", value: (b) => b.beyond, form: percents, low: 0, weight: "steps" },
   { title: "widening of the sets", unit: "largest factor in a bin", of: "bins", value: (b) => b.widening, form: figure },

@@ -5,12 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from brakeline.deploy.cli import main
 from brakeline.deploy.data import importer
 from brakeline.deploy.data.sources.isolated_reader import read_here
 from brakeline.safety.model.dataset import Dataset
 from tests.deploy.drive import drive
+from tests.fuzz.mutations import flipped
 
 
 @pytest.fixture(scope="session")
@@ -18,6 +20,21 @@ def log(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """150 steps in the dense arena: the filter steps in often."""
     path = tmp_path_factory.mktemp("drive") / "run.mcap"
     drive(path)
+    return path
+
+
+@pytest.fixture
+def damaged(log: Path, tmp_path: Path) -> Path:
+    """The same log with a changed byte in its last request and in its last step, each of which is a chunk."""
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    whole = log.read_bytes()
+    for chunk in summary.chunk_indexes[-2:]:
+        whole = flipped(whole, chunk.chunk_start_offset + chunk.chunk_length // 2, 3)
+    path = tmp_path / "damaged" / "run.mcap"
+    path.parent.mkdir()
+    path.write_bytes(whole)
     return path
 
 

@@ -1,6 +1,7 @@
 """Test the formats that a log is exported to, with the programs that read them."""
 
 import csv
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,29 @@ def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, command, 
     assert figures("export", out, "--foxglove", again)["foxglove"]["messages"] == count, "old pictures are not kept"
     assert command("replay", out)[0] == 0, "the model sets are in it too"
     assert command("export", log, "--foxglove", out)[0] == 1
+
+
+def test_an_export_of_a_damaged_log_says_what_it_lacks(damaged, tmp_path, command) -> None:
+    status, out, err = command("export", damaged, "--csv", tmp_path / "steps.csv", "--json")
+    figures = json.loads(out)
+    assert status == 0 and figures["csv"]["steps"] == STEPS - 1
+    assert len(figures["cuts"]) == 2 and figures["malformed"] == 0 and all(cut in err for cut in figures["cuts"])
+
+
+def test_a_failed_export_leaves_an_existing_file_as_it_was(log, tmp_path, command) -> None:
+    kept = tmp_path / "precious"
+    kept.write_text("precious")
+    for words in (
+        (tmp_path / "nosuch", "--csv", kept),
+        (log, "--csv", kept, "--robot", "quadrotor"),
+        (log, "--tlog", kept),
+    ):
+        assert command("export", *words)[0] == 1
+        assert kept.read_text() == "precious" and list(tmp_path.iterdir()) == [kept]
+    assert command("export", log, "--tlog", tmp_path / "new")[0] == 1 and list(tmp_path.iterdir()) == [kept]
+    assert command("export", log, "--csv", kept)[0] == 0 and kept.read_text().startswith("log_time,")
+    status, out, _ = command("export", log, "--csv", "/dev/null")
+    assert status == 0 and f"{STEPS} steps" in out and not Path("/dev/null").is_file()
 
 
 def test_an_impossible_export_fails_with_a_reason(log, tmp_path, command) -> None:

@@ -6,13 +6,16 @@ from random import Random
 import pytest
 
 from brakeline.errors import LogError
+from brakeline.logs.log_recovery import recover
 from brakeline.logs.mcap_container import MAGIC
 from brakeline.logs.reader import count_by_key, open_log
+from brakeline.logs.segment import Entry, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.fuzz.mutations import flipped
 from tests.logs.sample_log import written
 
 KEY = "step/ground/a"
+KINDS = {KEY: pb.Step, "log/b": pb.LogLine}
 
 
 @pytest.fixture
@@ -42,6 +45,48 @@ def test_each_flipped_bit_is_named(path: Path) -> None:
         assert read <= 30
 
 
+def test_a_damaged_first_chunk_costs_only_its_own_messages(path: Path) -> None:
+    """It declares the channels; the summary repeats them. A file that a killed recorder left has no summary."""
+    other = ((f"log/{'bcd'[number]}", pb.LogLine(text=str(number)), 10**18 + 30 + number) for number in range(3))
+    steps = ((KEY, pb.Step(actor="a", step=number), 10**18 + number) for number in range(30))
+    written(path.with_name("two.mcap"), (*steps, *other))
+    whole = path.with_name("two.mcap").read_bytes()
+    changed = flipped(whole, whole.index(b"zstd") + 40, 3)
+    path.write_bytes(changed)
+    log = open_log(path)
+    assert [record.message.step for record in log if record.topic == "step"] == list(range(1, 30))
+    assert len(log.cuts) == 1 and log.cuts[0].lost > 100
+    repaired = recover(path)
+    assert repaired.messages == sum(1 for _ in open_log(path)) == 32 and open_log(path).cuts == []
+    path.write_bytes(changed[: changed.rindex(b"zstd")])  # in the summary
+    log = open_log(path)
+    assert {record.key for record in log} == {"log/b", "log/c", "log/d"}, "of channels that later chunks declare"
+    assert sum("undeclared channel 1" in str(cut) for cut in log.cuts) == 29 and log.cuts[1].lost < 100
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_channel_whose_schema_was_in_a_damaged_chunk_is_read(path: Path, finished: bool) -> None:
+    segment = open_segment(path.with_name("lines.mcap"), {})
+    for key in ("log/a", "log/b"):
+        segment.save([Entry(key, pb.LogLine, pb.LogLine(text=key).SerializeToString(), 1, 1, 1)])
+    segment.finish() if finished else segment.abandon()
+    whole = segment.path.read_bytes()
+    segment.path.write_bytes(flipped(whole, whole.index(b"zstd") + 40, 3))
+    assert [record.message.text for record in open_log(segment.path)] == ["log/b"]
+
+
+def test_messages_of_an_undeclared_channel_do_not_hide_the_rest_of_their_chunk(path: Path) -> None:
+    segment = open_segment(path.with_name("mixed.mcap"), {})
+    for portion in ((KEY,), ("log/b", KEY), (KEY, "log/b")):
+        segment.save(Entry(key, KINDS[key], KINDS[key]().SerializeToString(), 1, 1, 1) for key in portion)
+    segment.abandon()
+    whole = segment.path.read_bytes()
+    segment.path.write_bytes(flipped(whole, whole.index(b"zstd") + 40, 3))
+    log = open_log(segment.path)
+    assert [record.key for record in log] == ["log/b", "log/b"]
+    assert sum("undeclared channel 1" in str(cut) for cut in log.cuts) == 2
+
+
 def test_counts_by_the_summary_are_right_or_by_the_messages(path: Path) -> None:
     assert count_by_key(path) == {KEY: 30}
     whole, random = path.read_bytes(), Random(1)
@@ -58,4 +103,4 @@ def test_a_chunk_with_an_absurd_length_is_damage(path: Path) -> None:
     name = whole.index(b"zstd")  # the chunk's compression, before the length of its records
     path.write_bytes(whole[: name + 4] + b"\xff" * 8 + whole[name + 12 :])
     log = open_log(path)
-    assert list(log) == [] and log.cuts
+    assert [record.message.step for record in log] == list(range(1, 30)) and log.cuts

@@ -11,7 +11,7 @@ import pytest
 
 from brakeline.logs.episode_sampler import SPREAD
 from brakeline.logs.figure_tables import analyse, show, show_episode
-from brakeline.logs.learning_curve import MOST_BINS, LearningCurve
+from brakeline.logs.learning_curve import MOST_BINS, LearningCurve, interventions_in
 from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, RunAnalysis, analyse_runs
 from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
@@ -158,6 +158,20 @@ def test_steps_that_a_learner_had_and_nobody_recorded_are_missing(tmp_path: Path
     assert cuts == ["3 of the 8 steps that the learner of ground had are not in the log"] * (lost == 3)
 
 
+def test_steps_that_a_feeder_published_from_other_logs_are_not_missing(tmp_path: Path) -> None:
+    writer = Writer()
+    published = {"logged/ground/a": 4, "logged/ground/b": 3, "logged/quadrotor/a": 9}
+    for count in (0, 1):
+        health = pb.Health(
+            process="feeder", published={key: n * count for key, n in published.items()}, last=count == 1
+        )
+        writer.put("health/feeder", health, always=True)
+    for robot in ("ground", "quadrotor"):
+        writer.put(f"metrics/{robot}", pb.LearnerMetrics(robot=robot, steps=9), always=True)
+    cuts = analyse(writer.write(tmp_path / "run.mcap"))["cuts"]
+    assert cuts == ["2 of the 9 steps that the learner of ground had are not in the log"]
+
+
 def test_the_table_of_an_episode_has_the_recorded_values(
     log: Path, figures: dict[str, Any], messages: Messages
 ) -> None:
@@ -234,6 +248,25 @@ def test_bins_become_wider_instead_of_more() -> None:
     assert sum(row["episodes"] for row in figures["bins"]) == 400
     times = timeline.figures()
     assert len(times["steps"]) <= MOST_TIMES and {rate for _, rate in times["steps"][:-1]} == {1.0}
+
+
+def test_curves_count_the_interventions_that_the_summary_counts() -> None:
+    curve, kinds = LearningCurve(), [pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE, pb.RECOVERING, pb.RECOVERING]
+    for k, kind in enumerate(kinds):
+        curve.step(pb.Step(actor="a", step=k, decision=kind, truncated=k == 4))
+    figures = curve.figures()
+    (row,) = figures["bins"]
+    assert interventions_in(row) == pytest.approx(figures["last"]["interventions"]) == 0.8
+    before = {name: value for name, value in row.items() if name != "recovering"}
+    assert interventions_in(before) == pytest.approx(0.4), "a row that an earlier version wrote"
+
+
+def test_a_cut_episode_is_not_joined_with_the_next_one_whose_first_step_is_lost() -> None:
+    curve = LearningCurve()
+    for episode, numbers in ((0, range(5)), (1, range(1, 10))):
+        for k in numbers:
+            curve.step(pb.Step(actor="a", episode=episode, step=k, reward=1.0, terminated=(episode, k) == (1, 9)))
+    assert curve.figures()["last"]["reward"] == 9.0
 
 
 def test_a_change_shows_in_the_windows_the_widening_the_widths_and_the_model_sets() -> None:

@@ -102,6 +102,16 @@ def test_without_a_trial_there_is_no_interval() -> None:
     assert clustered.interval() is None
 
 
+def test_without_any_or_with_only_interventions_the_interval_depends_on_the_episodes() -> None:
+    clustered = {hits: ClusteredProportion() for hits in (0, 50)}
+    for count in range(1, 8):
+        for hits, proportion in clustered.items():
+            proportion.add(hits, 50)
+            expected = clopper_pearson(count if hits else 0, count) if count > 1 else None
+            assert proportion.interval() == expected
+    assert (clustered[0].interval() or (0, 0))[1] == pytest.approx(1.0 - 0.025 ** (1 / 7))
+
+
 def test_intervals_by_episode_cover_the_true_rate_and_intervals_by_step_do_not() -> None:
     """With episodes of 50 steps and different rates, 95 % intervals contain the true rate in about 95 % of logs."""
     chance = np.random.default_rng(0)

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline.errors import LogError
-from brakeline.logs.reader import find, open_log, read
+from brakeline.logs.reader import by_run, find, open_log, read
 from brakeline.logs.recorder import entry
 from brakeline.logs.segment import Entry, Segment, name_of, number_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
@@ -70,6 +70,24 @@ def test_names_of_segments() -> None:
     assert [number_of(Path(name)) for name in names] == numbers
     first = [name_of("run.mcap", number) for number in range(200)]
     assert first == sorted(first)
+
+
+def test_logs_named_by_date_are_runs_of_their_own(tmp_path: Path, say: Say) -> None:
+    """The number in the file decides, not one in its name; many missing numbers are one line."""
+    line = [say("log/a", pb.LogLine(text="x"))]
+    for name in ("log_20260101", "log_20260101", "flight_2025", "flight_2026", *["run"] * 9):
+        write(tmp_path / f"{name}.mcap", line)
+    found = {label: [path.name for path in paths] for label, paths in by_run(find(tmp_path)).items()}
+    place = tmp_path.name
+    assert found[f"{place}/log_20260101"] == ["log_20260101.mcap", "log_20260101_0001.mcap"]
+    assert found[f"{place}/flight_2025"] == ["flight_2025.mcap"] and len(found) == 4
+    assert [path.name for path in find(tmp_path / "log_20260101.mcap")] == found[f"{place}/log_20260101"]
+    for number in (0, 1, 2, 5):
+        (tmp_path / name_of("run.mcap", number)).unlink()
+    log = open_log(tmp_path)
+    assert len(list(log)) == 9
+    missing = ["run.mcap to run_0002.mcap: these 3 segments are missing", "run_0005.mcap: this segment is missing"]
+    assert [str(cut).removeprefix(f"{tmp_path}/") for cut in log.cuts] == missing
 
 
 def test_a_truncated_file_yields_its_intact_messages_and_reports_the_damage(tmp_path: Path, say: Say) -> None:

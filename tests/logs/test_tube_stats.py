@@ -1,5 +1,7 @@
 """Plans that robots followed are compared with their verified tubes."""
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -26,7 +28,7 @@ def asked(step, kind, x=0.0, given=0, own=0.0, verified=True, episode=0, run=1):
     )
     decision = exchange.reply.decision
     decision.kind, decision.verified = kind, verified
-    decision.plan[:] = PLAN
+    decision.plan[:] = PLAN[given:] if kind == pb.FAILSAFE else PLAN
     decision.tube_center[:] = [own + 0.1 * (k + 1) for k in range(N)]
     decision.tube_half_width[:] = [0.05] * N
     return exchange
@@ -73,9 +75,57 @@ CASES = {
 @pytest.mark.parametrize(("exchanges", "flown", "outside"), CASES.values(), ids=CASES)
 def test_plans_that_were_followed_and_left_are_counted(exchanges, flown, outside):
     plans = of(*exchanges)
-    plans._end()
-    assert (plans.flown, plans.outside) == (flown, outside)
-    assert np.isfinite(plans.excess) and (plans.excess > 1.0) == bool(outside)
+    counted = figures([plans])
+    assert (counted["flown"], counted["outside"]) == (flown, outside)
+    assert np.isfinite(counted["excess"]) and (counted["excess"] > 1.0) == bool(outside)
+    assert figures([plans]) == counted, "the figures leave a plan in progress as it is"
+
+
+def run_of(*messages, robot="nobody"):
+    """Return the figures of plans in a run with these messages."""
+    metrics = Metrics()
+    for sequence, message in enumerate(messages, 1):
+        kind = "exchange" if isinstance(message, pb.Exchange) else "step"
+        message.header.run, message.header.sequence = message.header.run or 1, sequence
+        (message.request if kind == "exchange" else message).robot = robot
+        assert metrics.add(f"{kind}/{robot}/a", message)
+    return metrics.figures()["plans"]
+
+
+def end(step, x, **change):
+    """Return the last step of an episode, with a collision at x."""
+    last = {"episode": 0, "index": step + 1, "terminated": True, "collision": True, "decision": pb.FAILSAFE} | change
+    return pb.Step(actor="a", step=step, state=[x], **last)
+
+
+OFF = asked(1, pb.FAILSAFE, 0.1, 1)
+ENDS = {
+    "in the tube": ([FIRST, OFF, end(1, 0.2)], 1, 0),
+    "outside at the end": ([FIRST, OFF, end(1, 9.0)], 1, 1),
+    "outside, and a further episode": ([FIRST, OFF, end(1, 9.0), asked(0, pb.ALLOWED, episode=1)], 1, 1),
+    "outside without an answer": ([FIRST, SILENT, end(1, 9.0, fallback=True)], 1, 1),
+    "outside at a time limit": ([FIRST, OFF, end(1, 9.0, terminated=False, truncated=True)], 1, 1),
+    "in the first period of the plan": ([FIRST, end(0, 9.0)], 0, 0),
+    "in the first period of a newer plan": ([FIRST, asked(1, pb.ADJUSTED, 0.1, 1), end(1, 9.0)], 0, 0),
+    "while it follows another stop": ([FIRST, asked(1, pb.FAILSAFE, 0.1, 1), end(1, 9.0)], 1, 0),
+    "of another episode": ([FIRST, OFF, end(1, 9.0, episode=3)], 1, 0),
+    "of another period": ([FIRST, OFF, end(2, 9.0)], 1, 0),
+    "of another process": ([FIRST, OFF, end(1, 9.0, header=pb.Header(run=2))], 1, 0),
+}
+ENDS["while it follows another stop"][0][1].reply.decision.plan[:] = [0.0] * N
+
+
+@pytest.mark.parametrize(("messages", "flown", "outside"), ENDS.values(), ids=ENDS)
+def test_the_last_period_of_an_episode_counts(messages, flown, outside):
+    """A collision ends the episode: no request follows that has the state."""
+    plans = run_of(*map(copy.deepcopy, messages))
+    assert (plans["flown"], plans["outside"]) == (flown, outside)
+
+
+def test_a_robot_in_real_time_that_missed_periods_at_the_end_has_not_left_its_tube():
+    followed = [asked(0, pb.ALLOWED), asked(1, pb.FAILSAFE, 0.1, 1)]
+    assert run_of(*followed, end(1, 0.4), robot="nobody-late")["outside"] == 0
+    assert run_of(*followed, end(1, 9.0), robot="nobody-late")["outside"] == 1
 
 
 @settings(max_examples=30)

@@ -87,3 +87,4 @@ def test_steps_that_the_learner_knows_are_not_fed_again(
     ]
     assert 0 < len(late) < len(steps)
     assert (process.figures["published"], process.figures["known"]) == (len(late), len(steps) - len(late))
+    assert process.figures["damaged"] == 0

@@ -250,6 +250,7 @@ def test_trajectories_from_a_log_are_cut_at_gaps_episodes_actors_and_restarts():
         *steps("a", 1, range(8, 20), run=2),
         *steps("a", 2, range(4)),  # too short to keep
     ]
+    log += log[5:25]  # a copy of a part of the log
     np.random.default_rng(0).shuffle(log)
     found = sorted((int(t.states[0, 3]), int(t.states[0, 4]), len(t.inputs)) for t in trajectories_of(log, GROUND))
     assert found == [(0, 0, 9), (0, 0, 9), (0, 12, 17), (1, 0, 7), (1, 8, 11)]

@@ -59,7 +59,9 @@ def test_a_truncated_log_gives_its_remaining_steps(log: Path, tmp_path: Path) ->
     whole = log.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
     shutil.copy(log, tmp_path / "whole.mcap")
-    left = names(LoggedSteps([str(tmp_path / "cut.mcap")], GROUND))
+    steps = LoggedSteps([str(tmp_path / "cut.mcap")], GROUND)
+    left = names(steps)
+    assert len(steps.damage) == 1 and "cut.mcap" in steps.damage[0]
     assert left and left == names(LoggedSteps([str(tmp_path / "whole.mcap")], GROUND))[: len(left)]
 
 

@@ -12,7 +12,7 @@ from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.deploy.run.log_contents import ENCODING, frames_as_json
 from brakeline.errors import ExportError, Malformed
 from brakeline.logs.log_export import to_tlog
-from brakeline.logs.reader import read
+from brakeline.logs.reader import open_log, read
 from brakeline.logs.recorder import LogSettings, Recording
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
@@ -74,14 +74,14 @@ def test_a_recorder_stores_bytes_and_json(tmp_path: Path) -> None:
     assert any(content["message"]["vy"] == 0.5 for key, content, _ in entries if key.endswith("TARGET_LOCAL_NED"))
 
     with (tmp_path / "a.tlog").open("wb") as file:
-        assert to_tlog(tmp_path, file) == len(frames)
+        assert to_tlog(open_log(tmp_path), file) == len(frames)
     expected = b"".join((f.wall_time // 1000).to_bytes(8, "big") + f.raw for f in frames)
     assert (tmp_path / "a.tlog").read_bytes() == expected
 
 
 def test_a_tlog_of_a_log_without_frames_fails_with_what_to_do(log: Path, tmp_path: Path) -> None:
     with (tmp_path / "a.tlog").open("wb") as file, pytest.raises(ExportError, match="--mavlink"):
-        to_tlog(log, file)
+        to_tlog(open_log(log), file)
 
 
 def test_bytes_that_are_no_frame_are_left_out() -> None:

@@ -124,6 +124,16 @@ def test_falsified_decisions_are_found(data_folder: Path, tmp_path: Path, comman
     assert status == 1 and "11 requests; 1 had no answer" in shown and "different: 3" in shown
 
 
+def test_a_replay_says_what_it_could_not_read(damaged: Path, tmp_path: Path, command) -> None:
+    status, out, err = command("replay", damaged, "--json")
+    figures = json.loads(out)
+    assert status == 0 and figures["requests"] == STEPS - 1
+    assert len(figures["cuts"]) == 2 and all(cut in err for cut in figures["cuts"])
+    (tmp_path / "empty.mcap").touch()
+    status, _, err = command("replay", tmp_path / "empty.mcap")
+    assert status == 1 and "no request could be read" in err
+
+
 def test_a_log_that_begins_after_a_change_of_models_has_no_stale_models(data_folder: Path, tmp_path: Path) -> None:
     def verified_before(exchange: pb.Exchange) -> None:
         if exchange.request.model:
