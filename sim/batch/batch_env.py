@@ -176,7 +176,10 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self._ended = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             resets = np.flatnonzero(self._ended)
-            final = {"final_obs": observations.copy(), "final_info": dict(infos), "_final_obs": self._ended}
+            # The episodes that begin below overwrite the arrays of the obstacles, and of the flags.
+            obstacles = {name: array.copy() for name, array in infos["obstacles"].items()}
+            final = {"final_obs": observations.copy(), "_final_obs": self._ended.copy()}
+            final["final_info"] = infos | {"obstacles": obstacles}
         else:
             final = {}
         if len(resets):

@@ -82,8 +82,10 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     ended = 0
     inputs = np.tile(np.float32([0.25, 0.0]), (size, 1))
     for _ in range(40):
-        (seen, *mine, infos), (theirs, *other, _) = batch.step(inputs), peer.step(inputs)
+        (seen, *mine, infos), (theirs, *other, others) = batch.step(inputs), peer.step(inputs)
         ends = mine[1] | mine[2]
+        if mode == AutoresetMode.SAME_STEP and ends.any():
+            assert np.array_equal(infos["_final_obs"], others["_final_obs"])
         for a, b in zip(mine, other, strict=True):
             assert np.allclose(a, b, atol=0.5 * infos["collision"].any() + SAME)
         touched = infos["collision"] if mode == AutoresetMode.NEXT_STEP else np.zeros(size, dtype=bool)
@@ -95,6 +97,19 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     batch.close()
     peer.close()
     assert ended > 3
+
+
+def test_a_final_info_has_the_obstacles_of_its_own_arena() -> None:
+    batch, ended = BatchNavigationEnv(GROUND, 3, "dense"), 0
+    batch.reset(seed=1)
+    while ended < 4:
+        _, _, terminated, truncated, infos = batch.step(np.tile([0.25, 0.0], (3, 1)))
+        for row in np.flatnonzero(terminated | truncated):
+            arena = infos["final_info"]["arena"][row]
+            center, count = (infos["final_info"]["obstacles"][name][row] for name in ("center", "count"))
+            assert count == len(arena.obstacles) and np.array_equal(center[:count], arena.shapes.center)
+            ended += 1
+    batch.close()
 
 
 def test_noise_is_that_of_each_generator() -> None:
