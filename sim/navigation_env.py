@@ -32,7 +32,7 @@ DrawArena = Callable[[str, np.random.Generator, RobotWithTask], Arena]
 
 REPORTED = (  # fields of a `Period` that `info` has too
     *("collision", "contact_moving", "contact_standing", "contact_robot"),
-    *("clearance", "subsamples", "turned"),
+    *("clearance", "closest", "subsamples", "turned"),
 )
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
 
@@ -74,6 +74,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     contact_robot      the robot touched another robot (`brakeline.sim.shared_world`)
     at_goal            the robot is at the goal, without a contact
     clearance          m from the nearest disc (sphere) of the body to the nearest obstacle, true
+    closest            m, the least clearance at the samples of the last period
     speed              m/s, true
     subsamples         (S, d) m: estimated positions within the last period, in the robot's frame at its start
     turned             rad: estimated change of heading over the last period

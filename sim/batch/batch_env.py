@@ -259,6 +259,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "collision": period.collision,
             **dict.fromkeys(("contact_moving", "contact_standing", "contact_robot"), none),
             "clearance": period.clearance,
+            "closest": period.closest,
             "subsamples": period.subsamples,
             "turned": period.turned,
             "at_goal": self._at_goal(rows, period),

@@ -18,7 +18,7 @@ from tests.robots import GROUND, QUADROTOR
 
 COMPARED = (
     *("state", "true_state", "outside", "input_in_force", "goal", "time", "collision", "contact_moving", "clearance"),
-    *("subsamples", "turned", "at_goal", "speed", "episode_seed"),
+    *("closest", "subsamples", "turned", "at_goal", "speed", "episode_seed"),
 )
 SAME = 1e-9  # rounding
 
