@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from brakeline.errors import UnknownTask
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Array, Obstacle
 from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
@@ -35,6 +36,15 @@ REPORTED = (  # fields of a `Period` that `info` has too
     *("clearance", "closest", "subsamples", "turned"),
 )
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
+
+
+def check_observation(robot: RobotWithTask, size: int) -> None:
+    """Check the size of an observation. Raises UnknownTask: the task names more coordinates, or fewer."""
+    if size != (named := robot.task.observation_dim):
+        raise UnknownTask(
+            f"observed are {size} numbers, but the task names {named}: {len(robot.task.rays.directions)} rays, and "
+            f"{len(robot.task.observation)} coordinates in `observation`"
+        )
 
 
 class NavigationEnv(gymnasium.Env[Observation, Any]):
@@ -175,6 +185,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._distance = self._goal_distance(self._vehicle.true)
         self._view = None
         result = self._observe(), self._info(self._vehicle.initial_period())
+        check_observation(self.robot, len(result[0]))
         self._show()
         return result
 

@@ -26,7 +26,7 @@ from brakeline.sim.batch.observation_batch import GroundObservationBatch, Observ
 from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.navigation_env import OBSERVED_LIMIT
+from brakeline.sim.navigation_env import OBSERVED_LIMIT, check_observation
 from brakeline.sim.sim_conditions import Conditions
 
 Infos = dict[str, Any]
@@ -133,6 +133,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         rows, given = np.flatnonzero(mask), options.get("episode_seeds")
         episodes = [self._episode_seeds(i) if given is None else int(given[i]) for i in rows.tolist()]
         self._now = self._join(rows, *self._begin(rows, episodes))
+        check_observation(self.robot, self._now[0].shape[1])
         return self._now
 
     def step(self, actions: Array) -> StepBatch:

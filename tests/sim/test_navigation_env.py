@@ -4,6 +4,7 @@ Observations come from the measured state, the lidar's position from the true on
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,8 +20,9 @@ from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
-from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
+from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task, with_task
 from brakeline.sim.arena import same_room
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.navigation_env import NavigationEnv, Reward
 from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation
@@ -37,7 +39,7 @@ from tests.robots import GROUND, QUADROTOR
 INFO_KEYS = {
     *("robot", "state", "true_state", "outside", "input_in_force", "obstacles", "arena", "goal", "time"),
     *("collision", "contact_moving", "contact_robot", "contact_standing", "at_goal"),
-    *("clearance", "speed", "subsamples", "turned", "episode_seed"),
+    *("clearance", "closest", "speed", "subsamples", "turned", "episode_seed"),
 }
 ENVS = {
     "ground": partial(NavigationEnv, GROUND),
@@ -340,6 +342,18 @@ def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
     assert nearest[3] > 0.2, "the other robot drives"
     seen = sum(np.hypot(*(other[:2] - own[:2])) < 3.5 for other in others)
     assert [bool(named[f"track {i} near·ahead"]) for i in (1, 2, 3)] == [i <= seen for i in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("names", [GROUND.task.observation[1:], (*GROUND.task.observation, "extra")])
+def test_a_task_that_names_more_or_less_than_is_observed_is_refused(names: tuple[str, ...]) -> None:
+    task = replace(GROUND.task, observation=names)
+    said = f"observed are 26 numbers, but the task names {18 + len(names)}"
+    with pytest.raises(UnknownTask, match=said):
+        NavigationEnv(with_task(GROUND, task)).reset(seed=0)
+    batch = BatchNavigationEnv(with_task(GROUND, task), 2)
+    with pytest.raises(UnknownTask, match=said):
+        batch.reset(seed=0)
+    batch.close()
 
 
 def test_another_task_of_a_robot_is_read_by_its_name(tracking) -> None:
