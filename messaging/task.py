@@ -35,7 +35,7 @@ from brakeline.messaging.robot_files import (
     task_file,
     task_values,
 )
-from brakeline.messaging.task_checks import check_most, check_numbers, check_ranges, check_sizes
+from brakeline.messaging.number_checks import check_most, check_numbers, check_ranges, check_sizes
 
 _STRICT = ConfigDict(extra="forbid")
 

@@ -1,11 +1,11 @@
-"""Check the numbers of a task's file. A message names the key and the value."""
+"""Check the numbers of tasks and of conditions. A message names the key and the value."""
 
 from __future__ import annotations
 
 import math
 
 Number = float | int
-Numbers = Number | tuple[Number, ...] | None  # None: the file does not have the key
+Numbers = Number | tuple[Number, ...] | None  # None: there is no value
 
 
 def check_numbers(values: object, *names: str, least: float | None = None, above: float | None = None) -> None:
@@ -71,5 +71,5 @@ def _numbers(value: Numbers) -> tuple[Number, ...]:
 
 
 def _shown(value: Numbers) -> str:
-    """Return a value as a task's file has it."""
+    """Return a value as a file has it."""
     return str(list(value)) if isinstance(value, tuple) else str(value)
