@@ -25,6 +25,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from brakeline.errors import UnknownName, UnknownTask
 from brakeline.extras import missing_extra
+from brakeline.messaging.number_checks import check_most, check_numbers, check_ranges, check_sizes
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, robot_named
 from brakeline.messaging.robot_files import (
@@ -35,7 +36,6 @@ from brakeline.messaging.robot_files import (
     task_file,
     task_values,
 )
-from brakeline.messaging.number_checks import check_most, check_numbers, check_ranges, check_sizes
 
 _STRICT = ConfigDict(extra="forbid")
 

@@ -99,6 +99,34 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     assert ended > 3
 
 
+def test_a_reset_takes_the_seeds_that_gymnasium_takes() -> None:
+    batch = BatchNavigationEnv(GROUND, 3, autoreset_mode=AutoresetMode.DISABLED)
+    peer = SyncVectorEnv([lambda: NavigationEnv(GROUND)] * 3, autoreset_mode=AutoresetMode.DISABLED)
+    for env in (batch, peer):
+        for seeds in ([], [1], [1, 2, 3, 4]):
+            with pytest.raises(ValueError, match=f"num_envs=3|3 robots.*not {len(seeds)}"):
+                env.reset(seed=seeds)
+        env.reset(seed=0)
+        env.reset(seed=[50, 60, 70], options={"reset_mask": np.array([True, False, False])})
+    assert np.array_equal(batch.reset()[1]["episode_seed"], peer.reset()[1]["episode_seed"])
+    before = batch.reset(seed=np.int64(4))[1]["episode_seed"]
+    for options, said in (
+        ({"arena": "dense"}, "no option 'arena'"),
+        ({"episode_seed": 5}, "no option 'episode_seed'; there are: episode_seeds, reset_mask"),
+        ({"episode_seeds": [1, 2]}, "3 robots .* not 2"),
+        ({"episode_seeds": [1, 2, 3.5]}, "not 3.5"),
+        ({"reset_mask": [True]}, "3 flags"),
+        ({"reset_mask": [0, 2, 1]}, "3 flags"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            batch.reset(seed=9, options=options)
+    assert np.array_equal(batch.reset(seed=4)[1]["episode_seed"], before)
+    for env in (batch, peer):
+        env.close()
+    with pytest.raises(ValueError, match="at least one robot, not 0"):
+        BatchNavigationEnv(GROUND, 0)
+
+
 def test_a_final_info_has_the_obstacles_of_its_own_arena() -> None:
     batch, ended = BatchNavigationEnv(GROUND, 3, "dense"), 0
     batch.reset(seed=1)

@@ -15,7 +15,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.errors import BadWeights, UnknownRobot, UnknownTask
+from brakeline.errors import BadWeights, UnknownName, UnknownRobot, UnknownTask
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import robot_named
@@ -91,11 +91,18 @@ def test_an_environment_takes_a_robot_by_its_name() -> None:
         NavigationEnv("grond")
     with pytest.raises(ValueError, match="render_mode is None, 'rgb_array' or 'human', not 'ansi'"):
         NavigationEnv("ground", render_mode="ansi")
+    with pytest.raises(UnknownName, match="no arena is called 'moon'"):
+        NavigationEnv("ground", "moon")
+    for noise in (np.nan, -1.0):
+        with pytest.raises(ValueError, match=f"lidar_noise = {noise} is not"):
+            NavigationEnv("ground", lidar_noise=noise)
 
 
 @each_robot
 def test_the_image_shows_obstacles_the_goal_and_the_robot_from_above(make: Make) -> None:
     env = make(render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
     _, info = env.reset(options={"episode_seed": 1})
     before = env.render()
     assert before.dtype == np.uint8 and before.shape == (360, 360, 3)
@@ -136,6 +143,15 @@ def test_a_reset_can_change_the_arena_and_its_seed_determines_the_sequence_of_ep
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
     assert env.reset(options={"arena": "open"})[1]["arena"].name == env.reset()[1]["arena"].name == "open"
+    for options, said in (
+        ({"arena": "moon"}, "no arena is called 'moon'"),
+        ({"episode_seed": 2.7}, "an episode's seed is an integer, 0 or more, not 2.7"),
+        ({"episode_seed": -1}, "not -1"),
+        ({"episode": 5}, "no option 'episode'; there are: arena, episode_seed"),
+    ):
+        with pytest.raises((ValueError, UnknownName), match=said):
+            env.reset(options=options)
+        assert env.reset()[1]["arena"].name == "open", "what is refused changes nothing"
     seeds = [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"], env.reset()[1]["episode_seed"]]
     assert len(set(seeds)) == 3
     assert [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"]] == seeds[:2]
