@@ -30,7 +30,7 @@ from brakeline.sim.quadrotor import SAMPLES, Quadrotor
 from brakeline.sim.registration import ENVIRONMENTS, register
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
-from brakeline.sim.sim_conditions import Conditions, QuadrotorNoise
+from brakeline.sim.sim_conditions import Conditions, Perception, QuadrotorNoise
 from brakeline.sim.top_view import GOAL, OBSTACLE, ROBOT
 from brakeline.sim.traffic import Crowd
 from tests.arenas import staged_arena
@@ -65,10 +65,19 @@ def observed(env: NavigationEnv, policy: str, seed: int) -> np.ndarray:
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative
 @pytest.mark.parametrize(
-    ("robot", "arena"), [("ground", "dense"), ("ground", "walkers"), ("ground", "crossing"), ("quadrotor", "traffic")]
+    ("robot", "arena", "perception"),
+    [
+        ("ground", "dense", "map"),
+        ("ground", "walkers", "map"),
+        ("ground", "walkers", "scan"),
+        ("ground", "crossing", "map"),
+        ("quadrotor", "traffic", "map"),
+        ("quadrotor", "default", "scan"),
+    ],
 )
-def test_gymnasiums_checker_accepts_the_environment(robot: str, arena: str) -> None:
-    check_env(ENVS[robot](arena=arena), skip_render_check=True)
+def test_gymnasiums_checker_accepts_the_environment(robot: str, arena: str, perception: str) -> None:
+    conditions = Conditions(perception=Perception(perception))
+    check_env(ENVS[robot](arena=arena, conditions=conditions), skip_render_check=True)
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")
