@@ -82,6 +82,8 @@ def test_what_a_description_says_is_what_the_robot_has():
         (changed("periods", 0.1), "periods", "did you mean 'period'"),
         (changed("name", "a/b"), "name", "letters"),
         (changed("name", "car-late"), "name", "-late"),
+        (changed("name", ".."), "name", "letters"),
+        (changed("name", "."), "name", "letters"),
         (changed("sight", math.inf), "sight", "finite"),
         (changed("state", "x", "unit", "cm"), "state.x.unit", "SI"),
         (changed("state", "x", "unit", "rad"), "state.x.unit", "position is in m"),
@@ -111,6 +113,13 @@ def test_what_a_description_says_is_what_the_robot_has():
         (changed("body", 0, "at", [0.0, 0.0, 0.0]), "body.0.at", "the position has 2"),
         (changed("limit", 0, "weights", {"z": 1.0}), "limit.0.weights", "names of state coordinates"),
         (changed("limit", 0, "weights", {}), "limit.0.weights", "names of state coordinates"),
+        (changed("limit", 2 * CAR["limit"]), "limit.1.name", "another limit is called 'keep in'"),
+        (changed("body", 0, "radius", True), "body.0.radius", "a number, not True"),
+        (changed("body", 0, "at", [0.0, False]), "body.0.at", "a number, not False"),
+        (changed("state", "x", "error", True), "state.x.error", "a number, not True"),
+        (changed("input", "speed", "high", True), "input.speed.high", "a number, not True"),
+        (changed("plan", "free", True), "plan.free", "a number, not True"),
+        (changed("period", True), "period", "a number, not True"),
     ],
 )
 def test_a_mistake_is_told_by_its_field(said, field, word):
