@@ -111,7 +111,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         )
         self._bound = np.asarray(self.robot.measurement_bound)
         self._goal_radius, self._step_limit = kind.goal_radius, kind.step_limit
-        self._arenas = np.empty(num_envs, dtype=object)
+        self._arenas, self._names = np.empty(num_envs, dtype=object), np.full(num_envs, self.robot.name)
         self._seeds, self._steps = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
         self._goals, self._distance = np.zeros((num_envs, self.robot.position_dim)), np.zeros(num_envs)
         self._ended: Flags = np.zeros(num_envs, dtype=bool)
@@ -206,7 +206,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             # The episodes that begin below overwrite the arrays of the obstacles, and of the flags.
             obstacles = {name: array.copy() for name, array in infos["obstacles"].items()}
             final = {"final_obs": observations.copy(), "_final_obs": self._ended.copy()}
-            final["final_info"] = infos | {"obstacles": obstacles}
+            final |= {"final_info": infos | {"obstacles": obstacles}, "_final_info": self._ended.copy()}
         else:
             final = {}
         if len(resets):
@@ -274,7 +274,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
     def _infos(self, rows: NDArray[np.intp], period: PeriodBatch) -> Infos:
         obstacles, none = self._robots.obstacles, np.zeros(len(rows), dtype=bool)
         return {
-            "robot": self.robot.name,
+            "robot": self._names[rows],
             "state": period.measured,
             "true_state": period.true,
             "outside": self._outside(period),

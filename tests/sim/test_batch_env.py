@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList
 
 from brakeline.errors import BadInput, NoBatch, UnknownName
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -27,7 +28,7 @@ def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
     """Compare the infos of one robot."""
     for name in COMPARED:
         assert np.abs(np.asarray(batch[name][row], float) - single[name]).max() <= SAME, name
-    assert batch["arena"][row] == single["arena"] and batch["robot"] == single["robot"]
+    assert batch["arena"][row] == single["arena"] and batch["robot"][row] == single["robot"]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,8 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
         (seen, *mine, infos), (theirs, *other, others) = batch.step(inputs), peer.step(inputs)
         ends = mine[1] | mine[2]
         if mode == AutoresetMode.SAME_STEP and ends.any():
-            assert np.array_equal(infos["_final_obs"], others["_final_obs"])
+            for name in ("_final_obs", "_final_info"):
+                assert np.array_equal(infos[name], others[name])
         for a, b in zip(mine, other, strict=True):
             assert np.allclose(a, b, atol=0.5 * infos["collision"].any() + SAME)
         touched = infos["collision"] if mode == AutoresetMode.NEXT_STEP else np.zeros(size, dtype=bool)
@@ -125,6 +127,19 @@ def test_a_reset_takes_the_seeds_that_gymnasium_takes() -> None:
         env.close()
     with pytest.raises(ValueError, match="at least one robot, not 0"):
         BatchNavigationEnv(GROUND, 0)
+
+
+def test_gymnasium_turns_the_infos_into_a_list() -> None:
+    batch = BatchNavigationEnv(GROUND, 3, "dense")
+    env, ended = DictInfoToList(batch), 0
+    _, infos = env.reset(seed=1)
+    assert [info["robot"] for info in infos] == ["ground"] * 3
+    while ended < 2:
+        *_, terminated, truncated, infos = env.step(np.tile([0.25, 0.0], (3, 1)))
+        for end, info in zip(terminated | truncated, infos, strict=True):
+            assert ("final_info" in info) == ("final_obs" in info) == end
+            ended += bool(end)
+    batch.close()
 
 
 def test_a_final_info_has_the_obstacles_of_its_own_arena() -> None:
