@@ -54,9 +54,8 @@ def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[floa
 
 def same_values(one: Any, other: object) -> bool:
     """Return whether two dataclasses are of one type and have equal values; NaN equals NaN."""
-    if type(one) is not type(other):
-        return False
-    return all(_same(getattr(one, item.name), getattr(other, item.name)) for item in fields(one))
+    names = [item.name for item in fields(one)]
+    return type(one) is type(other) and all(_same(getattr(one, name), getattr(other, name)) for name in names)
 
 
 def _same(one: Any, other: Any) -> bool:

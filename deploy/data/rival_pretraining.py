@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
+from inspect import signature
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
     """
     velocities = method == CBF and barrier_of_velocities(robot)
     config = VelocityBarrierConfig if velocities else CONFIGS[method]
-    settings, known = getattr(robot.task.rivals, method), [item.name for item in fields(config)]
+    settings, known = getattr(robot.task.rivals, method), signature(config).parameters
     if unknown := settings.keys() - known:
         names = ", ".join(sorted(unknown))
         raise UnknownTask(f"rivals.{method} of the robot's task: no setting {names}, but {', '.join(known)}")

@@ -201,14 +201,13 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         observations, infos = self._join(rows, self._observe(rows), self._infos(rows, period))
         resets = np.flatnonzero(self._ended) if self.autoreset_mode == AutoresetMode.NEXT_STEP else rows[:0]
         self._ended = terminated | truncated
+        final: Infos = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             resets = np.flatnonzero(self._ended)
             # The episodes that begin below overwrite the arrays of the obstacles, and of the flags.
             obstacles = {name: array.copy() for name, array in infos["obstacles"].items()}
-            final = {"final_obs": observations.copy(), "_final_obs": self._ended.copy()}
+            final |= {"final_obs": observations.copy(), "_final_obs": self._ended.copy()}
             final |= {"final_info": infos | {"obstacles": obstacles}, "_final_info": self._ended.copy()}
-        else:
-            final = {}
         if len(resets):
             self._now = observations, infos
             episodes = [self._episode_seeds(i) for i in resets.tolist()]
