@@ -82,7 +82,7 @@ class Writer:
         step.reward, step.penalty = chance.gauss(0.0, 1.0), chance.random()
         step.speed, step.clearance = chance.random(), chance.expovariate(3.0) + 0.01
         if number % 2:  # the others are as in a log from before
-            step.closest = 0.9 * step.clearance
+            step.closest = 0.999 * step.clearance
         step.decide_ms, step.propose_ms = (0.0 if fallback else chance.lognormvariate(-1.0, 0.5)), 0.1
         step.outside, step.compared = chance.random() < 0.01, chance.random() < 0.9
         step.contained = step.compared and chance.random() < 0.99
