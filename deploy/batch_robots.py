@@ -86,9 +86,9 @@ class BatchRobots:
     def begin_period(self, proposals: Array) -> None:
         """Decide on the proposed inputs (N, m), and start the period."""
         self._before = self.observations, self.steps.copy(), self._index + 1, self._episodes.copy()
-        self._proposals = proposals
+        self._proposals, self._finite = proposals, np.isfinite(proposals).all(axis=1, keepdims=True)
         if self._filtered is None:
-            self._inputs = np.clip(np.nan_to_num(proposals, nan=0.0), self._robot.low(), self._robot.high())
+            self._inputs = np.clip(np.where(self._finite, proposals, 0.0), self._robot.low(), self._robot.high())
             self._outcome = None
             self._env.begin_step(self._inputs)
             return
@@ -101,6 +101,8 @@ class BatchRobots:
         end_step = self._env.end_step if self._filtered is None else self._filtered.end_step
         self.observations, rewards, terminated, truncated, infos = end_step()
         after, size = infos.get("final_info", infos), len(self.names)
+        if self._filtered is None:
+            self._inputs = after["input_in_force"]  # the vehicle limited the change of its input
         penalty, cut = infos.get("penalty", np.zeros(size)), np.zeros(size, dtype=bool)
         rewards = rewards + penalty
         if self._ends_on_intervention and self._outcome is not None and self._outcome.answers is not None:
@@ -113,7 +115,7 @@ class BatchRobots:
             "step": steps,
             "index": index,
             "observation": seen,
-            "proposed": np.where(decided | np.isfinite(self._proposals), self._proposals, self._inputs),
+            "proposed": np.where(decided | self._finite, self._proposals, self._inputs),
             "action": self._inputs,
             "next_observation": infos.get("final_obs", self.observations),
             "reward": rewards,

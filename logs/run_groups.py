@@ -161,7 +161,7 @@ def _score(run: GroupedRun, name: str) -> float:
 def aggregate(values: Array) -> Figures:
     """Return mean and interquartile mean of the runs' scores, with intervals; NaN scores are left out.
 
-    values (runs,), or (tasks, runs): the bootstrap is stratified, it draws runs anew for each task.
+    values (runs,), or (tasks, runs) of runs that each drove all tasks: a resample has the same runs in each task.
     """
     values = values if values.ndim > 1 else values[np.isfinite(values)]
     if not values.size:
@@ -179,13 +179,13 @@ def _interval(values: Array, statistic: Callable[[Array], Any]) -> list[float] |
     """Return the percentile bootstrap interval of a statistic over runs. A mean of shares stays within 0 and 1."""
     if values.shape[-1] < 2:
         return None
-    drawn = [row[_resampled(len(row), task)] for task, row in enumerate(np.atleast_2d(values))]
-    return _percentiles(statistic(np.concatenate(drawn, axis=1)))
+    rows = np.atleast_2d(values)
+    return _percentiles(statistic(np.concatenate(list(rows[:, _resampled(rows.shape[1])]), axis=1)))
 
 
-def _resampled(count: int, task: int = 0) -> NDArray[np.intp]:
+def _resampled(count: int) -> NDArray[np.intp]:
     """Return the runs (RESAMPLES, count) of each resample; the same for each call."""
-    return np.random.default_rng(task).integers(count, size=(RESAMPLES, count))
+    return np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
 
 
 def _percentiles(drawn: Array, axis: int | None = None) -> list[Any]:
@@ -199,7 +199,7 @@ def performance_profile(values: Array) -> Figures:
     above = (values[..., None] > LEVELS).astype(float)
     profile: Figures = {"level": LEVELS.tolist(), "share": above.mean(axis=(0, 1)).tolist() if values.size else []}
     if values.shape[1] > 1:
-        drawn = np.mean([part[_resampled(len(part), task)].mean(axis=1) for task, part in enumerate(above)], axis=0)
+        drawn = above[:, _resampled(values.shape[1])].mean(axis=(0, 2))
         profile["low"], profile["high"] = _percentiles(drawn, axis=0)
     return profile
 
@@ -214,13 +214,12 @@ def probability_of_improvement(first: Array, second: Array) -> Figures:
     if not firsts.size or not seconds.size:
         return row
     better = (firsts[:, :, None] > seconds[:, None]) + 0.5 * (firsts[:, :, None] == seconds[:, None])
+    better = better.mean(axis=0)  # (runs of the first, of the second)
     row["probability"] = float(better.mean())
-    if min(firsts.shape[1], seconds.shape[1]) > 1:
-        generator, drawn = np.random.default_rng(0), []
-        for task in better:
-            rows, columns = (generator.integers(size, size=(RESAMPLES, size)) for size in task.shape)
-            drawn.append(task[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
-        row["interval"] = _percentiles(np.mean(drawn, axis=0))
+    if min(better.shape) > 1:
+        generator = np.random.default_rng(0)
+        rows, columns = (generator.integers(size, size=(RESAMPLES, size)) for size in better.shape)
+        row["interval"] = _percentiles(better[rows[:, :, None], columns[:, None, :]].mean(axis=(1, 2)))
     return row
 
 

@@ -447,6 +447,7 @@ class Request(_message.Message):
     PAST_INPUTS_FIELD_NUMBER: _builtins.int
     PAST_FROM_START_FIELD_NUMBER: _builtins.int
     SLOW_FIELD_NUMBER: _builtins.int
+    LAYOUT_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -470,6 +471,10 @@ class Request(_message.Message):
     slow: _builtins.float
     """For the log: the share of the inputs' bounds that the robot's actor limits its proposals to, because more plans
     left their tubes than stated; 0: no limit.
+    """
+    layout: _builtins.str
+    """Hash of the description by which the client drives (`Robot.layout`). A service with another one refuses the request.
+    Empty: not compared.
     """
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -555,10 +560,11 @@ class Request(_message.Message):
         past_inputs: _abc.Iterable[_builtins.float] | None = ...,
         past_from_start: _builtins.bool = ...,
         slow: _builtins.float = ...,
+        layout: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "layout", b"layout", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

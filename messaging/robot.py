@@ -326,6 +326,10 @@ class Robot:
 
     def layout(self) -> str:
         """Return the hash of everything that two processes must share to exchange the robot's vectors."""
+        return self._layout
+
+    @cached_property
+    def _layout(self) -> str:
         shared = {name: value for name, value in self.description.items() if name != "accept_bound"}
         text = json.dumps([shared, self.late])  # not sorted: the order of the coordinates matters
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Self
 import gymnasium
 import numpy as np
 
-from brakeline.errors import BusError
-from brakeline.messaging.robot import Array
+from brakeline.errors import BadRequest, BusError, TooLoose
+from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
+from brakeline.messaging.stated_share import percent
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import correction_penalty
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from brakeline.safety.methods import Method
 
 
-UNANSWERED = "unanswered"  # in place of a decision's kind: no service answered, so the backup plan continued
+# In place of a decision's kind: no service answered, or the state could not be used, so the backup plan continued.
+UNANSWERED = "unanswered"
 
 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -44,7 +46,8 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     `info` may hold `scan` (a `Scan`, or a `RangeImage` in space) instead of obstacles. `step` adds to `info`:
 
-        safety: the `Answer`; None if a service did not answer.
+        safety: the `Answer`; None if a service did not answer, or if the measured state is missing, not finite or not
+            plausible. Then the robot continues its backup plan.
         proposed: the action that the policy proposed.
         penalty: subtracted from the reward.
         diagnostics: a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the
@@ -76,15 +79,19 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 no obstacles, so it is not called.
             actions: mapping between the environment's actions and the robot's inputs. Defaults to the identity.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
-                validation report states it. Defaults to the limit in the robot's description.
+                validation report states it. Defaults to the limit in the robot's description; with a client, to the
+                limit of the client or of its service.
             turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on.
 
         Raises:
             Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
-            TooLoose: the validation report states a larger probability, or there is no report.
+            TooLoose: the validation report states a larger probability, or there is no report. With a client of a
+                service, `step` raises it, since only the answers state the probability.
+            ValueError: `accept_bound` is not above 0 and at most 1.
         """
         super().__init__(env)
         self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
+        self._limit = 1.0 if accept_bound is None else _checked_limit(self.client, accept_bound)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
         self.backup_plan.turn_aside = turn_aside
         self._state, self._obstacles = state, obstacles
@@ -138,15 +145,43 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             answer = self.client.decide(
                 state, proposed, near, scan=self._scan, observation=observation, known_free=known_free
             )
+            if answer.bound is not None and answer.bound > self._limit:
+                raise TooLoose(
+                    f"{self.client.robot.name}: the service's model set {answer.model} states only that at most "
+                    f"{percent(answer.bound)} of plans leave their tubes; accept_bound is {percent(self._limit)}"
+                )
             return answer, ""
+        except BadRequest as error:
+            if not is_measurement_fault(error, self.client.robot, state):
+                raise
+            reason = str(error)
         except BusError as error:
-            self.client.fallback()
-            return None, str(error)
+            reason = str(error)
+        self.client.fallback()
+        return None, reason
 
     def _remember(self) -> None:
         """Fill in the scan from memory, if the environment has one."""
         assert self._now is not None
         self._scan = filled(self._memory, self._now[1], self.client.robot.period)
+
+
+def _checked_limit(client: FilterClient, accept_bound: float) -> float:
+    """Return the accepted bound. Raises TooLoose: the client has a model set that states more; ValueError: no share."""
+    from brakeline.safety.model.stated_bound import accepted_bound, check_bound  # a client of a service loads no model
+
+    method = getattr(client, "method", None)
+    check_bound(getattr(method, "model", None), client.robot, accept_bound)
+    return accepted_bound(client.robot, accept_bound)
+
+
+def is_measurement_fault(error: BadRequest, robot: Robot, state: Any) -> bool:
+    """Return whether a request was refused because its state is missing, not finite or not plausible.
+
+    Each other refusal is a mistake in the program, such as a state of the wrong size.
+    """
+    sized = state is None or np.asarray(state, dtype=object).shape == (robot.state_dim,)
+    return error.field == "state" and sized
 
 
 def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:

@@ -55,8 +55,12 @@ class BatchSafetyWrapper(VectorWrapper):
         self._deciding: tuple[Array, Array, BatchOutcome] | None = None
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        # Some environments take the mask out of the options that they get.
+        options = None if options is None else dict(options)
         self._observations, self._infos = self.env.reset(seed=seed, options=options)
-        self.plans.reset(np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool))
+        self.plans.reset(which)
+        self._ended = self._ended & ~which
         return self._observations, self._infos
 
     def step(self, actions: Any) -> StepBatch:
@@ -79,16 +83,19 @@ class BatchSafetyWrapper(VectorWrapper):
         assert self._deciding is not None, "begin_step comes first"
         proposed, before, outcome = self._deciding
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.end_step()  # type: ignore[attr-defined]
+        # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
+        resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         penalty = correction_penalties(self.plans.robot, proposed, before, outcome.inputs, self.penalty)
+        penalty[resets] = 0.0
         after = infos.get("final_info", infos)["state"]
         infos = infos | {
             "outcome": outcome,
             "executed": outcome.inputs,
             "penalty": penalty,
-            "compared": self.plans.predicted.given.copy(),
+            "compared": self.plans.predicted.given & ~resets,
             "contained": self.plans.contains(after),
         }
-        resets, self._ended = self._ended, terminated | truncated
+        self._ended = terminated | truncated
         if self._mode != AutoresetMode.DISABLED:
             self.plans.reset(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
         self._infos, self._observations = infos, observations

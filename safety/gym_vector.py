@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -9,13 +10,15 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from brakeline.errors import Mismatch
+from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
-from brakeline.safety.gym import diagnostics
+from brakeline.safety.filter.request import Request
+from brakeline.safety.gym import diagnostics, is_measurement_fault
 from brakeline.safety.perception.image_memory import filled, memory_of
+from brakeline.safety.service.filter_client import Answer
 from brakeline.safety.service.in_process import InProcess, request_observation
 
 if TYPE_CHECKING:
@@ -29,7 +32,8 @@ class VectorSafetyWrapper(VectorWrapper):
 
     The arguments are those of `SafetyWrapper` for k environments: `state(env, observations, infos)` returns (k, n),
     `obstacles` returns k lists, and `actions` maps (k, m). `step` adds to `infos`: `safety` (k answers; None for an
-    environment that is reset in this step), `penalty` (k,) and `diagnostics` (a dict of k values each).
+    environment that is reset in this step, or whose state is missing or not usable), `penalty` (k,) and `diagnostics`
+    (a dict of k values each).
     """
 
     def __init__(
@@ -62,54 +66,39 @@ class VectorSafetyWrapper(VectorWrapper):
         self._scans: list[RangeMeasurement | None] = [None] * env.num_envs
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._now = self.env.reset(seed=seed, options=options)
-        self._begin((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        self._remember(self._now[1])
+        which = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        # Gymnasium takes the mask out of the options that it gets.
+        observations, infos = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        if self._now is not None:
+            infos = with_earlier_rows(infos, self._now[1], ~which)
+        self._now = observations, infos
+        self._begin(which)
+        self._remember(infos, which)
         return self._now
 
     def step(self, actions: Any) -> tuple[Any, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         if self._now is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
-        robot, now = self.client.robot, self._now
+        robot = self.client.robot
         proposed = np.asarray(self._actions.action_to_control(actions), dtype=float)
         # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
-        deciding = np.flatnonzero(~resets)
+        deciding = np.flatnonzero(~resets).tolist()
         before = np.array([plan.next_input for plan in self.backup_plans])
-        states, near = self._state(self.env, *now), self._obstacles(self.env, *now)
-        near = [] if near is None else near
-        if not len(near) and all(scan is not None for scan in self._scans):  # the scans alone show free space
-            near = [None] * self.num_envs
-        if len(near) != self.num_envs:
-            raise Mismatch(f"obstacles has {len(near)} lists for {self.num_envs} environments: give a list for each")
-        vectors = now[0] if isinstance(now[0], np.ndarray) else [None] * self.num_envs
-        requests = [
-            self.client.request(
-                self.backup_plans[i],
-                states[i],
-                proposed[i],
-                near[i],
-                scan=self._scans[i],
-                observation=request_observation(vectors[i]),
-                known_free=near[i] is not None,
-            )
-            for i in deciding
-        ]
-        answers = self.client.decide_all([self.backup_plans[i] for i in deciding], requests)
+        answers, faults = self._decide(deciding, proposed)
         executed = np.array([plan.next_input for plan in self.backup_plans])
         executed[resets] = robot.zero_input()
         space = self.env.action_space
         safe_actions = np.asarray(self._actions.control_to_action(executed), dtype=space.dtype).reshape(space.shape)
         observations, rewards, terminated, truncated, infos = self.env.step(safe_actions)
-        decided = dict(zip(deciding.tolist(), answers, strict=True))
         penalty = np.zeros(self.num_envs)
         for i in deciding:
             penalty[i] = correction_penalty(robot, proposed[i], before[i], executed[i], self.penalty)
         self._ended = np.asarray(terminated | truncated)
         self._begin(self._ended if self._mode == AutoresetMode.SAME_STEP else resets)
-        self._remember(infos)
-        safety = np.array([decided.get(i) for i in range(self.num_envs)], dtype=object)
-        figures = [diagnostics(answer, "" if answer is not None else "reset") for answer in safety]
+        self._remember(infos, np.ones(self.num_envs, dtype=bool))
+        safety = np.array([answers.get(i) for i in range(self.num_envs)], dtype=object)
+        figures = [diagnostics(answer, faults.get(i, "reset")) for i, answer in enumerate(safety)]
         infos = infos | {
             "safety": safety,
             "penalty": penalty,
@@ -118,6 +107,80 @@ class VectorSafetyWrapper(VectorWrapper):
         self._now = observations, infos
         return observations, np.asarray(rewards) - penalty, terminated, truncated, infos
 
+    def _decide(self, deciding: list[int], proposed: Array) -> tuple[dict[int, Answer], dict[int, str]]:
+        """Return the decisions on some environments, and the reasons of those without one.
+
+        An environment with a decision commits to it. One without continues its backup plan.
+        """
+        states, near = self._views()
+        assert self._now is not None
+        vectors = self._now[0] if isinstance(self._now[0], np.ndarray) else [None] * self.num_envs
+
+        def request(i: int) -> Request:
+            return self.client.request(
+                self.backup_plans[i],
+                states[i],
+                proposed[i],
+                near[i],
+                scan=self._scans[i],
+                observation=request_observation(vectors[i]),
+                known_free=near[i] is not None,
+            )
+
+        faults = {i: reason for i, reason in self._missing_entries().items() if i in deciding}
+        try:
+            answers = self._answers([i for i in deciding if i not in faults], request)
+        except BadRequest:
+            faults |= self._measurement_faults([i for i in deciding if i not in faults], request, states)
+            answers = self._answers([i for i in deciding if i not in faults], request)
+        for i in faults:
+            self.backup_plans[i].fallback()
+        return answers, faults
+
+    def _answers(self, which: list[int], request: Callable[[int], Request]) -> dict[int, Answer]:
+        plans = [self.backup_plans[i] for i in which]
+        answers = self.client.decide_all(plans, [request(i) for i in which]) if which else []
+        return dict(zip(which, answers, strict=True))
+
+    def _measurement_faults(
+        self, which: list[int], request: Callable[[int], Request], states: Sequence[Any]
+    ) -> dict[int, str]:
+        """Return why the states of some environments cannot be used. Raises BadRequest for any other reason."""
+        faults = {}
+        for i in which:
+            try:
+                self.client.method.decide(request(i))
+            except BadRequest as error:
+                if not is_measurement_fault(error, self.client.robot, states[i]):
+                    raise
+                faults[i] = str(error)
+        return faults
+
+    def _views(self) -> tuple[Any, Any]:
+        """Return the environments' states (k, n) and lists of obstacles; None instead of a list: only a scan counts."""
+        assert self._now is not None
+        states = self._state(self.env, *self._now)
+        near = self._obstacles(self.env, *self._now) if self.client.robot.position_dim else [None] * self.num_envs
+        near = [] if near is None else near
+        if not len(near) and all(scan is not None for scan in self._scans):  # the scans alone show free space
+            near = [None] * self.num_envs
+        if len(near) != self.num_envs:
+            raise Mismatch(f"obstacles has {len(near)} lists for {self.num_envs} environments: give a list for each")
+        return states, near
+
+    def _missing_entries(self) -> dict[int, str]:
+        """Return the environments whose own info has no state or no obstacles, where Gymnasium puts zeros or None."""
+        assert self._now is not None
+        missing: dict[int, str] = {}
+        for name, view, default in (("obstacles", self._obstacles, OBSTACLES), ("state", self._state, STATE)):
+            given = self._now[1].get(f"_{name}")
+            if view is not default or given is None or (name == "obstacles" and not self.client.robot.position_dim):
+                continue
+            for i in np.flatnonzero(~given).tolist():
+                if name == "state" or self._scans[i] is None:
+                    missing[i] = f"{name} is missing in the info of this environment"
+        return missing
+
     def _begin(self, which: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen environments (k,)."""
         for i in np.flatnonzero(which):
@@ -125,10 +188,33 @@ class VectorSafetyWrapper(VectorWrapper):
             self._memories[i].reset()
             self._ended[i] = False
 
-    def _remember(self, infos: dict[str, Any]) -> None:
-        """Fill in the scans from memory, if the environments have any."""
-        by_environment = [{"scan": scan} for scan in infos["scan"]] if "scan" in infos else [{}] * self.num_envs
+    def _remember(self, infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
+        """Fill in the scans of the chosen environments (k,) from memory, if the environments have any."""
         period = self.client.robot.period
-        self._scans = [
-            filled(memory, info, period) for memory, info in zip(self._memories, by_environment, strict=True)
-        ]
+        for i in np.flatnonzero(which):
+            info = {"scan": infos["scan"][i]} if "scan" in infos else {}
+            self._scans[i] = filled(self._memories[i], info, period)
+
+
+def with_earlier_rows(infos: dict[str, Any], before: dict[str, Any], which: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the infos after a masked reset, with the earlier rows of the environments (k,) that were not reset.
+
+    Gymnasium leaves these rows out: the values are zeros, and `_name` is False. An environment that fills in all rows
+    itself has no `_name`.
+    """
+    joined = dict(infos)
+    for name, values in before.items():
+        given, now = before.get(f"_{name}"), infos.get(name)
+        if given is None or name.startswith("final_"):
+            continue
+        if isinstance(values, dict):
+            joined[name] = with_earlier_rows(now or {}, values, which)
+        elif now is None:
+            joined[name] = values
+        elif f"_{name}" in infos and now.shape == values.shape:
+            kept = (which & given & ~infos[f"_{name}"]).reshape(-1, *[1] * (values.ndim - 1))
+            joined[name] = np.where(kept, values, now)
+        else:
+            continue
+        joined[f"_{name}"] = infos.get(f"_{name}", False) | (which & given)
+    return joined

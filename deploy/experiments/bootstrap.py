@@ -1,4 +1,7 @@
-"""Confidence intervals over seeds and episodes by the hierarchical bootstrap: resample seeds, then their episodes.
+"""Confidence intervals over seeds and episodes by the bootstrap: resample seeds, and their episodes.
+
+Where all seeds drove the same episodes (crossed), a resample draws the same episodes for each seed, because a room that
+is hard for one policy is hard for the others. Otherwise each seed has a draw of its own (hierarchical).
 
 `scipy.stats.bootstrap` resamples one level only, which would treat the episodes of one trained policy as independent.
 With few seeds the interval is rough, so the table states the number of seeds and the plots show each of them.
@@ -29,49 +32,63 @@ class MeanEstimate:
     seeds: tuple[float, ...]
 
 
-def ratio(above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
+def ratio(
+    above: Sequence[ArrayLike], below: Sequence[ArrayLike], seed: int = 0, *, crossed: bool = False
+) -> MeanEstimate:
     """Estimate the mean over seeds of Σ above / Σ below, summed over the episodes of a seed.
 
-    Each resample draws, with replacement, as many seeds as there are, and for each as many episodes as it has.
+    Each resample draws, with replacement, as many seeds as there are, and as many episodes as a seed has.
 
-    above, below: one array (episodes,) per seed. seed: of the resampling.
+    Args:
+        above: one array (episodes,) per seed.
+        below: likewise.
+        seed: of the resampling.
+        crossed: episode i is the same for each seed.
 
     Raises:
-        ValueError: there is no seed, or a seed has no episode.
+        ValueError: there is no seed, a seed has no episode, or crossed seeds have other numbers of episodes.
     """
     pairs = [(np.asarray(a, float), np.asarray(b, float)) for a, b in zip(above, below, strict=True)]
     if not pairs or not all(len(a) for a, _ in pairs):
         raise ValueError("an interval needs at least one episode of each seed")
     rng = np.random.default_rng(seed)
     per_seed = np.array([a.sum() / b.sum() for a, b in pairs])
-    resampled = np.stack([_resampled(a, b, rng) for a, b in pairs])  # (seeds, RESAMPLES)
-    shape = len(pairs), RESAMPLES
-    # Draw an independent resample of the episodes for each seed, also if a seed is drawn twice.
-    means = resampled[rng.integers(len(pairs), size=shape), rng.integers(RESAMPLES, size=shape)].mean(axis=0)
+    if crossed and len({len(a) for a, _ in pairs}) > 1:
+        raise ValueError("seeds with the same episodes have the same number of them")
+    shared = _drawn(len(pairs[0][0]), rng) if crossed else None
+    resampled = np.stack([_resampled(a, b, _drawn(len(a), rng) if shared is None else shared) for a, b in pairs])
+    shape = len(pairs), RESAMPLES  # of the seeds drawn
+    # Without common episodes, draw them independently for each seed, also if a seed is drawn twice.
+    columns = np.arange(RESAMPLES) if crossed else rng.integers(RESAMPLES, size=shape)
+    means = resampled[rng.integers(len(pairs), size=shape), columns].mean(axis=0)
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
     low, high = np.percentile(means, (tail, 100.0 - tail))
     return MeanEstimate(float(per_seed.mean()), float(low), float(high), tuple(map(float, per_seed)))
 
 
-def mean(values: Sequence[ArrayLike], seed: int = 0) -> MeanEstimate:
-    """Estimate the mean over seeds and episodes of `values`, one array (episodes,) per seed."""
-    return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed)
+def mean(values: Sequence[ArrayLike], seed: int = 0, *, crossed: bool = False) -> MeanEstimate:
+    """Estimate the mean over seeds and episodes of `values`, one array (episodes,) per seed; see `ratio`."""
+    return ratio(values, [np.ones(len(np.asarray(v))) for v in values], seed, crossed=crossed)
 
 
-def rate(happened: Sequence[ArrayLike]) -> MeanEstimate:
-    """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed.
+def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimate:
+    """Estimate the probability of an event from 0 and 1, one array (episodes,) per seed; see `ratio`.
 
     If it never or always happened, all resamples are alike: then the interval is the exact one of Clopper and Pearson,
     which takes all episodes as independent.
     """
-    estimate, episodes = mean(happened), sum(len(np.asarray(each)) for each in happened)
+    estimate, episodes = mean(happened, crossed=crossed), sum(len(np.asarray(each)) for each in happened)
     if 0.0 < estimate.value < 1.0:
         return estimate
     low, high = clopper_pearson(round(estimate.value * episodes), episodes) or (0.0, 1.0)
     return replace(estimate, low=low, high=high)
 
 
-def _resampled(above: Array, below: Array, rng: np.random.Generator) -> Array:
-    """Return Σ above / Σ below (RESAMPLES,) for resampled episodes."""
-    counts = rng.multinomial(len(above), np.full(len(above), 1.0 / len(above)), size=RESAMPLES)
+def _drawn(episodes: int, rng: np.random.Generator) -> Array:
+    """Return how often each episode is drawn, (RESAMPLES, episodes)."""
+    return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), size=RESAMPLES), float)
+
+
+def _resampled(above: Array, below: Array, counts: Array) -> Array:
+    """Return Σ above / Σ below (RESAMPLES,) of episodes that were drawn `counts` times."""
     return np.asarray((counts @ above) / (counts @ below))

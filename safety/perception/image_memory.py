@@ -125,7 +125,10 @@ def filled(memory: FanMemory | ImageMemory, info: Mapping[str, Any], elapsed: fl
         elapsed: time since the last call [s].
 
     Returns:
-        The scan, or None if the environment never had a `scan`.
+        The scan, or None if no `scan` ever came. An episode that begins without one begins with nothing free.
+
+    Raises:
+        BadRequest: `elapsed` is negative or not finite; then all in memory counts as too old.
     """
     if "scan" not in info and memory.unused:
         return None

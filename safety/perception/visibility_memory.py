@@ -16,6 +16,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.errors import BadRequest
+from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import Scan
 from brakeline.safety.perception.occlusion_exits import minimum_by_sector
@@ -29,6 +31,7 @@ SPACING = 0.04  # m, or a quarter of it in rad: smallest motion between two stor
 REACH = 1.0  # m along a beam that the memory is asked about
 STEP = 0.01  # m between the tested points of a beam
 SECTORS = 360  # of a turn
+VERY_OLD = FARTHEST  # s: the largest age that a scan can have
 
 
 S = TypeVar("S", Scan, RangeImage)
@@ -46,10 +49,11 @@ class VisibilityMemory(ABC, Generic[S]):
     def __init__(self, footprint: float) -> None:
         """Begin an episode. footprint: radius of the body's disc or ball [m]."""
         self._start_radius = footprint + self.START
+        self._used = False
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: an episode begins."""
+        """Forget all space: an episode begins."""
         self._begun = False
         self._first: S | None = None
         self._last: S | None = None  # as returned
@@ -58,15 +62,27 @@ class VisibilityMemory(ABC, Generic[S]):
         self._ages: list[float] = []  # s, of the stored scans
 
     def later(self, elapsed: float) -> None:
-        """Let time pass [s]."""
+        """Let time pass [s].
+
+        Raises:
+            BadRequest: the time is negative or not finite. The memory then takes everything in it as too old.
+        """
+        if not 0.0 <= elapsed < math.inf:  # NaN fails too
+            self._lose_time()
+            raise BadRequest("elapsed", f"elapsed is {elapsed:g} s: give the time since the last call, 0 or more")
         self._since_last += elapsed
         self._since_start += elapsed
         self._ages = [age + elapsed for age in self._ages]
 
+    def _lose_time(self) -> None:
+        """Take everything in memory as very old, because the time since the last call is unknown."""
+        self._since_last = self._since_start = VERY_OLD
+        self._ages = [VERY_OLD] * len(self._ages)
+
     @property
     def unused(self) -> bool:
-        """Whether no scan has come yet."""
-        return self._last is None
+        """Whether no scan has ever come, in no episode."""
+        return not self._used
 
     def fill(self, scan: S | None, elapsed: float) -> S:
         """Return the scan with unknown beams filled in from memory.
@@ -75,13 +91,18 @@ class VisibilityMemory(ABC, Generic[S]):
             scan: the new scan. None if none came: the last one stays valid and ages, and before the first one nothing
                 is free.
             elapsed: time since the last call [s].
+
+        Raises:
+            BadRequest: `elapsed` is negative or not finite.
         """
         if self._begun:
             self.later(elapsed)
         self._begun = True
         if scan is None:
-            return self.nothing if self._last is None else replace(self._last, age=self._last.age + self._since_last)
-        scan = self._copied(scan)
+            if self._last is None:
+                return self.nothing
+            return replace(self._last, age=min(self._last.age + self._since_last, VERY_OLD))
+        scan, self._used = self._copied(scan), True
         if self._first is None:
             self._first = scan
         unknown = self._beams_to_fill(scan)
@@ -149,6 +170,10 @@ class FanMemory(VisibilityMemory[Scan]):
     def later(self, elapsed: float) -> None:
         super().later(elapsed)
         self._tracker.later(elapsed)
+
+    def _lose_time(self) -> None:
+        super()._lose_time()
+        self._tracker.reset()  # a longer time would make motions look slower
 
     def fill(self, scan: Scan | None, elapsed: float) -> Scan:
         """Fill in the scan, and add the motions that `ScanTracker` knows."""

@@ -12,6 +12,8 @@ reward (`actors/episode_runner.py`, `learner/n_step.py`). In use, the rule appli
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,8 +56,9 @@ class Sailr(Rival):
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
         """Return the proposal, or the backup policy's input."""
         advantage = self.advantage(request.observation, proposal)
-        if advantage > self.threshold:
-            reason = f"its advantage over braking is {advantage:.3f}, above {self.threshold:g}"
+        if not advantage <= self.threshold:  # NaN brakes too
+            above = f"{advantage:.3f}, above {self.threshold:g}"
+            reason = f"its advantage over braking is {'not a number' if math.isnan(advantage) else above}"
             return self.braking(request, started, reason)
         return self.decision(ALLOWED, braking_plan(self.robot, proposal), 0.0, started)
 

@@ -136,10 +136,12 @@ class Secas(Rival):
         self.scale = self.robot.high()
 
     def correct(self, request: Request, proposal: Array, started: int) -> Decision:
-        """Return the corrected proposal."""
+        """Return the corrected proposal; brake if the linear model is not finite."""
         robot = self.robot
         c = self.constraints(request.observation, request.state)
         G, d = np.asarray(self.g(request.observation), float), self.bound - c
+        if not (np.isfinite(G).all() and np.isfinite(d).all()):
+            return self.braking(request, started, "the linear model of the constraints is not finite")
         action, solver, iterations, solve_ns = proposal, "", 0, 0
         r = proposal / self.scale
         if (G @ r - d > TOLERANCE).any():

@@ -12,7 +12,7 @@ import secrets
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -26,11 +26,20 @@ from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
-from brakeline.safety.filter.backup_plan import BackupPlan
-from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
+from brakeline.safety.service.filter_client import (
+    Answer,
+    accept,
+    known_free_in,
+    observation_in,
+    obstacles_in,
+    scan_in,
+    vector_in,
+)
 from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
 
 DEADLINE = 0.1  # s
+LONGEST_DEADLINE = 86400.0  # s
 NONCE = 16  # bytes
 SAME_INPUT = 1e-9  # rounding error allowed between two equal inputs
 
@@ -51,11 +60,13 @@ def request_message(
     fleet: Sequence[str] = (),
 ) -> pb.Request:
     """Return the message that requests a decision on an action. Raises BadRequest if a value has another type."""
-    backup_plan.measured(np.asarray(state, float))
+    measured = vector_in("state", state)
+    backup_plan.measured(measured)
     message = pb.Request(
         robot=backup_plan.robot.name,
-        state=np.asarray(state, float).tolist(),
-        action=np.asarray(action, float).tolist(),
+        layout=backup_plan.robot.layout(),
+        state=measured.tolist(),
+        action=vector_in("action", action).tolist(),
         input_in_force=backup_plan.input_in_force.tolist(),
         plan=backup_plan.plan.ravel().tolist(),
         model=backup_plan.model,
@@ -90,7 +101,7 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
 
     Raises:
         SafetyError: the reply is an error, or its plan is not possible for this robot after the input in force, or its
-            prediction is not valid.
+            prediction is not valid, or it contradicts itself.
     """
     if reply.WhichOneof("result") != "decision":
         raise SafetyError(reply.error)
@@ -114,6 +125,10 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     numbers = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
     if not all(map(math.isfinite, numbers)) or min(decision.predicted_half_width, default=0.0) < 0.0:
         raise _bad_reply("predicted_center", "a predicted state or a margin that is not valid")
+    if decision.verified and decision.model in ("", UNVERIFIED):  # an empty one would say that the robot stands
+        raise _bad_reply("model", "a verified plan without the model that verified it")
+    if decision.verified and decision.kind == pb.RECOVERING:
+        raise _bad_reply("kind", "a verified plan to recover: nothing verifies such plans")
     try:
         if request.fleet:
             reservation_of(decision.reservation, robot)
@@ -163,10 +178,34 @@ class BusClient:
     """A client over a bus, for robots of one kind. It closes the bus if it opened it."""
 
     def __init__(self, bus: Bus, robot: Robot | str, deadline: float) -> None:
-        # deadline: longest wait for a decision [s]
+        """Make a client.
+
+        Args:
+            bus: the bus.
+            robot: the robot, its name, or the path of its description.
+            deadline: longest wait for a decision [s].
+
+        Raises:
+            ValueError: the deadline is not above 0 and at most `LONGEST_DEADLINE`.
+            UnknownRobot: no robot has this name.
+        """
+        if not (isinstance(deadline, int | float | np.number) and 0.0 < deadline <= LONGEST_DEADLINE):  # NaN fails too
+            raise ValueError(f"a deadline is a time above 0 and at most {LONGEST_DEADLINE:g} s, not {deadline!r}")
         self.bus, self.deadline = bus, deadline
         self.robot = robot_named(robot) if isinstance(robot, str) else robot
         self._owned = False
+
+    @classmethod
+    def _opened(cls, connect: str | Sequence[str], keys: Path | str | None, name: str, *more: Any) -> Self:
+        """Return a client with a bus of its own; more: the other arguments of the constructor."""
+        bus = bus_at(connect, keys, name)
+        try:
+            client = cls(bus, *more)
+        except BaseException:
+            bus.close()
+            raise
+        client._owned = True
+        return client
 
     def close(self) -> None:
         if self._owned:
@@ -215,10 +254,9 @@ class SafetyClient(BusClient):
         Raises:
             Unreachable: there is no router at the endpoints.
             BadKeys: the folder has no keys of that name.
+            ValueError: the deadline is not above 0 and at most a day.
         """
-        client = cls(bus_at(connect, keys, name), robot, deadline)
-        client._owned = True
-        return client
+        return cls._opened(connect, keys, name, robot, deadline)
 
     def decide(
         self,

@@ -101,6 +101,22 @@ class FilterClient(Protocol):
         """Begin an episode with a robot that stands still."""
 
 
+def vector_in(name: str, value: ArrayLike) -> Array:
+    """Return an argument that is a vector, such as `state`. Raises BadRequest for another type or shape."""
+    if value is None:
+        raise BadRequest(name, f"{name} is missing: give a list of numbers")
+    try:
+        vector = np.asarray(value)
+        if vector.dtype.kind not in "fiubO":  # texts and complex numbers can be converted, but not as they are meant
+            raise TypeError(f"an array of {vector.dtype}")
+        vector = np.asarray(vector, float)
+    except (TypeError, ValueError) as error:
+        raise BadRequest(name, f"{name} is a {type(value).__name__}: give a list of numbers") from error
+    if vector.ndim != 1:
+        raise BadRequest(name, f"{name} has shape {vector.shape}: give a list of numbers")
+    return vector
+
+
 def obstacles_in(value: Iterable[Obstacle] | None) -> list[Obstacle]:
     """Return the argument `obstacles` as a list; an empty one for None. Raises BadRequest for another type."""
     if isinstance(value, Scan | RangeImage):
@@ -128,13 +144,9 @@ def observation_in(value: ArrayLike | None) -> NDArray[np.float32]:
         return np.zeros(0, np.float32)
     if isinstance(value, Scan | RangeImage):
         raise BadRequest("observation", f"observation is a {type(value).__name__}: give it as scan=")
-    try:
-        observation = np.asarray(value, np.float32)
-    except (TypeError, ValueError) as error:
-        raise BadRequest("observation", f"observation is a {type(value).__name__}: give a list of numbers") from error
-    if observation.ndim != 1:
-        raise BadRequest("observation", f"observation has shape {observation.shape}: give a list of numbers")
-    return observation
+    if isinstance(value, np.ndarray) and value.dtype == np.float32 and value.ndim == 1:
+        return value
+    return vector_in("observation", value).astype(np.float32)
 
 
 def known_free_in(value: bool) -> bool:

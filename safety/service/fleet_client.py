@@ -21,7 +21,6 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import (
     DEADLINE,
     BusClient,
-    bus_at,
     query_service,
     read_reply,
     request_message,
@@ -45,7 +44,8 @@ class FleetClient(BusClient):
         """Make a client for robots of one kind; names: of the robots.
 
         Raises:
-            ValueError: there are fewer than two names, or two are equal, or the robot has no position.
+            ValueError: there are fewer than two names, or two are equal, or the robot has no position; or the deadline
+                is not above 0 and at most a day.
         """
         if len(names) < 2 or len(set(names)) < len(names):
             raise ValueError(f"a fleet needs two robots or more with different names, not {list(names)}")
@@ -67,9 +67,7 @@ class FleetClient(BusClient):
         name: str = "client",
     ) -> Self:
         """Return a client with a bus of its own. For the other arguments and errors, see `SafetyClient.open`."""
-        client = cls(bus_at(connect, keys, name), robot, names, deadline)
-        client._owned = True
-        return client
+        return cls._opened(connect, keys, name, robot, names, deadline)
 
     def decide(
         self,

@@ -19,7 +19,15 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import MOST_OBSERVED, Request
-from brakeline.safety.service.filter_client import Answer, accept, known_free_in, observation_in, obstacles_in, scan_in
+from brakeline.safety.service.filter_client import (
+    Answer,
+    accept,
+    known_free_in,
+    observation_in,
+    obstacles_in,
+    scan_in,
+    vector_in,
+)
 
 if TYPE_CHECKING:
     from brakeline.safety.methods import Method
@@ -109,12 +117,12 @@ class InProcess:
         known_free: bool = False,
     ) -> Request:
         """Return the request about a robot with this backup plan. Raises BadRequest if a value has another type."""
-        measured = np.asarray(state, dtype=float)
+        measured = vector_in("state", state)
         backup_plan.measured(measured)
         standing, moving = split_moving(obstacles_in(obstacles), self.robot.position_dim)
         return Request(
             state=measured,
-            action=np.asarray(action, dtype=float),
+            action=vector_in("action", action),
             input_in_force=backup_plan.input_in_force,
             plan=backup_plan.plan,
             obstacles=standing,

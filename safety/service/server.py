@@ -93,13 +93,25 @@ class ModelRegistry:
             log.error("a model is in use but could not be archived, so a restarted service will not use it: %s", error)
 
     def method_for(self, request: pb.Request) -> Method:
-        """Return the method for a request. Raises UnknownRobot, NoModel or StaleModel."""
+        """Return the method for a request.
+
+        Raises:
+            UnknownRobot, NoModel: there is no model of this robot.
+            BadRequest: the client drives by another description of the robot.
+            StaleModel: the plan was verified by a model that was never in use here.
+        """
         method = self.filters.get(request.robot)
         if method is None:
             if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
                 raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
             raise NoModel("robot", f"no model of {request.robot} is loaded (loaded: {have})")
+        if request.layout and not method.robot.accepts_layout(request.layout):
+            raise BadRequest(
+                "layout",
+                f"the client drives by another description of {request.robot} than the model was made for: "
+                "give both the same file, or make the model again",
+            )
         known = request.model in ("", UNVERIFIED) or request.model in self.known
         if not known and not self._archived(request.robot, request.model):
             raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")

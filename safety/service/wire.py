@@ -239,8 +239,8 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
     tube = array_of(m.tube_center), array_of(m.tube_half_width)
     if {part.size for part in tube} not in ({0}, {robot.horizon * d}):  # the rivals have none
         raise BadRequest("tube_center", "a tube of the wrong size")
-    if not all(np.isfinite(part).all() for part in tube):
-        raise BadRequest("tube_center", "a tube that holds NaN or infinity")
+    if not all(np.isfinite(part).all() for part in tube) or (tube[1] < 0.0).any():
+        raise BadRequest("tube_center", "a tube that holds NaN, infinity or a negative half-width")
     stopped = None
     if m.HasField("stopped"):
         where = array_of(m.stopped.normal), array_of(m.stopped.at)

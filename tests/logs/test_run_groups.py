@@ -55,6 +55,21 @@ def test_scores_of_groups_are_those_of_their_runs(first: list[float], second: li
     assert pair["probability"] == pytest.approx(better)
 
 
+def test_runs_that_drove_every_task_are_drawn_together_for_all_of_them() -> None:
+    """A good run is good in each arena: with draws of their own, two arenas would seem to know twice as much."""
+    runs = np.array([0.5, 0.6, 0.7, 0.8, 0.9])
+    one, two = aggregate(runs), aggregate(np.stack([runs, runs]))
+    assert two["mean_interval"] == one["mean_interval"] and two["iqm_interval"] == pytest.approx(
+        one["iqm_interval"], abs=0.03
+    )
+    profile, twice = performance_profile(runs), performance_profile(np.stack([runs, runs]))
+    assert profile == twice
+    worse = runs - 0.15
+    assert probability_of_improvement(np.stack([runs, runs]), np.stack([worse, worse])) == probability_of_improvement(
+        runs, worse
+    )
+
+
 @pytest.mark.long
 def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
     """With ten runs the percentile bootstrap covers somewhat less than 95 %."""

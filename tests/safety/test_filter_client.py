@@ -118,6 +118,28 @@ def test_a_value_of_another_type_is_refused_with_its_field(client, field, more, 
     assert caught.value.field == field
 
 
+@pytest.mark.parametrize("field", ["state", "action"])
+@pytest.mark.parametrize(
+    "value",
+    [None, 0.2, "abc", ["0.1", "0.2"], {}, [[0.1, 0.2]], [0.1, [0.2]], np.array([0.1 + 1j, 0.2]), [object()] * 2],
+    ids=["none", "number", "text", "texts", "dict", "nested", "ragged", "complex", "objects"],
+)
+def test_a_vector_of_another_type_is_refused_with_its_field(client, field, value):
+    with pytest.raises(BadRequest, match=f"{field} .*: give a list of numbers") as caught:
+        client.decide(**{"state": np.zeros(5), "action": [0.25, 0.0], field: value}, known_free=True)
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize("deadline", [float("nan"), float("inf"), -1.0, 0.0, 1e300, None, "0.1"])
+def test_a_deadline_that_no_query_can_have_is_refused(join, endpoint, deadline):  # noqa: F811
+    bus = join("safety", listen=True)
+    for make in (lambda: SafetyClient(bus, "ground", deadline), lambda: FleetClient(bus, "ground", NAMES, deadline)):
+        with pytest.raises(ValueError, match="a deadline is"):
+            make()
+    with pytest.raises(ValueError, match="a deadline is"):
+        SafetyClient.open(endpoint, "ground", deadline)
+
+
 @IN_PROCESS_OR_SERVED
 def test_a_request_without_obstacles_scan_or_map_is_refused(model, ask):
     """An empty list or a dropped scan does not mean that space is free."""

@@ -201,6 +201,59 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
     assert infos["diagnostics"]["kind"].shape == (count,)
 
 
+class Faulty(Toy):
+    """An environment with the state and the obstacles in its info. In the second step one of them fails."""
+
+    def __init__(self, fault, **how):
+        super().__init__(CAR, discs(), **how)
+        self.fault = fault
+
+    def reset(self, **how):
+        observation, info = super().reset(**how)
+        return observation, info | {"state": observation, "obstacles": self.obstacles}
+
+    def step(self, action):
+        observation, *ended, _ = super().step(action)
+        info = {"state": observation.copy(), "obstacles": self.obstacles}
+        if self.count == 2 and self.fault in info:
+            del info[self.fault]
+        elif self.count == 2:
+            info["state"][0] = {"nan": np.nan, "far": 1e9}.get(self.fault, observation[0])
+        return observation, *ended, info
+
+
+@pytest.mark.parametrize("fault", ["nan", "far"])
+def test_a_state_that_is_not_finite_or_not_plausible_continues_the_backup_plan(ready, fault):
+    env = wrapped(Faulty(fault), ready, actions=normalised(CAR))
+    figures = [env.step(np.ones(2, np.float32))[4]["diagnostics"] for _ in range(4)]
+    assert [one["kind"] == UNANSWERED for one in figures] == [False, False, True, False]
+    assert figures[2]["reason"].startswith(("state holds NaN", "a state beyond"))
+    assert figures[2]["executed"][0] < figures[1]["executed"][0], "it brakes"
+    with pytest.raises(BadRequest, match="shape"):
+        wrapped(Toy(CAR), ready, **HOW | {"state": lambda *_: np.zeros(3)}).step(np.ones(2, np.float32))
+
+
+@pytest.mark.parametrize("fault", ["nan", "far", "state", "obstacles"])
+def test_a_vector_brakes_the_robot_alone_whose_state_or_obstacles_are_missing(ready, fault):
+    faults = ("", fault, "")
+    vector = gymnasium.vector.SyncVectorEnv([lambda one=one: Faulty(one) for one in faults])
+    env = VectorSafetyWrapper(vector, ready, accept_bound=1.0, actions=normalised(CAR))
+    sound = VectorSafetyWrapper(
+        gymnasium.vector.SyncVectorEnv([lambda: Faulty("")] * 3), ready, accept_bound=1.0, actions=normalised(CAR)
+    )
+    for each in (env, sound):
+        each.reset(seed=[0, 0, 0])
+    for count in range(1, 5):
+        infos, wanted = (each.step(np.ones((3, 2), np.float32))[4] for each in (env, sound))
+        for i in (0, 2):
+            assert np.array_equal(infos["safety"][i].plan, wanted["safety"][i].plan), "the others are not concerned"
+        kind, reason = infos["diagnostics"]["kind"][1], infos["diagnostics"]["reason"][1]
+        assert (infos["safety"][1] is None) == (kind == UNANSWERED) == (count == 3)
+        if count == 3:
+            assert reason.startswith(("state holds NaN", "a state beyond", f"{fault} is missing"))
+            assert (env.backup_plans[1].input_in_force < env.backup_plans[0].input_in_force)[0], "it brakes"
+
+
 class Walled(Toy):
     """An environment with a scan instead of obstacles: a wall all around."""
 
@@ -230,6 +283,36 @@ def test_one_environment_and_a_vector_decide_by_scans(ready):
         *_, info = wrapped(blind, ready, many, **SCANNED).step(action)
         assert np.all(info["diagnostics"]["kind"] == "failsafe"), "before the first scan, nothing is free"
     assert margins[0] == margins[1] < 0.3, "the wall is near"
+
+
+class Mapped(Walled):
+    """An environment with the state, the obstacles and a scan in its info."""
+
+    def _with_scan(self, info):
+        return super()._with_scan(info | {"obstacles": self.obstacles})
+
+
+def test_a_masked_reset_leaves_the_other_robots_as_they_are(ready):
+    ends = (2, 60)
+    vector = gymnasium.vector.SyncVectorEnv(
+        [lambda steps=steps: Mapped(CAR, discs(), steps=steps) for steps in ends],
+        autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED,
+    )
+    env = VectorSafetyWrapper(vector, ready, accept_bound=1.0, actions=normalised(CAR))
+    env.reset(seed=[0, 1])
+    for _ in range(ends[0]):
+        observations, _, _, ended, infos = env.step(np.ones((2, 2), np.float32))
+    plan, predicted, scan, options = env.backup_plans[1].plan, env.backup_plans[1].predicted, env._scans[1], {}
+    options["reset_mask"] = ended.copy()
+    observations, after = env.reset(options=options)
+    assert options["reset_mask"].tolist() == [True, False], "the caller's options stay"
+    assert not env.backup_plans[0].input_in_force.any() and env.backup_plans[0].predicted is None
+    assert env.backup_plans[1].plan is plan and env.backup_plans[1].predicted is predicted
+    assert np.array_equal(after["state"], observations) and after["_state"].all()
+    assert np.array_equal(after["state"][1], infos["state"][1]) and after["obstacles"][1] is infos["obstacles"][1]
+    assert env._scans[1] is scan, "no time passes"
+    *_, infos = env.step(np.ones((2, 2), np.float32))
+    assert infos["safety"][1].compared and infos["safety"][1].contained
 
 
 def test_a_vector_view_without_lists_is_refused(ready):

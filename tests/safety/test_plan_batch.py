@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Obstacle, Shapes
@@ -135,4 +136,20 @@ def test_the_wrapper_filters_every_step_and_nothing_collides() -> None:
         contained, compared = contained + infos["contained"].sum(), compared + infos["compared"].sum()
     assert compared > 900 and contained > 0.98 * compared
     assert BackupPlan(GROUND).plan.shape == env.plans.plan.shape[1:]
+    env.close()
+
+
+def test_a_step_that_resets_a_robot_compares_and_costs_nothing() -> None:
+    arenas = BatchNavigationEnv(GROUND, 8, "dense", autoreset_mode=AutoresetMode.NEXT_STEP)
+    env = BatchSafetyWrapper(arenas, SAFETY, penalty=1.0)
+    env.reset(seed=0)
+    rng, resets, ended = np.random.default_rng(0), 0, np.zeros(8, dtype=bool)
+    while resets < 4 or not ended.any():
+        _, rewards, terminated, truncated, infos = env.step(rng.uniform([0.2, -0.5], [0.25, 0.5], (8, 2)))
+        assert not (infos["compared"][ended].any() or infos["penalty"][ended].any() or rewards[ended].any())
+        assert infos["compared"][~ended].all()
+        resets, ended = resets + ended.sum(), terminated | truncated
+    env.reset(seed=1)
+    env.step(np.tile([0.2, 0.0], (8, 1)))
+    assert env.plans.input_in_force[:, 0].all(), "no robot is reset again"
     env.close()

@@ -10,6 +10,7 @@ import pytest
 from brakeline.errors import BadRequest, NoReply, Refused, SafetyError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.robot import Disc
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.request import NOT_FINITE
@@ -97,6 +98,23 @@ def test_bad_requests_get_an_error_that_names_the_field(service, field, message)
     assert error.message
     assert service.counts.errors == 1
     verified(service)
+
+
+@pytest.mark.parametrize(
+    "change", [{"body": (Disc((0.0, 0.0), 0.3),)}, {"period": 0.5}, {"state": ("y", "x", "a", "v", "w")}]
+)
+def test_a_robot_with_another_description_of_the_same_name_gets_no_decision(service, change):
+    mine = replace(GROUND, **change)
+    message = request_message(BackupPlan(mine), np.zeros(5), [0.2, 0.1], [AHEAD])
+    error = service.error(message)
+    assert (error.type, error.field) == ("BadRequest", "layout") and "another description of ground" in error.message
+    with pytest.raises(SafetyError, match="another description"):
+        read_reply(service.replies(message)[0], message, mine)
+    message.layout = ""  # of a client in another language: the service cannot compare
+    assert service.replies(message)[0].WhichOneof("result") == "decision"
+    fleet = request_message(BackupPlan(mine), np.zeros(5), [0.2, 0.1], [AHEAD], actor="a", fleet=["a"])
+    assert service.error(fleet).field == "layout"
+    assert good().layout == GROUND.layout()
 
 
 def test_the_service_refuses_bytes_that_are_not_a_batch_and_goes_on(service):
@@ -193,6 +211,10 @@ def test_the_client_refuses_a_bad_reply(service):
         (lambda d: setattr(d, "margin", NAN), "predicted_center"),
         (lambda d: d.tube_center.pop(), "tube_center"),
         (lambda d: d.tube_half_width.__setitem__(0, INF), "tube_center"),
+        (lambda d: d.tube_half_width.__setitem__(0, -0.1), "tube_center"),
+        (lambda d: setattr(d, "model", ""), "model"),
+        (lambda d: setattr(d, "model", UNVERIFIED), "model"),
+        (lambda d: setattr(d, "kind", pb.RECOVERING), "kind"),
     ):
         damaged = pb.Reply()
         damaged.CopyFrom(reply)

@@ -11,6 +11,7 @@ from brakeline.errors import TooLoose
 from brakeline.logs.decision_explanation import bound_in, explain
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.stated_share import describe_verification, percent, rounded_up
+from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.gym_vector import VectorSafetyWrapper
@@ -21,7 +22,7 @@ from brakeline.safety.service.wire import decision_of, decision_reply
 from tests.robots import GROUND
 from tests.safety.asked import request
 from tests.safety.rivals.test_sailr import known as rival
-from tests.safety.served import Service
+from tests.safety.served import Service, ServiceClient
 
 FLOWN = {"bound_plan": "0.2613", "windows": "15", "violations": "0", "minutes": "15"}
 TIGHT = {"bound_plan": "0.0042", "windows": "1981", "violations": "2", "minutes": "200"}
@@ -117,10 +118,39 @@ def test_every_use_in_process_refuses_a_loose_model_set(model, tmp_path):
 
 
 class Nothing(gymnasium.Env):
-    """An environment that no filter wraps."""
+    """An environment where nothing happens."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2), {"state": np.zeros(5), "obstacles": []}
+
+
+class Asking(ServiceClient):
+    """A client of a service, as a wrapper needs it."""
+
+    def fallback(self):
+        return self.backup_plan.fallback()
+
+    def reset(self):
+        self.backup_plan.reset()
+
+
+def test_a_wrapper_with_a_client_keeps_the_limit_that_it_was_given(model):
+    loose, free = said(model, FLOWN), normalised(GROUND)
+    client = InProcess(Filter(loose), accept_bound=1.0)
+    SafetyWrapper(Nothing(), client, actions=free), SafetyWrapper(Nothing(), client, actions=free, accept_bound=0.27)
+    with pytest.raises(TooLoose, match=r"accept-bound 0\.27"):
+        SafetyWrapper(Nothing(), client, actions=free, accept_bound=0.01)
+    served = SafetyWrapper(Nothing(), Asking(loose), actions=free, accept_bound=0.01)
+    served.reset()
+    with pytest.raises(TooLoose, match=r"at most 27 % .* accept_bound is 1 %"):
+        served.step(np.zeros(2))
+    for bad in (-1.0, 0.0, 7.0, math.nan):
+        for one in (client, Asking(loose)):
+            with pytest.raises(ValueError, match="share above 0"):
+                SafetyWrapper(Nothing(), one, actions=free, accept_bound=bad)
 
 
 def test_every_decision_carries_the_bound_but_that_of_an_old_log_or_of_a_rival(model):

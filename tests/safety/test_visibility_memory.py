@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.image_memory import ImageMemory
+from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
+from brakeline.safety.perception.image_memory import ImageMemory, memory_of
+from brakeline.safety.perception.image_memory import filled as filled_from_memory
 from brakeline.safety.perception.scan_free_space import gaps
 from brakeline.safety.perception.visibility_memory import FanMemory
+from tests.robots import GROUND
 from tests.safety.test_scan_free_space import FAN, FAR, WIDTH, cast, scene
 
 BODY = 0.02
@@ -97,6 +100,28 @@ def test_at_the_start_only_a_ring_around_the_body_is_free_and_only_if_the_first_
     for _ in range(3):
         memory.fill(None, 0.2)
     assert not memory.fill(BLINDED, 0.2).valid_beams.any()
+
+
+def test_an_episode_that_begins_without_a_scan_frees_nothing_if_the_robot_has_a_sensor():
+    memory = memory_of(GROUND)
+    assert filled_from_memory(memory, {}, 0.2) is None, "no scan has ever come"
+    filled_from_memory(memory, {"scan": empty()}, 0.2)
+    memory.reset()
+    assert not filled_from_memory(memory, {}, 0.2).valid_beams.any()
+
+
+@pytest.mark.parametrize("elapsed", [-2.4, -1e9, math.nan, math.inf])
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+def test_after_a_jump_of_the_clock_everything_in_memory_is_old(elapsed, speed):
+    memory = FanMemory(0.105)
+    memory.fill(empty(speed=speed), 0.2)
+    for scan in (None, empty(speed=speed)):
+        with pytest.raises(BadRequest, match="elapsed is") as caught:
+            memory.fill(scan, elapsed)
+        assert caught.value.field == "elapsed"
+    assert memory.fill(None, 0.2).age > MAX_SCAN_AGE
+    fresh = memory.fill(replace(BLINDED, speed=speed), 0.2)
+    assert fresh.age == 0.0 and fresh.valid_beams.any() == (speed == 0.0), "in a world that stands still, it stays free"
 
 
 @pytest.mark.parametrize("memory", [FanMemory(0.105), ImageMemory(0.3)])

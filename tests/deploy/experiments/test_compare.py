@@ -226,6 +226,32 @@ def test_intervals_cover_what_they_should():
     assert 0.08 < np.mean(lengths) < 0.25, "the spread of the seeds is in it, not the coins' alone"
 
 
+def test_intervals_cover_the_mean_also_where_all_seeds_drive_the_same_hard_rooms():
+    """A room is hard for every policy. Drawn anew for each seed, such rooms would seem to average out."""
+    generator, wide, narrow = np.random.default_rng(0), [], []
+    inside = 0
+    for _ in range(40):
+        hard = 0.5 + 0.45 * generator.choice([-1.0, 1.0], size=60)
+        seeds = [generator.random(60) < hard for _ in range(5)]
+        estimate, apart = mean(seeds, crossed=True), mean(seeds)
+        inside += estimate.low <= 0.5 <= estimate.high
+        wide.append(estimate.high - estimate.low)
+        narrow.append(apart.high - apart.low)
+        assert estimate.value == apart.value and estimate.seeds == apart.seeds
+    assert inside >= 36 and np.mean(wide) > 1.5 * np.mean(narrow)
+    with pytest.raises(ValueError, match="same number"):
+        mean([np.ones(3), np.ones(4)], crossed=True)
+
+
+def test_episodes_that_an_intervention_cut_do_not_count_as_missed_goals():
+    """SAILR ends a training episode when it brakes; an evaluation of the same policy goes on, mostly to the goal."""
+    steps, cut = [10] * 200, [i % 2 for i in range(200)]
+    goals = [int(not each) for each in cut]
+    episodes = {"goal": goals, "steps": steps, "collision": [0] * 200, "timeout": [0] * 200}
+    assert steps_to_learn(episodes, 5000) == 10 * 89, "the 45th episode that was not cut"
+    assert steps_to_learn(episodes | {"timeout": cut}, 5000) == 5000, "episodes that ran out of time are misses"
+
+
 def test_a_rate_without_an_event_has_an_exact_interval():
     never, always, once = rate([np.zeros(50)] * 3), rate([np.ones(50)] * 3), [np.eye(50)[0], np.zeros(50)]
     assert (never.value, never.low) == (0.0, 0.0) and never.high == pytest.approx(1.0 - 0.025 ** (1 / 150))

@@ -93,6 +93,19 @@ def test_a_proposal_that_is_not_finite_brakes():
     assert np.allclose(decision.plan[0], brake(QUADROTOR, before)) and not decision.plan[-1].any()
 
 
+@pytest.mark.filterwarnings("ignore:.*encountered in matmul:RuntimeWarning")
+@pytest.mark.parametrize("network", ["q", "v"])
+def test_an_advantage_that_is_not_a_number_brakes(network):
+    model = known(threshold=0.9)
+    inputs = model.networks[network].inputs
+    broken = Pretrained(
+        GROUND, "sailr", model.networks | {network: linear(inputs, {0: 9.0, 1: -9.0}, EVEN)}, model.settings
+    )
+    seen = np.full(GROUND.task.observation_dim, 3e38, np.float32)
+    decision = Sailr(broken).decide(request((0.25, 0.0), observation=seen))
+    assert decision.kind == "failsafe" and not decision.plan.any() and "not a number" in decision.reason
+
+
 def test_a_request_without_an_observation_is_refused():
     with pytest.raises(BadRequest) as refused:
         Sailr(known()).decide(request((0.1, 0.0), observation=np.zeros(0, np.float32)))

@@ -111,6 +111,16 @@ def test_far_from_everything_the_proposal_passes_and_else_the_speed_is_cut_to_wh
     assert too_near.plan[0] == pytest.approx((0.0, 0.4), abs=1e-4) and too_near.margin < 0
 
 
+@pytest.mark.filterwarnings("ignore:.*encountered in matmul:RuntimeWarning")
+def test_a_linear_model_that_is_not_finite_brakes():
+    model = known()
+    (weight, bias), *_ = model.networks["g"].layers
+    weight[:, 0, :2] = 9.0, -9.0
+    broken = Pretrained(GROUND, "secas", {"g": Perceptrons([(weight, bias)])}, model.settings, rays=GROUND.task.rays)
+    decision = Secas(broken).decide(request((0.25, 0.4), observation=np.full(26, 3e38, np.float32)))
+    assert decision.kind == "failsafe" and not decision.plan.any() and "not finite" in decision.reason
+
+
 def test_a_robot_that_approaches_counts_as_nearer():
     constraints = Constraints(GROUND, GROUND.task.rays)
     still, moving = (constraints(seen(0.3), np.array([0, 0, 0, v, 0])) for v in (0.0, 0.25))
