@@ -31,7 +31,7 @@ StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # th
 EPISODE_STRIDE = 4096  # robots of one run never share a seed: seed = episode * stride + number of the robot
 COPIED = (  # values of `info` that a step records under the same name
     *("collision", "contact_moving", "contact_standing", "contact_robot"),
-    *("speed", "clearance", "outside", "turned"),
+    *("speed", "clearance", "closest", "outside", "turned"),
 )
 
 

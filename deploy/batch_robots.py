@@ -127,7 +127,7 @@ class BatchRobots:
             "state": after["state"],
             "true_state": after["true_state"],
             "path": after["subsamples"].reshape(size, -1),
-            **{name: after[name] for name in ("collision", "speed", "clearance", "outside", "turned")},
+            **{name: after[name] for name in ("collision", "speed", "clearance", "closest", "outside", "turned")},
             **{name: infos[name] for name in ("compared", "contained") if name in infos},
             **({} if self._outcome is None else _decisions(self._outcome)),
         }

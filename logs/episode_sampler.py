@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 
-from brakeline.logs.episode_stats import Figures, kind_of
+from brakeline.logs.episode_stats import Figures, closest_of, kind_of
 from brakeline.logs.episode_view import FEW_TUBES, MOST_TUBES, picture, rows, sketch
 from brakeline.logs.json_values import finite
 from brakeline.messaging import brakeline_pb2 as pb
@@ -48,9 +48,9 @@ class EpisodeRecord:
     def add(self, step: pb.Step) -> None:
         if len(self.steps) < MOST_STEPS:
             self.steps.append(step)
-        clearance = step.clearance
-        if clearance < self.closest:
-            self.closest = clearance
+        closest = closest_of(step)
+        if closest < self.closest:
+            self.closest = closest
         self.failsafes += kind_of(step) == pb.FAILSAFE
 
     def exchanges(self) -> dict[int, pb.Exchange]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from brakeline.logs.json_values import finite
 from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson, poisson
 from brakeline.logs.quantiles import QuantileSketch, spread, summary
 from brakeline.messaging import brakeline_pb2 as pb
@@ -44,6 +45,11 @@ def kind_of(step: pb.Step) -> int:
     return _FAILSAFE if step.fallback else step.decision
 
 
+def closest_of(step: pb.Step) -> float:
+    """Return the least clearance [m] within a step's period; of an old log, the clearance at the period's end."""
+    return step.closest if step.HasField("closest") else step.clearance
+
+
 @dataclass
 class EpisodeStats:
     """Statistics of one actor's steps."""
@@ -70,6 +76,7 @@ class EpisodeStats:
     violations: int = 0  # compared steps whose measured state is outside that set
     speed: float = 0.0  # m/s, summed
     max_speed: float = 0.0  # m/s
+    closest: float = math.inf  # m, least clearance within the periods
     clearance: QuantileSketch = field(default_factory=QuantileSketch)  # m, from the footprint to the nearest obstacle
     returns: array[float] = field(default_factory=lambda: array("d"))  # per finished episode, without penalties
     decision_ms: dict[int, QuantileSketch] = field(default_factory=lambda: {kind: QuantileSketch() for kind in KINDS})
@@ -93,6 +100,9 @@ class EpisodeStats:
         self.speed += speed
         if speed > self.max_speed:
             self.max_speed = speed
+        closest = closest_of(step)
+        if closest < self.closest:
+            self.closest = closest
         self.clearance.add(step.clearance)
         self._return += step.reward
         self._add_decision(step)
@@ -166,7 +176,7 @@ def closed_loop(parts: Iterable[EpisodeStats]) -> Figures:
         "broken": total("broken"),
         "fleet": max((part.fleet for part in parts), default=0),
         "outside": total("outside"),
-        "closest_approach": clearance and clearance["min"],
+        "closest_approach": finite(min((part.closest for part in parts), default=math.inf)),
         "clearance": clearance,
     }
     if total("without_for_clearance"):

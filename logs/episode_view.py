@@ -11,7 +11,7 @@ import numpy as np
 from brakeline.logs.arena_view import arena_view, obstacles_view
 from brakeline.logs.decision_explanation import NO_ANSWER, bound_in, explain, limits_applied
 from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
-from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures, kind_of
+from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, Figures, closest_of, kind_of
 from brakeline.logs.json_values import rounded
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, WALL
@@ -123,7 +123,7 @@ def _summary(episode: EpisodeRecord, closest: int) -> Figures:
 
 
 def _closest(steps: Sequence[pb.Step]) -> int:
-    return min(range(len(steps)), key=lambda k: steps[k].clearance)
+    return min(range(len(steps)), key=lambda k: closest_of(steps[k]))
 
 
 def letter(step: pb.Step) -> str:

@@ -10,7 +10,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
-from brakeline.logs.episode_stats import INTERVENTIONS, Figures, kind_of
+from brakeline.logs.episode_stats import INTERVENTIONS, Figures, closest_of, kind_of
 from brakeline.logs.json_values import finite
 from brakeline.logs.quantiles import QuantileSketch, summary
 from brakeline.messaging import brakeline_pb2 as pb
@@ -100,9 +100,9 @@ class LearningCurve:
         kind = kind_of(step)
         if kind in COUNTED:
             now[COUNTED[kind]] += 1
-        clearance = step.clearance
-        if clearance < now.closest:
-            now.closest = clearance
+        closest = closest_of(step)
+        if closest < now.closest:
+            now.closest = closest
         version = step.weights_version
         if version > self._newest:
             self._newest = version

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
-from brakeline.messaging.scan import check_numbers, check_unit
+from brakeline.messaging.scan import check_numbers, check_unit, same_values
 
 Array = NDArray[np.float64]
 
@@ -55,6 +55,12 @@ class RangeImage:
     doubt: int = 0  # number of beams, 0 or 1, that may miss an obstacle among any four neighbouring beams
     speed: float = 0.0  # largest speed of the surfaces that were hit [m/s]; 0: the world is static
     age: float = 0.0  # time since the image [s]
+
+    def __eq__(self, other: object) -> bool:
+        return same_values(self, other)
+
+    def __hash__(self) -> int:
+        return hash((self.ranges.shape, self.far, self.age))
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)

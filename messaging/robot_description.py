@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from brakeline.errors import BadDescription, BadText, UnknownRobot
 from brakeline.messaging.robot import DEFAULT_ACCEPT_BOUND, FEEDBACK, HOLD, RAMP, Disc, Limit, Robot
@@ -27,9 +27,19 @@ MAX_NAME_LENGTH = 64
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "Pa", "K", "1")
 UNIT_OF_ROLE = {"position": "m", "heading": "rad"}
 INPUT_ROUNDING = 1e-12
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Problem = tuple[str, str]  # a field, and its mistake with the allowed values
+
+
+def _check_number(value: object) -> object:
+    if isinstance(value, bool):
+        raise ValueError("a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_check_number)]
+Whole = Annotated[int, BeforeValidator(_check_number)]
+Finite = Annotated[Number, Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0, allow_inf_nan=False)]
 
 
 def _check_unit(unit: str) -> str:
@@ -50,7 +60,7 @@ class CoordinateModel(_Strict):
 
     unit: Unit
     role: Literal["position", "heading", "other"] = "other"
-    error: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+    error: Annotated[Number, Field(ge=0.0, allow_inf_nan=False)]
     follows: str | None = None
     regressor: bool | None = None  # None: true for the role "other"
 
@@ -69,9 +79,9 @@ class InputModel(_Strict):
 class PlanModel(_Strict):
     """The number of periods of a plan, of its free inputs, and of a ramp to zero."""
 
-    horizon: Annotated[int, Field(ge=2, le=64)]
-    free: Annotated[int, Field(ge=1, le=8)] = 1
-    brake: Annotated[int, Field(ge=1, le=64)]
+    horizon: Annotated[Whole, Field(ge=2, le=64)]
+    free: Annotated[Whole, Field(ge=1, le=8)] = 1
+    brake: Annotated[Whole, Field(ge=1, le=64)]
 
 
 class DiscModel(_Strict):
@@ -93,7 +103,7 @@ class DescriptionModel(_Strict):
     """A robot description before the checks that concern several fields."""
 
     name: Annotated[str, Field(max_length=MAX_NAME_LENGTH)]
-    period: Annotated[float, Field(ge=0.002, le=10.0)]
+    period: Annotated[Number, Field(ge=0.002, le=10.0)]
     sight: Positive | None = None  # required with a position, refused without one
     state: Annotated[dict[str, CoordinateModel], Field(min_length=1, max_length=32)]
     input: Annotated[dict[str, InputModel], Field(min_length=1, max_length=16)]
@@ -102,7 +112,7 @@ class DescriptionModel(_Strict):
     limit: Annotated[list[LimitModel], Field(max_length=32)] = []
     stopped: Positive | None = None
     # Below 1: a model set that states no bound counts as 1 and must always be confirmed.
-    accept_bound: Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = DEFAULT_ACCEPT_BOUND
+    accept_bound: Annotated[Number, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = DEFAULT_ACCEPT_BOUND
 
     def role_names(self, role: str) -> list[str]:
         """Return the names of the coordinates with a role."""
@@ -282,8 +292,9 @@ def _problem(detail: Any) -> Problem:
 
 def _inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
     """Yield the mistakes that concern several fields."""
-    if not NAME.fullmatch(model.name) or model.name.endswith(REAL_TIME_SUFFIX):
-        yield "name", f"letters, digits, '_', '.' and '-', not ending in {REAL_TIME_SUFFIX!r}; not {model.name!r}"
+    if not NAME.fullmatch(model.name) or model.name.endswith(REAL_TIME_SUFFIX) or not model.name.strip("."):
+        allowed = f"letters, digits, '_', '.' and '-', not only dots, and not ending in {REAL_TIME_SUFFIX!r}"
+        yield "name", f"{allowed}; not {model.name!r}"
     yield from _state_problems(model)
     for name, one in model.input.items():
         for field, text in _input_problems(model, one):
@@ -307,6 +318,8 @@ def _inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
         if unknown or not any(limit.weights.values()):
             names = ", ".join(model.state)
             yield f"limit.{i}.weights", f"names of state coordinates ({names}), not {', '.join(unknown)}"
+        if limit.name in [other.name for other in model.limit[:i]]:
+            yield f"limit.{i}.name", f"another limit is called {limit.name!r}"
 
 
 def _space_problems(model: DescriptionModel, d: int) -> Iterator[Problem]:

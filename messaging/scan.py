@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,18 @@ def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[floa
         raise BadScan(f"a {name}'s least width must be positive")
 
 
+def same_values(one: Any, other: object) -> bool:
+    """Return whether two dataclasses are of one type and have equal values; NaN equals NaN."""
+    names = [item.name for item in fields(one)]
+    return type(one) is type(other) and all(_same(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=True)
+    return bool(np.all(one == other))
+
+
 @dataclass(frozen=True, eq=False)
 class BeamTracks:
     """The tracked motion of the surfaces that a scan hit (`safety/perception/scan_tracking.py`)."""
@@ -61,6 +74,12 @@ class BeamTracks:
     # (K, 4) velocity x, y in the world [m/s], its error [m/s], and the largest acceleration [m/s²]. t seconds after the
     # scan the displacement is velocity·t, within error·t + acceleration·t²/2.
     motions: Array
+
+    def __eq__(self, other: object) -> bool:
+        return same_values(self, other)
+
+    def __hash__(self) -> int:
+        return hash(self.motions.shape)
 
     def problem(self, beams: int) -> str:
         """Return the reason why these tracks do not fit a scan with so many beams; empty if they fit."""
@@ -103,6 +122,12 @@ class Scan:
     acceleration: float = 0.0  # largest acceleration of moving obstacles [m/s²]; 0: unknown
     least_radius: float = 0.0  # least radius of moving obstacles [m]
     tracks: BeamTracks | None = None
+
+    def __eq__(self, other: object) -> bool:
+        return same_values(self, other)
+
+    def __hash__(self) -> int:
+        return hash((self.ranges.shape, self.far, self.age))
 
     def __post_init__(self) -> None:
         check_unit(self.ranges)

@@ -18,12 +18,14 @@ import sys
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from brakeline.errors import UnknownName, UnknownTask
 from brakeline.extras import missing_extra
+from brakeline.messaging.number_checks import check_most, check_numbers, check_ranges, check_sizes
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, robot_named
 from brakeline.messaging.robot_files import (
@@ -52,6 +54,9 @@ class Reward:
 
     def __post_init__(self) -> None:
         check_penalty(self.correction_penalty)
+        check_numbers(self, "progress", "goal", least=0.0)
+        check_numbers(self, "collision", "run_into", "cut")
+        check_most(self, "collision", "run_into", "cut", most=0.0)
 
 
 def check_penalty(penalty: float | None) -> None:
@@ -73,6 +78,11 @@ class MoverKind:
     position_error: float = 0.03  # [m]
     velocity_error: float = 0.05  # [m/s]
     steps_over: bool = False  # True: passes over a standing robot, which then continues; False: the episode ends
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "count")
+        check_numbers(self, "radius", above=0.0)
+        check_numbers(self, "speed", "acceleration", "keep", "position_error", "velocity_error", least=0.0)
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,14 @@ class ArenaKind:
     movers: MoverKind | None = None
     ring: float | None = None  # radius of a circle with starts and, opposite, goals, so that paths cross [m]
 
+    def __post_init__(self) -> None:
+        check_numbers(self, "half_width", "goal_distance", "goal_radius", "height", "ring", above=0.0)
+        check_numbers(self, "gap", "path_clearance", "start_clearance", least=0.0)
+        check_numbers(self, "step_limit", least=1)
+        check_ranges(self, "cylinders", "boxes", "spheres")
+        check_sizes(self, radius=self.cylinders, edge=self.boxes, ball=self.spheres)
+        check_sizes(self, tall=(0, 0) if self.height is None else self.boxes)
+
 
 @dataclass(frozen=True)
 class LidarLayout:
@@ -111,6 +129,14 @@ class LidarLayout:
     azimuths: int = 0
     elevations: int = 0
 
+    def __post_init__(self) -> None:
+        check_numbers(self, "range", above=0.0)
+        check_numbers(self, "degrees", "fan", "azimuths", "elevations", least=0.0)
+        check_most(self, "degrees", most=360.0)
+        if (self.azimuths > 0) != (self.elevations > 0) or (self.fan and self.azimuths):
+            counts = f"fan = {self.fan}, azimuths = {self.azimuths}, elevations = {self.elevations}"
+            raise ValueError(f"{counts}: give the rays of a fan, or azimuths and elevations of rays in space")
+
 
 @dataclass(frozen=True)
 class Rivals:
@@ -122,6 +148,11 @@ class Rivals:
     cbf: dict[str, float] = field(default_factory=dict)
     psf: dict[str, float] = field(default_factory=dict)
     margins: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "margins", least=0.0)
+        for method in (self.secas, self.sailr, self.cbf, self.psf):
+            check_numbers(SimpleNamespace(**method), *method)
 
 
 @dataclass(frozen=True)
@@ -152,6 +183,10 @@ class Task:
     rivals: Rivals = field(default_factory=Rivals)
     folder: Path = Path()  # folder of the task's file
     name: str = ""  # name of the file without its suffix; empty: there is no file
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "trajectories", "steps", "at_once", least=1)
+        check_numbers(self, "simulator_version", least=0)
 
     @cached_property
     def rays(self) -> LidarRays:
@@ -343,18 +378,32 @@ def read_task(path: Path) -> Task:
     try:
         values = task_values(path)
         arenas = values.get("arenas", {})
-        values["arenas"] = {name: _arena(arenas, name) for name in arenas}
+        values["arenas"] = {name: _arena(arenas, (name,)) for name in arenas}
         place = {"folder": path.parent, "name": path.name.removesuffix(TASK_SUFFIX)}
         return TypeAdapter(Task).validate_python(values | place)
     except ValidationError as error:
-        lines = "".join(f"\n  {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        problems = [(".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, ")) for e in error.errors()]
+        lines = "".join(f"\n  {place}: {what}" if place else f"\n  {what}" for place, what in problems)
         raise UnknownTask(f"{path} is no task:{lines}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except RecursionError as error:
+        raise UnknownTask(f"{path} is no task: it is like itself, at once or by way of other tasks") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UnknownTask(f"{path} is no task: {error}") from error
 
 
-def _arena(arenas: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the values of an arena, with those of the arena that it is `like` as defaults."""
+def _arena(arenas: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of an arena, with those of the arena that it is `like` as defaults.
+
+    names: its name, after those of the arenas that are like it.
+
+    Raises:
+        ValueError: there is no arena that it is like, or it is like itself.
+    """
+    first, name = names[0], names[-1]
+    if name not in arenas:
+        raise ValueError(f"arenas.{first}: no arena is called {name!r}")
+    if name in names[:-1]:
+        raise ValueError(f"arenas.{first}: it is like itself ({' → '.join(names)})")
     values = dict(arenas[name])
     base = values.pop("like", None)
-    return ({} if base is None else _arena(arenas, base)) | values
+    return ({} if base is None else _arena(arenas, (*names, base))) | values

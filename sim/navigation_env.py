@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from numbers import Integral
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -11,9 +13,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from brakeline.errors import UnknownTask
 from brakeline.messaging.moving_obstacles import MovingObstacles
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.obstacle import Array, Obstacle
-from brakeline.messaging.task import Reward, RobotWithTask, robot_with_task
+from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.delayed_vehicle import simulated_vehicle
@@ -32,9 +36,32 @@ DrawArena = Callable[[str, np.random.Generator, RobotWithTask], Arena]
 
 REPORTED = (  # fields of a `Period` that `info` has too
     *("collision", "contact_moving", "contact_standing", "contact_robot"),
-    *("clearance", "subsamples", "turned"),
+    *("clearance", "closest", "subsamples", "turned"),
 )
 OBSERVED_LIMIT = 1.5  # every coordinate of the observation is clipped to ± this
+
+
+def check_observation(robot: RobotWithTask, size: int) -> None:
+    """Check the size of an observation. Raises UnknownTask: the task names more coordinates, or fewer."""
+    if size != (named := robot.task.observation_dim):
+        raise UnknownTask(
+            f"observed are {size} numbers, but the task names {named}: {len(robot.task.rays.directions)} rays, and "
+            f"{len(robot.task.observation)} coordinates in `observation`"
+        )
+
+
+def check_options(options: Mapping[str, Any], *known: str) -> None:
+    """Check the names of the options of a `reset`. Raises ValueError."""
+    if unknown := options.keys() - known:
+        names = ", ".join(map(repr, sorted(unknown)))
+        raise ValueError(f"a reset has no option {names}; there are: {', '.join(known)}")
+
+
+def episode_seed(value: Any) -> int:
+    """Return the seed of an episode. Raises ValueError: it is no integer, or negative."""
+    if not isinstance(value, Integral) or value < 0:
+        raise ValueError(f"an episode's seed is an integer, 0 or more, not {value!r}")
+    return int(value)
 
 
 class NavigationEnv(gymnasium.Env[Observation, Any]):
@@ -74,6 +101,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     contact_robot      the robot touched another robot (`brakeline.sim.shared_world`)
     at_goal            the robot is at the goal, without a contact
     clearance          m from the nearest disc (sphere) of the body to the nearest obstacle, true
+    closest            m, the least clearance at the samples of the last period
     speed              m/s, true
     subsamples         (S, d) m: estimated positions within the last period, in the robot's frame at its start
     turned             rad: estimated change of heading over the last period
@@ -110,11 +138,14 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         Raises:
             UnknownRobot: no robot has this name.
             UnknownTask: the robot has no task.
-            ValueError: the render mode is none of `metadata["render_modes"]`.
+            UnknownName: the robot has no arena of this name.
+            ValueError: the render mode is none of `metadata["render_modes"]`, or the noise cannot be.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode is None, 'rgb_array' or 'human', not {render_mode!r}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
+        if draw is draw_arena:
+            arena_kind(self.robot, arena)
         self.arena_name, self.seed_key, self.render_mode = arena, seed_key, render_mode
         self.task = self.robot.task
         self.reward = reward or self.task.reward
@@ -128,6 +159,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._make_vehicle = make_vehicle or simulated_vehicle(self.robot, self.conditions)
         if lidar_noise is None:
             lidar_noise = self.conditions.lidar_noise(flies=self.robot.position_dim == 3)
+        check_numbers(SimpleNamespace(lidar_noise=lidar_noise), "lidar_noise", least=0.0)
         self._lidar_noise = lidar_noise
         self._draw = draw
         self._measurement_bound = np.asarray(self.robot.measurement_bound)
@@ -140,7 +172,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     def vehicle(self) -> Vehicle:
         """The vehicle of the present episode. Raises gymnasium.error.ResetNeeded: no episode has started yet."""
         if self._vehicle is None:
-            raise gymnasium.error.ResetNeeded("call reset() before the first step")
+            raise gymnasium.error.ResetNeeded("call reset() before step() and render()")
         return self._vehicle
 
     def alter(self, **changes: float) -> None:
@@ -150,13 +182,14 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             self._vehicle.alter(**changes)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
-        super().reset(seed=seed)
         options = options or {}
-        self.arena_name = options.get("arena", self.arena_name)
-        given = "episode_seed" in options
-        self._episode_seed = int(options["episode_seed"] if given else self.np_random.integers(2**31))
-        rng = np.random.default_rng((self.seed_key, self._episode_seed))
-        self._arena = self._draw(self.arena_name, rng, self.robot)
+        check_options(options, "arena", "episode_seed")
+        super().reset(seed=seed)
+        name, given = options.get("arena", self.arena_name), "episode_seed" in options
+        episode = episode_seed(options["episode_seed"] if given else self.np_random.integers(2**31))
+        rng = np.random.default_rng((self.seed_key, episode))
+        arena = self._draw(name, rng, self.robot)
+        self.arena_name, self._episode_seed, self._arena = name, episode, arena
         self._vehicle = self._make_vehicle(self._arena, rng)
         if self._changes:
             self._vehicle.alter(**self._changes)
@@ -174,6 +207,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self._distance = self._goal_distance(self._vehicle.true)
         self._view = None
         result = self._observe(), self._info(self._vehicle.initial_period())
+        check_observation(self.robot, len(result[0]))
         self._show()
         return result
 
@@ -208,12 +242,14 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
     def _show(self) -> None:
         if self.render_mode == "human":
+            image = self._image()
             self._window = self._window or Window(f"{self.robot.name}: {self.arena_name}")
-            self._window.show(self._image())
+            self._window.show(image)
 
     def _image(self) -> Image:
+        true = self.vehicle.true
         self._view = self._view or TopView(self.robot, self._arena)
-        return self._view.draw(self.vehicle.true, self._time)
+        return self._view.draw(true, self._time)
 
     @property
     def _time(self) -> float:

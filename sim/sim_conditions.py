@@ -6,7 +6,9 @@ This module imports nothing slow: every command that starts a run reads it.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+
+from brakeline.messaging.number_checks import check_numbers
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,12 @@ class NoiseLevels:
     lidar: float = 0.01  # m, each ray
     drift_position: float = 0.001  # m, odometry's drift in a period as the estimator assumes it
     drift_heading: float = 0.0015  # rad, the same for the heading
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "scale", "wheel_scale", "wheel_slip", "gyro", "gyro_bias", "lidar", least=0.0)
+        check_numbers(self, "drift_position", "drift_heading", least=0.0)
+        check_numbers(self, "fix_position", "fix_heading", above=0.0)
+        check_numbers(self, "encoder_ticks", least=1)
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,9 @@ class QuadrotorNoise:
     gyro: float = 0.005  # rad/s, each axis, drawn for each reading
     lidar: float = 0.02  # m, each ray
 
+    def __post_init__(self) -> None:
+        check_numbers(self, *(level.name for level in fields(self)), least=0.0)
+
 
 @dataclass(frozen=True)
 class Wind:
@@ -83,6 +94,11 @@ class Wind:
     direction: float | None = None  # rad from east, where the wind blows to; None: drawn for each vehicle
     gust: float = 0.0  # m/s, standard deviation on each axis, cut off at `GUST_LIMIT` of them
     correlation: float = 1.5  # s, correlation time of the gusts
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "speed", "gust", least=0.0)
+        check_numbers(self, "direction")
+        check_numbers(self, "correlation", above=0.0)
 
     @property
     def calm(self) -> bool:

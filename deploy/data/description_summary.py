@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.messaging.robot import RAMP, Array, Robot
+from brakeline.messaging.robot import HOLD, RAMP, Array, Robot
+
+INFEASIBLE = 2  # scipy's status of a linear program without a solution
 
 
 def full_stop_inputs(robot: Robot) -> Array:
@@ -19,6 +21,20 @@ def nominal_stopping_distance(robot: Robot) -> float:
     """Return the length in m of a full stop of a robot without lag: an order of magnitude, not a bound."""
     speeds = [i for i, label in enumerate(robot.action) if label.endswith("[m/s]") and robot.translates[i]]
     return float(np.linalg.norm(np.abs(full_stop_inputs(robot)[:, speeds]).sum(0))) * robot.period
+
+
+def stands_somewhere(robot: Robot) -> bool:
+    """Return whether a state meets all limits whose speeds and accelerations are zero, but for those that are held."""
+    if not robot.limits:
+        return True
+    from scipy.optimize import linprog  # here: it takes half a second to load
+
+    held = [state for state, rule in zip(robot.follows, robot.stop, strict=True) if rule == HOLD]
+    moves = [label.endswith(("/s]", "/s2]")) and k not in held for k, label in enumerate(robot.state)]
+    rows, most = [limit.weights for limit in robot.limits], [limit.most for limit in robot.limits]
+    bounds = [(0.0, 0.0) if moving else (None, None) for moving in moves]
+    found = linprog(np.zeros(len(moves)), A_ub=rows, b_ub=most, bounds=bounds, method="highs")
+    return int(found.status) != INFEASIBLE
 
 
 def remarks(robot: Robot) -> list[str]:
@@ -34,6 +50,10 @@ def remarks(robot: Robot) -> list[str]:
         (
             no_standing and RAMP in robot.stop,
             "plan.horizon: no period of standing after the ramp: a robot with lag still moves when the plan ends",
+        ),
+        (
+            not stands_somewhere(robot),
+            "limit: no state without speed meets all limits. A plan that ends with standing leaves them.",
         ),
         (bool(free), f"state: no coordinate follows {', '.join(free)}: half-widths are reported for rest only"),
     )

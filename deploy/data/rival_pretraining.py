@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import asdict, dataclass
+from inspect import signature
 
 import numpy as np
 
 from brakeline.deploy.data.recording_origin import VERSION, simulator_changed
 from brakeline.deploy.data.rival_rollouts import Each, SailrConfig, SecasConfig, costs, transitions
+from brakeline.errors import UnknownTask
 from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
 from brakeline.messaging.task import RobotWithTask
@@ -55,10 +57,18 @@ CONFIGS[PSF] = PredictiveConfig
 
 
 def config_for(method: str, robot: RobotWithTask) -> RivalConfig:
-    """Return the configuration with the tuned threshold of this robot (deploy/experiments/experiments.md)."""
+    """Return the configuration with the tuned threshold of this robot (deploy/experiments/experiments.md).
+
+    Raises:
+        UnknownTask: the task's `rivals` have a setting that this method lacks.
+    """
     velocities = method == CBF and barrier_of_velocities(robot)
     config = VelocityBarrierConfig if velocities else CONFIGS[method]
-    return config(**getattr(robot.task.rivals, method))
+    settings, known = getattr(robot.task.rivals, method), signature(config).parameters
+    if unknown := settings.keys() - known:
+        names = ", ".join(sorted(unknown))
+        raise UnknownTask(f"rivals.{method} of the robot's task: no setting {names}, but {', '.join(known)}")
+    return config(**settings)
 
 
 def made_by(model: Pretrained, robot: RobotWithTask, config: RivalConfig) -> bool:

@@ -24,6 +24,7 @@ from brakeline.deploy.experiments.trials import COLUMNS, Column, EpisodeTable, T
 from brakeline.deploy.policy_loading import network_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch
+from brakeline.logs.episode_stats import closest_of
 from brakeline.logs.mcap_container import model_attachment_name
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
@@ -42,7 +43,7 @@ ROWS: dict[str, Column] = {
     "failsafes": Column(lambda step: step.fallback or step.decision == pb.FAILSAFE, count=True),
     "compared": Column(lambda step: step.compared, count=True),
     "violations": Column(lambda step: step.compared and not step.contained, count=True),
-    "closest": Column(lambda step: step.clearance, min, start=math.inf),  # m
+    "closest": Column(closest_of, min, start=math.inf),  # m
 }
 
 

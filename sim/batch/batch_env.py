@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -26,7 +27,7 @@ from brakeline.sim.batch.observation_batch import GroundObservationBatch, Observ
 from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.navigation_env import OBSERVED_LIMIT
+from brakeline.sim.navigation_env import OBSERVED_LIMIT, check_observation, check_options, episode_seed
 from brakeline.sim.sim_conditions import Conditions
 
 Infos = dict[str, Any]
@@ -82,7 +83,10 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
             UnknownRobot, UnknownTask, UnknownName: see `NavigationEnv`.
+            ValueError: there is no robot, or no simulator of this robot has such conditions.
         """
+        if num_envs < 1:
+            raise ValueError(f"a batch has at least one robot, not {num_envs}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
         self.conditions, self.num_envs, self.arena_name = conditions or Conditions(), num_envs, arena
         check_batch(self.robot, arena, self.conditions)
@@ -107,7 +111,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         )
         self._bound = np.asarray(self.robot.measurement_bound)
         self._goal_radius, self._step_limit = kind.goal_radius, kind.step_limit
-        self._arenas = np.empty(num_envs, dtype=object)
+        self._arenas, self._names = np.empty(num_envs, dtype=object), np.full(num_envs, self.robot.name)
         self._seeds, self._steps = np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs, dtype=np.int64)
         self._goals, self._distance = np.zeros((num_envs, self.robot.position_dim)), np.zeros(num_envs)
         self._ended: Flags = np.zeros(num_envs, dtype=bool)
@@ -121,19 +125,42 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         """Begin an episode of every robot, or of those in `options["reset_mask"]`.
 
         options["episode_seeds"] (N,) determines the episodes, as `episode_seed` does for `NavigationEnv`.
+
+        Raises:
+            ValueError: there is no such option, or not a seed or flag for each robot.
         """
         options = options or {}
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), dtype=bool)
-        if self._now is None:
-            mask[:] = True
-        for i, one in enumerate(seeds):
-            if one is not None:
+        check_options(options, "episode_seeds", "reset_mask")
+        rows = self._rows_of(options.get("reset_mask"))
+        seeds, given = self._seeds_of(seed), options.get("episode_seeds")
+        if given is not None:
+            given = [episode_seed(one) for one in self._one_each(given)]
+        for i in rows.tolist():
+            if (one := seeds[i]) is not None:
                 self._generators[i], _ = seeding.np_random(one)
-        rows, given = np.flatnonzero(mask), options.get("episode_seeds")
-        episodes = [self._episode_seeds(i) if given is None else int(given[i]) for i in rows.tolist()]
+        episodes = [self._episode_seeds(i) if given is None else given[i] for i in rows.tolist()]
         self._now = self._join(rows, *self._begin(rows, episodes))
+        check_observation(self.robot, self._now[0].shape[1])
         return self._now
+
+    def _rows_of(self, mask: Any) -> NDArray[np.intp]:
+        """Return the robots of a mask (N,), or all of them without one; the first reset is of all."""
+        flags = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
+        if flags.shape != (self.num_envs,) or flags.dtype != np.bool_:
+            raise ValueError(f"reset_mask must be {self.num_envs} flags, True or False")
+        return np.arange(self.num_envs) if self._now is None else np.flatnonzero(flags)
+
+    def _seeds_of(self, seed: Any) -> Sequence[int | None]:
+        """Return the seed of each robot's generator, as `SyncVectorEnv` does."""
+        if seed is None:
+            return [None] * self.num_envs
+        return [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, Integral) else self._one_each(seed)
+
+    def _one_each(self, seeds: Sequence[Any]) -> Sequence[Any]:
+        """Return seeds of which each robot has one. Raises ValueError."""
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{self.num_envs} robots take so many seeds, not {len(seeds)}")
+        return seeds
 
     def step(self, actions: Array) -> StepBatch:
         self.begin_step(actions)
@@ -174,11 +201,13 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         observations, infos = self._join(rows, self._observe(rows), self._infos(rows, period))
         resets = np.flatnonzero(self._ended) if self.autoreset_mode == AutoresetMode.NEXT_STEP else rows[:0]
         self._ended = terminated | truncated
+        final: Infos = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             resets = np.flatnonzero(self._ended)
-            final = {"final_obs": observations.copy(), "final_info": dict(infos), "_final_obs": self._ended}
-        else:
-            final = {}
+            # The episodes that begin below overwrite the arrays of the obstacles, and of the flags.
+            obstacles = {name: array.copy() for name, array in infos["obstacles"].items()}
+            final |= {"final_obs": observations.copy(), "_final_obs": self._ended.copy()}
+            final |= {"final_info": infos | {"obstacles": obstacles}, "_final_info": self._ended.copy()}
         if len(resets):
             self._now = observations, infos
             episodes = [self._episode_seeds(i) for i in resets.tolist()]
@@ -244,7 +273,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
     def _infos(self, rows: NDArray[np.intp], period: PeriodBatch) -> Infos:
         obstacles, none = self._robots.obstacles, np.zeros(len(rows), dtype=bool)
         return {
-            "robot": self.robot.name,
+            "robot": self._names[rows],
             "state": period.measured,
             "true_state": period.true,
             "outside": self._outside(period),
@@ -256,6 +285,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
             "collision": period.collision,
             **dict.fromkeys(("contact_moving", "contact_standing", "contact_robot"), none),
             "clearance": period.clearance,
+            "closest": period.closest,
             "subsamples": period.subsamples,
             "turned": period.turned,
             "at_goal": self._at_goal(rows, period),

@@ -21,13 +21,20 @@ ADVICE = "use NavigationEnv, or train without --backend batch"
 
 
 def check_vehicles(robot: RobotWithTask, conditions: Conditions) -> None:
-    """Check that many robots of this kind can be simulated at once. Raises NoBatch if they can't."""
+    """Check that many robots of this kind can be simulated at once.
+
+    Raises:
+        NoBatch: they can only be simulated one by one.
+        ValueError: no simulator of this robot has such conditions.
+    """
     if (robot.layout(), robot.task.simulator) not in SIMULATED:
         raise NoBatch(f"{robot.name} with the task {robot.task.name} is not simulated in batches: {ADVICE}")
     if robot.position_dim == 3 and not conditions.wind.calm:
         raise NoBatch(f"a batch of quadrotors flies in calm air (--wind 0 --gust 0): {ADVICE}")
     if robot.position_dim == 3 and {"payload_kg", "weak_motor"} & {*conditions.unusual}:
         raise NoBatch(f"a batch of quadrotors has no payload and no weak motors: {ADVICE}")
+    if robot.position_dim == 3:
+        conditions.check()
 
 
 def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> None:
@@ -36,6 +43,7 @@ def check_batch(robot: RobotWithTask, arena: str, conditions: Conditions) -> Non
     Raises:
         NoBatch: this robot, arena or perception can only be simulated one by one.
         UnknownName: the robot has no arena of this name.
+        ValueError: no simulator of this robot has such conditions.
     """
     kind = arena_kind(robot, arena)
     check_vehicles(robot, conditions)

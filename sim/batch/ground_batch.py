@@ -146,7 +146,8 @@ class GroundBatch(VehicleBatch):
             rows, motion.coordinates[..., WHEELS], rates, self.true[rows, :3]
         )
         self.measured[rows] = measured
-        return PeriodBatch(measured, self.true[rows], motion.collision, motion.clearance[:, -1], path, turned)
+        closest, clearance = motion.clearance.min(axis=1), motion.clearance[:, -1]
+        return PeriodBatch(measured, self.true[rows], motion.collision, closest, clearance, path, turned)
 
     def _floor_physics(self, arena: Arena) -> FloorPhysics:
         """Compile the robot in an arena, under the conditions."""

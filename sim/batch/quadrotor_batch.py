@@ -48,7 +48,7 @@ class FlightBatch:
     path: Array  # (rows, T, 3): positions at the ticks [m]
     accelerations: Array  # (rows, 3): at the end, means over the last physics step [m/s²]
     collision: NDArray[np.bool_]  # (rows,): whether the quadrotor touched an obstacle in some physics step
-    clearance: Array  # (rows,): m, from the body to the nearest obstacle at the end
+    clearance: Array  # (rows, T): m, from the body to the nearest obstacle at the ticks
 
 
 class QuadrotorBatch(VehicleBatch):
@@ -112,18 +112,19 @@ class QuadrotorBatch(VehicleBatch):
             )
             clearance[i] = self.obstacles.clearance(rows[i : i + 1], path[i : i + 1])[0] - QUADROTOR.footprint
         self._controllers[rows], self._coordinates[rows] = controllers, coordinates
-        return FlightBatch(path, accelerations, collision, clearance[:, -1])
+        return FlightBatch(path, accelerations, collision, clearance)
 
     def finish(self, rows: Rows, motion: FlightBatch) -> PeriodBatch:
         before = self.measured[rows, None, :3]
         self._measure(rows, motion)
         path = self._estimator.path(rows, motion.path[:, TICKS // SAMPLES - 1 :: TICKS // SAMPLES]) - before
         states = self.measured[rows], self.true[rows]
-        return PeriodBatch(*states, motion.collision, motion.clearance, path, np.zeros(len(rows)))
+        closest, clearance = motion.clearance.min(axis=1), motion.clearance[:, -1]
+        return PeriodBatch(*states, motion.collision, closest, clearance, path, np.zeros(len(rows)))
 
     def _measure(self, rows: Rows, motion: FlightBatch) -> None:
         coordinates = self._coordinates[rows]
-        self._clearance[rows] = motion.clearance
+        self._clearance[rows] = motion.clearance[:, -1]
         self.true[rows] = np.column_stack([coordinates[:, :3], coordinates[:, 7:10], motion.accelerations])
         self.measured[rows] = self._estimator.read(rows, coordinates, motion.accelerations)
 

@@ -24,6 +24,7 @@ class PeriodBatch:
     measured: Array  # (rows, n)
     true: Array  # (rows, n)
     collision: NDArray[np.bool_]  # (rows,)
+    closest: Array  # (rows,) m
     clearance: Array  # (rows,) m
     subsamples: Array  # (rows, S, d) m
     turned: Array  # (rows,) rad
@@ -56,7 +57,8 @@ class VehicleBatch(ABC):
         """Return the reports of a period in which nothing happened, at the present states."""
         k, states = len(rows), (self.measured[rows], self.true[rows])
         path, still = np.zeros((k, self.samples, self.robot.position_dim)), np.zeros(k, dtype=bool)
-        return PeriodBatch(*states, still, self._clearance[rows], path, np.zeros(k))
+        clearance = self._clearance[rows]
+        return PeriodBatch(*states, still, clearance, clearance, path, np.zeros(k))
 
     @abstractmethod
     def set_input(self, rows: Rows, inputs: Array) -> None:

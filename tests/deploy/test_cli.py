@@ -387,6 +387,10 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
     new = path.read_text()
     path.write_text(new.replace("sight = 3.0", "sight = 0.2"))
     assert any(remark.startswith("sight") for remark in figures("robot", "check", path)["remarks"])
+    limit = '\n[[limit]]\nname = "{}"\nweights = {{ speed = {} }}\nmost = {}\n'
+    for text, told in ((limit.format("slow", 1.0, 0.3), False), (limit.format("fast", -1.0, -0.1), True)):
+        path.write_text(new + text)
+        assert told == any(remark.startswith("limit") for remark in figures("robot", "check", path)["remarks"])
     path.write_text(new.replace("brake = 3", "brakes = 3").replace('"m/s"', '"km/h"', 1))
     status, _, err = command("robot", "check", path)
     assert status == 1 and "plan.brakes: unknown; did you mean 'brake'?" in err and "state.speed.unit" in err

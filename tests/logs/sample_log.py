@@ -81,6 +81,8 @@ class Writer:
             step.for_clearance = number % 2 == 0
         step.reward, step.penalty = chance.gauss(0.0, 1.0), chance.random()
         step.speed, step.clearance = chance.random(), chance.expovariate(3.0) + 0.01
+        if number % 2:  # the others are as in a log from before
+            step.closest = 0.999 * step.clearance
         step.decide_ms, step.propose_ms = (0.0 if fallback else chance.lognormvariate(-1.0, 0.5)), 0.1
         step.outside, step.compared = chance.random() < 0.01, chance.random() < 0.9
         step.contained = step.compared and chance.random() < 0.99
@@ -212,6 +214,11 @@ def percentiles(values: list[float]) -> dict[str, float] | None:
     }  # fmt: skip
 
 
+def least_clearance(step: pb.Step) -> float:
+    """Return the least clearance [m] in a step's period; in a log from before, that at the period's end."""
+    return float(step.closest if step.HasField("closest") else step.clearance)
+
+
 def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
     """Compute the expected figures of `analyse` from all messages."""
     every, messages = messages, once(messages)
@@ -253,7 +260,7 @@ def counted(messages: list[tuple[str, Any]]) -> dict[str, Any]:
         "containment": {
             "steps": sum(s.compared for s in steps), "violations": sum(s.compared and not s.contained for s in steps)
         },
-        "closest_approach": min(s.clearance for s in steps),
+        "closest_approach": min(least_clearance(s) for s in steps),
         "clearance": percentiles([s.clearance for s in steps]),
         "decision_ms": _short(whole) | {name: _short(values) for name, values in inside.items()},
         "round_trip_ms": _short([e.round_trip_ms for e in answered]),

@@ -17,7 +17,19 @@ from brakeline.logs.process_timeline import MOST_BINS as MOST_TIMES
 from brakeline.logs.process_timeline import ProcessTimeline
 from brakeline.logs.reader import Log, by_run, find
 from brakeline.messaging import brakeline_pb2 as pb
-from tests.logs.sample_log import ABOUT, BEGIN, SECOND, Writer, agree, counted, decoded, mixed, once, printed
+from tests.logs.sample_log import (
+    ABOUT,
+    BEGIN,
+    SECOND,
+    Writer,
+    agree,
+    counted,
+    decoded,
+    least_clearance,
+    mixed,
+    once,
+    printed,
+)
 
 Two = tuple[list[dict[str, Any]], dict[str, Any]]
 Messages = list[tuple[str, Any]]
@@ -67,7 +79,7 @@ def test_training_rates_are_those_of_the_steps_in_each_bin(figures: dict[str, An
         assert row["adjusted"] == pytest.approx(sum(s.decision == 2 and not s.fallback for s in own) / len(own))
         assert row["failsafes"] == pytest.approx(sum(s.fallback or s.decision == 3 for s in own) / len(own))
         assert row["episodes"] == sum(s.terminated or s.truncated for s in own)
-        assert row["closest"] == min(s.clearance for s in own)
+        assert row["closest"] == min(map(least_clearance, own))
     assert training["bins"][-1]["until"] == len(steps)
     ended = [step for step in steps if step.terminated or step.truncated]
     last = training["last"]
@@ -187,7 +199,7 @@ def test_the_table_of_an_episode_has_the_recorded_values(
         assert (row["reward"], row["clearance"], row["action"]) == (step.reward, step.clearance, list(step.action))
         if step.step in asked and not step.fallback:
             assert row["decide_ms"] == asked[step.step].reply.decision.time_ms
-    assert detail["closest"] == min(step.clearance for step in steps) and detail["start"] == [0.0, 0.0]
+    assert detail["closest"] == min(map(least_clearance, steps)) and detail["start"] == [0.0, 0.0]
     assert "actor-1, episode 3" in printed(show_episode(detail), 200)
 
 
@@ -197,7 +209,7 @@ def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Mes
     for key, step in once(messages):
         if key.startswith("step/ground"):
             place = key.rsplit("/", 1)[1], step.header.run, step.episode
-            closest[place] = min(closest.get(place, 1e9), step.clearance)
+            closest[place] = min(closest.get(place, 1e9), least_clearance(step))
     gallery = pictures["galleries"]["ground"]
     by_order = {episode["order"]: episode for episode in gallery["episodes"]}
     assert [by_order[order]["closest"] for order in gallery["near"]] == sorted(closest.values())[:8]

@@ -1,5 +1,6 @@
 """Range images, and what of space they show to be free: no point of anything in random scenes is in it."""
 
+import copy
 import math
 from dataclasses import fields, replace
 
@@ -12,7 +13,7 @@ from brakeline.errors import BadScan
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.range_image import RangeImage, directions
-from brakeline.messaging.scan import Scan
+from brakeline.messaging.scan import BeamTracks, Scan
 from brakeline.messaging.sensor_messages import image_of, measurement_in, set_measurement
 from brakeline.safety.perception.displayed_map import map_for_display
 from brakeline.safety.perception.image_coverage import patch_free_ranges
@@ -154,6 +155,18 @@ def test_an_image_crosses_the_wire_and_its_ranges_never_grow():
     assert [getattr(got, name) for name in names] == [getattr(sent, name) for name in names]
     assert np.allclose(got.rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     assert np.allclose(got.sensor(), [1.0, 2.1, 3.2])
+
+
+def test_scans_and_images_are_equal_if_all_their_values_are():
+    tracks = BeamTracks(np.zeros(4, dtype=np.uint8), np.ones((2, 4)))
+    scan = Scan(np.array([1.0, 2.0, 0.0, np.nan]), np.arange(4.0), (0.0, 0.0, 0.0), tracks=tracks)
+    image = RangeImage(np.full((45, 90), 20.0), (0.0, 0.0, 1.0))
+    for one in (scan, image):
+        same = copy.deepcopy(one)
+        assert one == same and hash(one) == hash(same)
+        assert one != replace(one, age=0.1) and one != replace(one, ranges=0.5 * one.ranges) and one != "scan"
+    assert scan != image and scan != replace(scan, tracks=None)
+    assert scan != replace(scan, tracks=replace(tracks, motions=np.zeros((2, 4))))
 
 
 def test_two_at_once_and_half_a_beam_are_refused():

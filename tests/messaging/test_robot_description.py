@@ -82,6 +82,8 @@ def test_what_a_description_says_is_what_the_robot_has():
         (changed("periods", 0.1), "periods", "did you mean 'period'"),
         (changed("name", "a/b"), "name", "letters"),
         (changed("name", "car-late"), "name", "-late"),
+        (changed("name", ".."), "name", "letters"),
+        (changed("name", "."), "name", "letters"),
         (changed("sight", math.inf), "sight", "finite"),
         (changed("state", "x", "unit", "cm"), "state.x.unit", "SI"),
         (changed("state", "x", "unit", "rad"), "state.x.unit", "position is in m"),
@@ -111,6 +113,13 @@ def test_what_a_description_says_is_what_the_robot_has():
         (changed("body", 0, "at", [0.0, 0.0, 0.0]), "body.0.at", "the position has 2"),
         (changed("limit", 0, "weights", {"z": 1.0}), "limit.0.weights", "names of state coordinates"),
         (changed("limit", 0, "weights", {}), "limit.0.weights", "names of state coordinates"),
+        (changed("limit", 2 * CAR["limit"]), "limit.1.name", "another limit is called 'keep in'"),
+        (changed("body", 0, "radius", True), "body.0.radius", "a number, not True"),
+        (changed("body", 0, "at", [0.0, False]), "body.0.at", "a number, not False"),
+        (changed("state", "x", "error", True), "state.x.error", "a number, not True"),
+        (changed("input", "speed", "high", True), "input.speed.high", "a number, not True"),
+        (changed("plan", "free", True), "plan.free", "a number, not True"),
+        (changed("period", True), "period", "a number, not True"),
     ],
 )
 def test_a_mistake_is_told_by_its_field(said, field, word):
@@ -202,6 +211,49 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
         (tmp_path / "a.task.toml").write_text(text.replace("[reward]", f"[reward]\ncorrection_penalty = {penalty}"))
         with pytest.raises(UnknownTask, match="a penalty is finite and not negative"):
             read_task(tmp_path / "a.task.toml")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("progress = 20.0", "progress = nan", r"reward: progress = nan is not finite"),
+        ("progress = 20.0", "collision = 100.0", r"reward: collision = 100\.0 is not 0 or less"),
+        ("step_limit = 300", "step_limit = 0", r"arenas\.default: step_limit = 0 is not 1 or more"),
+        ("step_limit = 300", "step_limit = 300\ngoal_radius = nan", r"arenas\.default: goal_radius = nan is not fin"),
+        ("step_limit = 300", "step_limit = 300\ngoal_radius = -1", r"goal_radius = -1\.0 is not above 0"),
+        ("step_limit = 300", "step_limit = 300\nstart_clearance = -0.2", r"start_clearance = -0\.2 is not 0 or more"),
+        ("count = [3, 4]", "count = [4, 3]", r"arenas\.walkers\.movers: count = \[4, 3\] has the largest number first"),
+        ("half_width = 2.5", "half_width = nan", r"half_width = nan is not finite"),
+        ("radius = [0.1, 0.2]", "radius = [0.2, 0.1]", r"radius = \[0\.2, 0\.1\] has the largest number first"),
+        ("radius = [0.1, 0.2]", "radius = [0.0, 0.1]", r"radius = \[0\.0, 0\.1\] is not above 0"),
+        ("cylinders = [3, 5]", "cylinders = [5, 3]", r"cylinders = \[5, 3\] has the largest number first"),
+        ("cylinders = [3, 5]", "cylinders = [-3, 5]", r"cylinders = \[-3, 5\] is not 0 or more"),
+        ("goal_distance = 1.5", "goal_distance = -1.5", r"goal_distance = -1\.5 is not above 0"),
+        ("range = 3.5", "range = 0", r"lidar: range = 0\.0 is not above 0"),
+        ("range = 3.5", "range = nan", r"lidar: range = nan is not finite"),
+        ("fan = 18", "fan = 18\nazimuths = 4\nelevations = 3", r"lidar: .*fan = 18.*azimuths = 4"),
+        ("fan = 18", "azimuths = 4", r"lidar: .*azimuths = 4.*elevations = 0"),
+        ("trajectories = 200", "at_once = 0", r"at_once = 0 is not 1 or more"),
+        ("trajectories = 200", "trajectories = -1", r"trajectories = -1 is not 1 or more"),
+        ("steps = 60_000", "steps = -1", r"steps = -1 is not 1 or more"),
+        ("threshold = 0.05", "threshold = inf", r"rivals: threshold = inf is not finite"),
+        ("margins = [0.02,", "margins = [nan,", r"rivals: margins = \[nan, .* is not finite"),
+        ('dense]\nlike = "default"', 'dense]\nlike = "defualt"', r"arenas\.dense: no arena is called 'defualt'"),
+        ('dense]\nlike = "default"', 'dense]\nlike = "dense"', r"arenas\.dense: it is like itself"),
+    ],
+)
+def test_a_task_names_the_key_and_the_value_that_make_no_sense(tmp_path, before, after, said):
+    text = (ROBOTS_FOLDER / "ground.task.toml").read_text()
+    assert before in text
+    (tmp_path / "a.task.toml").write_text(text.replace(before, after, 1))
+    with pytest.raises(UnknownTask, match=said):
+        read_task(tmp_path / "a.task.toml")
+
+
+def test_a_task_cannot_be_like_itself(tmp_path):
+    (tmp_path / "a.task.toml").write_text('like = "a"')
+    with pytest.raises(UnknownTask, match="like itself"):
+        read_task(tmp_path / "a.task.toml")
 
 
 def test_a_robot_that_stops_by_feedback_brakes_by_what_is_measured():

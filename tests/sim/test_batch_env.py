@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList
 
 from brakeline.errors import BadInput, NoBatch, UnknownName
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -18,7 +19,7 @@ from tests.robots import GROUND, QUADROTOR
 
 COMPARED = (
     *("state", "true_state", "outside", "input_in_force", "goal", "time", "collision", "contact_moving", "clearance"),
-    *("subsamples", "turned", "at_goal", "speed", "episode_seed"),
+    *("closest", "subsamples", "turned", "at_goal", "speed", "episode_seed"),
 )
 SAME = 1e-9  # rounding
 
@@ -27,7 +28,7 @@ def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
     """Compare the infos of one robot."""
     for name in COMPARED:
         assert np.abs(np.asarray(batch[name][row], float) - single[name]).max() <= SAME, name
-    assert batch["arena"][row] == single["arena"] and batch["robot"] == single["robot"]
+    assert batch["arena"][row] == single["arena"] and batch["robot"][row] == single["robot"]
 
 
 @pytest.mark.parametrize(
@@ -82,8 +83,11 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     ended = 0
     inputs = np.tile(np.float32([0.25, 0.0]), (size, 1))
     for _ in range(40):
-        (seen, *mine, infos), (theirs, *other, _) = batch.step(inputs), peer.step(inputs)
+        (seen, *mine, infos), (theirs, *other, others) = batch.step(inputs), peer.step(inputs)
         ends = mine[1] | mine[2]
+        if mode == AutoresetMode.SAME_STEP and ends.any():
+            for name in ("_final_obs", "_final_info"):
+                assert np.array_equal(infos[name], others[name])
         for a, b in zip(mine, other, strict=True):
             assert np.allclose(a, b, atol=0.5 * infos["collision"].any() + SAME)
         touched = infos["collision"] if mode == AutoresetMode.NEXT_STEP else np.zeros(size, dtype=bool)
@@ -95,6 +99,60 @@ def test_autoreset_modes_are_those_of_gymnasium(mode: AutoresetMode) -> None:
     batch.close()
     peer.close()
     assert ended > 3
+
+
+def test_a_reset_takes_the_seeds_that_gymnasium_takes() -> None:
+    batch = BatchNavigationEnv(GROUND, 3, autoreset_mode=AutoresetMode.DISABLED)
+    peer = SyncVectorEnv([lambda: NavigationEnv(GROUND)] * 3, autoreset_mode=AutoresetMode.DISABLED)
+    for env in (batch, peer):
+        for seeds in ([], [1], [1, 2, 3, 4]):
+            with pytest.raises(ValueError, match=f"num_envs=3|3 robots.*not {len(seeds)}"):
+                env.reset(seed=seeds)
+        env.reset(seed=0)
+        env.reset(seed=[50, 60, 70], options={"reset_mask": np.array([True, False, False])})
+    assert np.array_equal(batch.reset()[1]["episode_seed"], peer.reset()[1]["episode_seed"])
+    before = batch.reset(seed=np.int64(4))[1]["episode_seed"]
+    for options, said in (
+        ({"arena": "dense"}, "no option 'arena'"),
+        ({"episode_seed": 5}, "no option 'episode_seed'; there are: episode_seeds, reset_mask"),
+        ({"episode_seeds": [1, 2]}, "3 robots .* not 2"),
+        ({"episode_seeds": [1, 2, 3.5]}, "not 3.5"),
+        ({"reset_mask": [True]}, "3 flags"),
+        ({"reset_mask": [0, 2, 1]}, "3 flags"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            batch.reset(seed=9, options=options)
+    assert np.array_equal(batch.reset(seed=4)[1]["episode_seed"], before)
+    for env in (batch, peer):
+        env.close()
+    with pytest.raises(ValueError, match="at least one robot, not 0"):
+        BatchNavigationEnv(GROUND, 0)
+
+
+def test_gymnasium_turns_the_infos_into_a_list() -> None:
+    batch = BatchNavigationEnv(GROUND, 3, "dense")
+    env, ended = DictInfoToList(batch), 0
+    _, infos = env.reset(seed=1)
+    assert [info["robot"] for info in infos] == ["ground"] * 3
+    while ended < 2:
+        *_, terminated, truncated, infos = env.step(np.tile([0.25, 0.0], (3, 1)))
+        for end, info in zip(terminated | truncated, infos, strict=True):
+            assert ("final_info" in info) == ("final_obs" in info) == end
+            ended += bool(end)
+    batch.close()
+
+
+def test_a_final_info_has_the_obstacles_of_its_own_arena() -> None:
+    batch, ended = BatchNavigationEnv(GROUND, 3, "dense"), 0
+    batch.reset(seed=1)
+    while ended < 4:
+        _, _, terminated, truncated, infos = batch.step(np.tile([0.25, 0.0], (3, 1)))
+        for row in np.flatnonzero(terminated | truncated):
+            arena = infos["final_info"]["arena"][row]
+            center, count = (infos["final_info"]["obstacles"][name][row] for name in ("center", "count"))
+            assert count == len(arena.obstacles) and np.array_equal(center[:count], arena.shapes.center)
+            ended += 1
+    batch.close()
 
 
 def test_noise_is_that_of_each_generator() -> None:

@@ -4,6 +4,7 @@ Observations come from the measured state, the lidar's position from the true on
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,13 +15,14 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from brakeline.deploy.vehicle_factory import environment
-from brakeline.errors import BadWeights, UnknownRobot, UnknownTask
+from brakeline.errors import BadWeights, UnknownName, UnknownRobot, UnknownTask
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
-from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task
+from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task, with_task
 from brakeline.sim.arena import same_room
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.navigation_env import NavigationEnv, Reward
 from brakeline.sim.observations import GroundObservation, QuadrotorObservation, TrackingObservation
@@ -28,7 +30,7 @@ from brakeline.sim.quadrotor import SAMPLES, Quadrotor
 from brakeline.sim.registration import ENVIRONMENTS, register
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
-from brakeline.sim.sim_conditions import Conditions, QuadrotorNoise
+from brakeline.sim.sim_conditions import Conditions, Perception, QuadrotorNoise
 from brakeline.sim.top_view import GOAL, OBSTACLE, ROBOT
 from brakeline.sim.traffic import Crowd
 from tests.arenas import staged_arena
@@ -37,7 +39,7 @@ from tests.robots import GROUND, QUADROTOR
 INFO_KEYS = {
     *("robot", "state", "true_state", "outside", "input_in_force", "obstacles", "arena", "goal", "time"),
     *("collision", "contact_moving", "contact_robot", "contact_standing", "at_goal"),
-    *("clearance", "speed", "subsamples", "turned", "episode_seed"),
+    *("clearance", "closest", "speed", "subsamples", "turned", "episode_seed"),
 }
 ENVS = {
     "ground": partial(NavigationEnv, GROUND),
@@ -63,10 +65,19 @@ def observed(env: NavigationEnv, policy: str, seed: int) -> np.ndarray:
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")  # actions are physical: speed is not negative
 @pytest.mark.parametrize(
-    ("robot", "arena"), [("ground", "dense"), ("ground", "walkers"), ("ground", "crossing"), ("quadrotor", "traffic")]
+    ("robot", "arena", "perception"),
+    [
+        ("ground", "dense", "map"),
+        ("ground", "walkers", "map"),
+        ("ground", "walkers", "scan"),
+        ("ground", "crossing", "map"),
+        ("quadrotor", "traffic", "map"),
+        ("quadrotor", "default", "scan"),
+    ],
 )
-def test_gymnasiums_checker_accepts_the_environment(robot: str, arena: str) -> None:
-    check_env(ENVS[robot](arena=arena), skip_render_check=True)
+def test_gymnasiums_checker_accepts_the_environment(robot: str, arena: str, perception: str) -> None:
+    conditions = Conditions(perception=Perception(perception))
+    check_env(ENVS[robot](arena=arena, conditions=conditions), skip_render_check=True)
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space.*")
@@ -89,11 +100,18 @@ def test_an_environment_takes_a_robot_by_its_name() -> None:
         NavigationEnv("grond")
     with pytest.raises(ValueError, match="render_mode is None, 'rgb_array' or 'human', not 'ansi'"):
         NavigationEnv("ground", render_mode="ansi")
+    with pytest.raises(UnknownName, match="no arena is called 'moon'"):
+        NavigationEnv("ground", "moon")
+    for noise in (np.nan, -1.0):
+        with pytest.raises(ValueError, match=f"lidar_noise = {noise} is not"):
+            NavigationEnv("ground", lidar_noise=noise)
 
 
 @each_robot
 def test_the_image_shows_obstacles_the_goal_and_the_robot_from_above(make: Make) -> None:
     env = make(render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
     _, info = env.reset(options={"episode_seed": 1})
     before = env.render()
     assert before.dtype == np.uint8 and before.shape == (360, 360, 3)
@@ -134,6 +152,15 @@ def test_a_reset_can_change_the_arena_and_its_seed_determines_the_sequence_of_ep
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
     assert env.reset(options={"arena": "open"})[1]["arena"].name == env.reset()[1]["arena"].name == "open"
+    for options, said in (
+        ({"arena": "moon"}, "no arena is called 'moon'"),
+        ({"episode_seed": 2.7}, "an episode's seed is an integer, 0 or more, not 2.7"),
+        ({"episode_seed": -1}, "not -1"),
+        ({"episode": 5}, "no option 'episode'; there are: arena, episode_seed"),
+    ):
+        with pytest.raises((ValueError, UnknownName), match=said):
+            env.reset(options=options)
+        assert env.reset()[1]["arena"].name == "open", "what is refused changes nothing"
     seeds = [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"], env.reset()[1]["episode_seed"]]
     assert len(set(seeds)) == 3
     assert [env.reset(seed=3)[1]["episode_seed"], env.reset()[1]["episode_seed"]] == seeds[:2]
@@ -340,6 +367,18 @@ def test_robots_of_a_fleet_are_tracks_to_each_other(tracking) -> None:
     assert nearest[3] > 0.2, "the other robot drives"
     seen = sum(np.hypot(*(other[:2] - own[:2])) < 3.5 for other in others)
     assert [bool(named[f"track {i} near·ahead"]) for i in (1, 2, 3)] == [i <= seen for i in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("names", [GROUND.task.observation[1:], (*GROUND.task.observation, "extra")])
+def test_a_task_that_names_more_or_less_than_is_observed_is_refused(names: tuple[str, ...]) -> None:
+    task = replace(GROUND.task, observation=names)
+    said = f"observed are 26 numbers, but the task names {18 + len(names)}"
+    with pytest.raises(UnknownTask, match=said):
+        NavigationEnv(with_task(GROUND, task)).reset(seed=0)
+    batch = BatchNavigationEnv(with_task(GROUND, task), 2)
+    with pytest.raises(UnknownTask, match=said):
+        batch.reset(seed=0)
+    batch.close()
 
 
 def test_another_task_of_a_robot_is_read_by_its_name(tracking) -> None:

@@ -1,5 +1,6 @@
 """No simulator ignores a condition in silence."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from brakeline.deploy import cli
 from brakeline.deploy.run.autopilot_run import AutopilotSettings, vehicle
 from brakeline.deploy.run.launcher import prepare
 from brakeline.deploy.vehicle_factory import empty_arena, vehicle_in_empty_arena
-from brakeline.sim.sim_conditions import Conditions, ProcessNoise, QuadrotorNoise, Wind
+from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels, ProcessNoise, QuadrotorNoise, Wind
 from tests.robots import GROUND, QUADROTOR
 
 IN_WIND = Conditions(wind=Wind(speed=3.0))
@@ -27,6 +29,9 @@ IN_WIND = Conditions(wind=Wind(speed=3.0))
 def test_a_condition_that_a_simulator_does_not_have_is_refused(robot, conditions, words) -> None:
     with pytest.raises(ValueError, match=words):
         vehicle_in_empty_arena(robot, np.random.default_rng(0), conditions)
+    if not robot.late:
+        with pytest.raises(ValueError, match=words):
+            BatchNavigationEnv(robot, 2, conditions=conditions)
 
 
 @pytest.mark.parametrize("words", ["evaluate ground --episodes 1", "train ground --steps 100", "collect ground"])
@@ -41,6 +46,34 @@ def test_a_command_refuses_it_before_it_begins(words, capsys, tmp_path, monkeypa
 def test_a_condition_that_cannot_be_is_refused(name, value) -> None:
     with pytest.raises(ValueError, match=f"not {value:g}"):
         Conditions(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "said"),
+    [
+        (NoiseLevels, "scale", math.nan, "scale = nan is not finite"),
+        (NoiseLevels, "scale", -1.0, "scale = -1.0 is not 0 or more"),
+        (NoiseLevels, "lidar", math.inf, "lidar = inf is not finite"),
+        (NoiseLevels, "encoder_ticks", 0, "encoder_ticks = 0 is not 1 or more"),
+        (NoiseLevels, "fix_position", 0.0, "fix_position = 0.0 is not above 0"),
+        (QuadrotorNoise, "scale", math.nan, "scale = nan is not finite"),
+        (QuadrotorNoise, "gyro", -0.1, "gyro = -0.1 is not 0 or more"),
+        (Wind, "speed", math.nan, "speed = nan is not finite"),
+        (Wind, "speed", -2.0, "speed = -2.0 is not 0 or more"),
+        (Wind, "gust", -1.0, "gust = -1.0 is not 0 or more"),
+        (Wind, "direction", math.inf, "direction = inf is not finite"),
+        (Wind, "correlation", 0.0, "correlation = 0.0 is not above 0"),
+    ],
+)
+def test_noise_and_wind_that_cannot_be_are_refused(kind, name, value, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize("words", ["quadrotor --wind nan", "quadrotor --noise nan", "ground --noise -1"])
+def test_a_command_says_which_value_cannot_be(words, capsys) -> None:
+    assert cli.main(["evaluate", *words.split(), "--episodes", "1"]) == 1
+    assert f"= {float(words.split()[-1])} is not" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("robot", [GROUND, QUADROTOR], ids=lambda robot: robot.kind)

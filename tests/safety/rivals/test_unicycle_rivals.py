@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.rival_pretraining import BarrierConfig, PredictiveConfig, config_for, made_by, pretrain
-from brakeline.errors import BadModel, BadRequest
+from brakeline.errors import BadModel, BadRequest, UnknownTask
 from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.task import Rivals, with_task
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE
 from brakeline.safety.methods import decode, ready
 from brakeline.safety.model.model_config import CBF, PSF
@@ -95,6 +96,12 @@ def test_what_they_cannot_decide_is_refused_or_braked(method):
         type(method)(replace(method.model, settings={"margin": 0.0, "rate": 1.0}))
     with pytest.raises(BadModel, match="speed and turn rate"):
         type(method)(replace(method.model, robot=replace(GROUND, action_slew=(0.1, 0.1), late=True)))
+
+
+def test_a_setting_of_a_task_that_a_rival_lacks_is_refused():
+    task = replace(GROUND.task, rivals=Rivals(cbf={"ratte": 2.0}))
+    with pytest.raises(UnknownTask, match=r"rivals\.cbf .*no setting ratte, but ahead, rate"):
+        config_for(CBF, with_task(GROUND, task))
 
 
 @pytest.mark.parametrize("name", [CBF, PSF])
