@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from brakeline.errors import BadStep, CheckpointError, DamagedPart
+from brakeline.errors import BadStep, CheckpointError, DamagedPart, Diverged
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
@@ -219,11 +219,26 @@ class Learner:
         return new >= self.config.publish_every
 
     def publish(self) -> pb.Weights:
-        """Return the present weights as a new version, which `weights` and `flow` give from now on."""
+        """Return the present weights as a new version, which `weights` and `flow` give from now on.
+
+        Raises:
+            Diverged: they are not finite. The last version stays.
+        """
+        self._check_finite()
         self._version += 1
         self._published_updates = self._td3.updates
         self._encode()
         return self._weights
+
+    def _check_finite(self) -> None:
+        """Raise Diverged if the training has diverged."""
+        if not self._td3.finite(self._batch):
+            td3 = self.config.td3
+            raise Diverged(
+                f"the training diverged by update {self.updates}, step {self.steps}: weights or losses are not finite. "
+                "The last checkpoint and the last policy stay as they are. Train anew with lower learning rates "
+                f"(now --learner.td3.critic-rate {td3.critic_rate:g} --learner.td3.actor-rate {td3.actor_rate:g})"
+            )
 
     def _encode(self) -> None:
         noise = self.config.td3.exploration_noise
@@ -311,7 +326,9 @@ class Learner:
 
         Raises:
             CheckpointError: the checkpoint could not be written; the previous one is unchanged.
+            Diverged: the weights are not finite; the previous checkpoint is unchanged.
         """
+        self._check_finite()
         saved_before, self._saved_at = self._saved_at, self.steps
         parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}
         try:
@@ -334,6 +351,8 @@ class Learner:
                 restore(states[name])
             except Exception as error:  # of another version, for instance
                 raise DamagedPart(name, root, f"damaged: {error}") from error
+        if not self._td3.finite(self._batch):
+            raise DamagedPart("td3", root, "not finite: an earlier version saved it after the training diverged")
         self._td3.cost_weight = 0.0 if self._multiplier is None else self._multiplier.value
         self._weigh_penalties()
         self._encode()

@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from brakeline.errors import CheckpointError, DamagedPart
+from brakeline.errors import CheckpointError, DamagedPart, Diverged
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
@@ -214,6 +214,32 @@ def test_restore_refuses_what_is_not_this_run_and_names_a_part_of_another_shape(
     with pytest.raises(DamagedPart) as caught:
         other.restore(tmp_path)
     assert caught.value.part == "replay"
+
+
+def test_a_diverged_training_keeps_its_last_checkpoint_and_its_last_weights(tmp_path):
+    config = replace(CONFIG, td3=replace(CONFIG.td3, critic_rate=1e18, actor_rate=1e18))
+    learner, actor = started(config)
+    run(learner, actor, 2)
+    assert learner.warming_up
+    saved = learner.save(tmp_path)
+    with pytest.raises(Diverged, match="lower learning rates"):
+        run(learner, actor)
+    with pytest.raises(Diverged):
+        learner.save(tmp_path)
+    policy_weights.decode(learner.weights().file, TOY)  # which refuses numbers that are not finite
+    resumed = Learner(TOY, config)
+    resumed.restore(tmp_path)
+    assert resumed.steps == 40 and [path.name for path in tmp_path.glob("0*")] == [saved.name]
+
+
+def test_a_checkpoint_of_a_diverged_training_is_refused(tmp_path, monkeypatch):
+    learner, actor = started()
+    run(learner, actor, 4)
+    learner._td3.critics.parameters[3] = float("inf")
+    monkeypatch.setattr(learner, "_check_finite", lambda: None)  # as in versions before there was this check
+    learner.save(tmp_path)
+    with pytest.raises(DamagedPart, match="not finite"):
+        Learner(TOY, CONFIG).restore(tmp_path)
 
 
 def test_figures():
