@@ -81,5 +81,5 @@ class Diverging(SupervisedProcess):
 
 def test_a_process_that_a_restart_does_not_help_ends_the_run_at_once_with_its_own_words(clock, tmp_path) -> None:
     child = Diverging(ProcessSpec("learner", "learner", "ground"), tmp_path)
-    with pytest.raises(LaunchError, match="^learner: Diverged: lower the learning rates; see "):
+    with pytest.raises(LaunchError, match=r"^learner: Diverged: lower the learning rates; see "):
         lives(child, clock, 0.5, 2.0)
