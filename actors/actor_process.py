@@ -72,9 +72,7 @@ class ActorSettings:
     def __post_init__(self) -> None:
         check_penalty(self.penalty)
         if not 1 <= self.robots <= MAX_REQUESTS:
-            raise ValueError(
-                f"an actor process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more processes"
-            )
+            raise ValueError(f"a process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more of them")
 
 
 FOR_GOOD = f"{Refused.__name__}: {BadRequest.__name__}"  # begin of a failure that no repetition of a question mends

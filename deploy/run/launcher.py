@@ -13,6 +13,7 @@ from typing import Any
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
+from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed_run
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.deploy.run.verdict import LatestEpisodes
@@ -140,11 +141,15 @@ class Launcher:
             show: is called several times a second with this launcher.
 
         Raises:
-            LaunchError: a process failed several times in a row; the launcher has ended the others.
+            LaunchError: the run is running already. Or a process failed several times in a row, or cannot go on; the
+                launcher has ended the others.
             Unreachable: the launcher can't listen on the endpoint.
         """
         failure: LaunchError | None = None
-        with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
+        with (
+            only_launcher(self.folder),
+            Process(self.bus, "launcher", stderr=False, reserved=True) as process,
+        ):
             self._rejected = process.bus.rejected
             self._claim_folder()
             for topic in RECORDED:

@@ -18,8 +18,9 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.display import summary
 from brakeline.deploy.run.launcher import Launcher, prepare
-from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
+from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
+from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.errors import DamagedPart, LaunchError
 from brakeline.learner import checkpoint
@@ -132,6 +133,27 @@ def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path)
     with pytest.raises(DamagedPart, match="latest"):
         prepare(config, tmp_path, resume=True)
     prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
+
+
+def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+    hold = f"""
+import time
+from pathlib import Path
+from brakeline.deploy.run.run_lock import only_launcher
+with only_launcher(Path({str(tmp_path)!r})):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
+            with pytest.raises(LaunchError, match=rf"is running \(process {os.getpid()}\)"):
+                Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",))).run()
+        finally:
+            holder.kill()
+    with only_launcher(tmp_path):
+        pass
 
 
 @pytest.mark.parametrize("text", ["", "[]", "\xff", '{"a":' * 100_000, '{"steps": 1e999}', '{"robots": 5}'])
