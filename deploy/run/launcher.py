@@ -21,6 +21,7 @@ from brakeline.errors import LaunchError, LogError
 from brakeline.learner.checkpoint import CHECKPOINT
 from brakeline.learner.checkpoint import exists as checkpoint_exists
 from brakeline.learner.checkpoint import latest as latest_checkpoint
+from brakeline.logs.json_values import finite
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import count_by_key
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -178,13 +179,17 @@ class Launcher:
                 process.notes["outcome"] = f"failed: {failure}" if failure is not None else outcome
         self._drain(LAST_MESSAGES_TIMEOUT)
         figures = self.figures()
-        try:
-            write_atomically(self.folder / FIGURES, json.dumps(figures, indent=2).encode())
-        except OSError as error:  # the caller shows them all the same
-            log.error("the figures were not saved: %s", error)
+        self._save(figures)
         if failure is not None:
             raise failure
         return figures
+
+    def _save(self, figures: dict[str, Any]) -> None:
+        """Save the figures in the run's folder. A number that is not finite, such as a diverged loss, becomes null."""
+        try:
+            write_atomically(self.folder / FIGURES, json.dumps(finite(figures), indent=2, allow_nan=False).encode())
+        except OSError as error:  # the caller shows them all the same
+            log.error("the figures were not saved: %s", error)
 
     def _update_health(self, process: Process) -> None:
         """Put the totals of the run into each health message, for viewers that connect in its middle."""

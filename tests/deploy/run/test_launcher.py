@@ -189,6 +189,17 @@ def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_pa
     assert "run_0003.mcap is not an MCAP file" in failure
 
 
+def test_figures_that_are_not_finite_are_saved_as_null(tmp_path: Path, launcher: Launcher) -> None:
+    learner = pb.LearnerMetrics(header=pb.Header(sequence=1), robot="ground", steps=5, critic_loss=float("nan"))
+    launcher.metrics.add("metrics/ground", learner, 1)
+    launcher._save(launcher.figures() | {"loss": float("inf")})
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    assert json.loads((tmp_path / "figures.json").read_text(), parse_constant=refuse)["loss"] is None
+
+
 def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
     launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
     assert launcher.figures()["log"] is None and launcher.processes[0].spec.name == "safety-0"
