@@ -70,7 +70,8 @@ class ActorSettings:
     steps: int = 0  # steps of each robot whose policy does not learn; 0: no end
 
     def __post_init__(self) -> None:
-        check_penalty(self.penalty)
+        if self.penalty is not None:
+            check_penalty(self.penalty, robot_with_task(self.robot))
         if not 1 <= self.robots <= MAX_REQUESTS:
             raise ValueError(f"a process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more of them")
 

@@ -123,9 +123,10 @@ class RunConfig:
                 f"--robots-per-actor{more}"
             )
         if self.penalty is not None:
-            from brakeline.messaging.task import check_penalty
+            from brakeline.messaging.task import check_penalty, robot_with_task
 
-            check_penalty(self.penalty)
+            for robot in self.robots:
+                check_penalty(self.penalty, robot_with_task(robot))
         if self.adapt and self.method != DDPC:
             raise ValueError(f"--adapt certifies model sets of the method {DDPC}, not of {self.method}")
         if self.backend == BATCH:

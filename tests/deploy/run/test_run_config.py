@@ -72,6 +72,9 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     for penalty in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="a penalty is finite and not negative"):
             RunConfig(penalty=penalty)
+    with pytest.raises(ValueError, match="20000 is out of proportion to the rewards of ground: give at most 2057"):
+        RunConfig(penalty=20_000.0)
+    assert RunConfig(penalty=300.0).penalty == 300.0
     with pytest.raises(ValueError, match="--actors 1"):
         RunConfig(deterministic=True)
     assert RunConfig(deterministic=True, actors=1).learning().lockstep
