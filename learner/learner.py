@@ -178,7 +178,7 @@ class Learner:
     def work(self, most: int) -> int:
         """Make at most `most` of the updates that are due. Return how many it made."""
         made = 0
-        while made < most and self._limiter.may_sample() and len(self._replay) > 0:
+        while made < most and self._update_due():
             self._replay.sample(self._draws, self._batch)
             if self._images is not None:
                 self._images.apply(self._batch)
@@ -187,6 +187,10 @@ class Learner:
             made += 1
         return made
 
+    def _update_due(self) -> bool:
+        """Return whether an update is due, and there is a step to learn from: windows of n steps fill late."""
+        return self._limiter.may_sample() and len(self._replay) > 0
+
     def _enough(self) -> bool:
         """Return whether all steps of the run have arrived."""
         return self._limiter.inserts >= self.config.steps and (self._episode_ended or not self.config.lockstep)
@@ -194,7 +198,7 @@ class Learner:
     @property
     def done(self) -> bool:
         """Whether all steps have arrived and all updates are made."""
-        return self._enough() and not self._limiter.may_sample()
+        return self._enough() and not self._update_due()
 
     @property
     def steps(self) -> int:
@@ -215,7 +219,7 @@ class Learner:
         """Return whether it is time for `publish`."""
         new = self._td3.updates - self._published_updates
         if self.config.lockstep or self.done:
-            return new > 0 and not self._limiter.may_sample()
+            return new > 0 and not self._update_due()
         return new >= self.config.publish_every
 
     def publish(self) -> pb.Weights:
@@ -253,7 +257,7 @@ class Learner:
 
     def flow(self) -> pb.Flow:
         """Return up to which index each actor may publish. A limit never falls."""
-        if not (self.config.lockstep and (self._limiter.may_sample() or self.weights_due())):
+        if not (self.config.lockstep and (self._update_due() or self.weights_due())):
             self._grant()
         return pb.Flow(
             robot=self.robot.name,
@@ -276,6 +280,8 @@ class Learner:
 
     def _grant(self) -> None:
         room = 0 if self._enough() else self._limiter.room()
+        if not len(self._replay) and not self._enough():
+            room = max(room, len(self._limits))  # no update can make room before the first window is full
         if not self.config.lockstep:
             room = min(room, self.config.steps - self._limiter.inserts)
         if room < 1 or not self._limits:
@@ -314,7 +320,7 @@ class Learner:
 
     def may_save(self) -> bool:
         """Return whether a checkpoint is possible: in lockstep only between episodes, with no update due."""
-        settled = self._episode_ended and not self._limiter.may_sample() and not self.weights_due()
+        settled = self._episode_ended and not self._update_due() and not self.weights_due()
         return settled or not self.config.lockstep
 
     def checkpoint_due(self) -> bool:

@@ -156,6 +156,23 @@ def test_flow_holds_actors_back_until_the_updates_are_made():
     assert 0 < push_to_the_limit(learner) <= 20
 
 
+@pytest.mark.parametrize("steps", [150, 400])  # the run ends before the first window is full; or after it
+def test_many_actors_with_long_windows_do_not_wait_for_each_other(steps):
+    learner = asynchronous(td3=replace(CONFIG.td3, n_step=20, warmup=60), steps=steps)
+    names = [f"actor-{i}" for i in range(16)]
+    taken = dict.fromkeys(names, 0)
+    for name in names:
+        learner.join(joining(name))
+    for _ in range(steps):
+        for name in names:
+            if taken[name] < learner.flow().limit[name]:
+                taken[name] += 1
+                learner.insert(step(taken[name], actor=name))
+        learner.work(1000)
+    assert learner.done and learner.steps == steps
+    assert learner.updates == (0 if steps == 150 else steps - 60)
+
+
 def test_a_silent_actor_holds_up_nobody_and_the_run_ends_at_its_last_step():
     learner = asynchronous(steps=300)
     index = 0
