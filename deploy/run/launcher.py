@@ -131,6 +131,7 @@ class Launcher:
         self.ending = False
         self._history = RunHistory()
         self._earlier: set[Path] = set()  # files of the log from before a resumption
+        self._resumed = False  # then the figures count from the resumption on
         self._inbox = Inbox()
         self._lacks_messages = False  # because the inbox was full
         self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
@@ -203,7 +204,10 @@ class Launcher:
         process.notes.update(seed=str(config.seed), steps=str(steps))
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures that `analyse` computes from the log, and those that only the launcher knows."""
+        """Return the figures that `analyse` computes from the log, and those that only the launcher knows.
+
+        Those of a resumed run count from the resumption on; `analyse` counts the whole run.
+        """
         setup = {
             "method": self.config.method,
             "certificate": self.config.model_config.certificate if self.config.method == "ddpc" else None,
@@ -212,7 +216,7 @@ class Launcher:
             "seed": self.config.seed,
         }
         restarts = {child.spec.name: child.restarts for child in self.processes if child.restarts}
-        outcome = {"finished": self.finished, "restarts": restarts} | self._from_logs()
+        outcome = {"finished": self.finished, "resumed": self._resumed, "restarts": restarts} | self._from_logs()
         paths = {
             "folder": str(self.folder),
             "log": str(self.folder / LOG) if self.config.record else None,
@@ -276,7 +280,7 @@ class Launcher:
 
     def _claim_folder(self) -> None:
         """Write the files that the processes read, and make runs/latest point to this run."""
-        self._earlier = set(self.folder.glob(SEGMENTS))
+        self._earlier, self._resumed = set(self.folder.glob(SEGMENTS)), (self.folder / CONFIG).exists()
         write_atomically(self.folder / CONFIG, encode(self.config).encode())
         write_endpoint(self.folder, self.bus)
         if self.bus.keys is None:

@@ -223,6 +223,13 @@ def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) ->
     assert (tmp_path / "latest").readlink() == Path("first")
 
 
+def test_the_figures_say_whether_they_count_from_a_resumption_on(tmp_path: Path) -> None:
+    for resumed in (False, True):
+        launcher = Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+        launcher._claim_folder()
+        assert launcher.figures()["resumed"] is resumed
+
+
 def summary_of(figures: dict[str, object]) -> str:
     console = Console(file=io.StringIO(), width=200)
     summary(console, figures)
