@@ -184,6 +184,23 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     assert lengths(made) == [49, 48] and "1 periods left out: an input was outside" in made.report.notes[0]
 
 
+@pytest.mark.parametrize("later", [0.0, 0.01])  # s, of the second robot's rows
+def test_rows_of_two_robots_are_refused_and_a_column_tells_them_apart(later):
+    time, values = steady(step=0.1)
+    times, both = np.r_[time, time + later], np.vstack([values, values + 3.0 * np.eye(7)[0]])
+    order = np.argsort(times, kind="stable")
+    with pytest.raises(NoSource, match="are these rows of several robots"):
+        resample([table(times[order], both[order])], porter(), LogOptions())
+    told_apart = table(times, both, run=np.repeat([0, 1], len(time)))
+    assert lengths(resample([told_apart], porter(), LogOptions())) == [99, 99]
+
+
+def test_rows_with_the_same_stamp_are_named(driven):
+    time, values = driven[0][:2000], driven[1][:2000]
+    made = resample([table(np.floor(time * 10.0 + 1e-6) / 10.0, values)], porter(), LogOptions())
+    assert any("rows with the stamp of the row before and another pose: left out" in note for note in made.report.notes)
+
+
 def test_angles_are_unwrapped_before_they_are_looked_at_in_between():
     time, values = steady(step=0.06, turn=1.0)
     made = resample([table(time, values)], porter(), LogOptions())
