@@ -60,7 +60,7 @@ class Reward:
     @property
     def most(self) -> float:
         """The largest plausible reward or penalty of a step; the learner refuses a step with a larger one."""
-        return MOST_REWARD_FACTOR * sum(map(abs, astuple(self)))
+        return MOST_REWARD_FACTOR * float(sum(map(abs, astuple(self))))
 
 
 def check_penalty(penalty: float | None, robot: RobotWithTask | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A lock on a run's folder: one launcher at a time. The lock ends with its process, however that ends."""
+"""A lock on a run's folder: one launcher at a time."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
+from brakeline.deploy.data.build_lock import lock_at_once
 from brakeline.deploy.run.processes import launcher_pid
 from brakeline.errors import LaunchError
 
@@ -21,16 +20,15 @@ def only_launcher(folder: Path) -> Iterator[None]:
     Raises:
         LaunchError: another launcher holds it: the run is running.
     """
-    lock = FileLock(folder / LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        try:
-            where = f" (process {launcher_pid(folder)})"
-        except (OSError, ValueError, KeyError):  # it has just begun
-            where = ""
-        raise LaunchError(f"{folder} is running{where}: end it first, or give another --out") from None
-    try:
+    with lock_at_once(folder / LOCK) as held:
+        if not held:
+            raise LaunchError(f"{folder} is running{_process(folder)}: end it first, or give another --out")
         yield
-    finally:
-        lock.release()
+
+
+def _process(folder: Path) -> str:
+    """Return the process of a running launcher in brackets; empty if it has just begun."""
+    try:
+        return f" (process {launcher_pid(folder)})"
+    except (OSError, ValueError, KeyError):
+        return ""
