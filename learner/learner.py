@@ -240,7 +240,7 @@ class Learner:
             td3 = self.config.td3
             raise Diverged(
                 f"the training diverged by update {self.updates}, step {self.steps}: weights or losses are not finite. "
-                "The last checkpoint and the last policy stay as they are. Train anew with lower learning rates "
+                "Checkpoint and policy, if there are any, stay as they were. Train anew with lower learning rates "
                 f"(now --learner.td3.critic-rate {td3.critic_rate:g} --learner.td3.actor-rate {td3.actor_rate:g})"
             )
 
