@@ -28,6 +28,7 @@ from brakeline.actors.episode_runner import (
 )
 from brakeline.actors.mavlink.frame_recorder import FrameRecorder, MessageSink
 from brakeline.actors.proposers import FixedPolicy, LearnedPolicy, PolicyFactory, Proposer, RealTimePolicy, Stop
+from brakeline.errors import BadRequest, BusError, Refused
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings, Publisher
 from brakeline.messaging.process_runtime import Process
@@ -36,6 +37,7 @@ from brakeline.messaging.task import RobotWithTask, check_penalty, robot_with_ta
 from brakeline.messaging.topics import EPISODE, EXCHANGE, FRAMES, STEP
 from brakeline.safety.filter.request import ALLOWED
 from brakeline.safety.service.client import query_service
+from brakeline.safety.service.wire import MAX_REQUESTS
 
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.frame_log import FrameTap
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("brakeline.actor")
 
 RETRY_INTERVAL = 0.05  # s between two questions about robots that stand and got no answer
+MOST_REFUSALS = 200  # questions about standing robots that the service refuses in a row, before the process ends
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,13 @@ class ActorSettings:
     steps: int = 0  # steps of each robot whose policy does not learn; 0: no end
 
     def __post_init__(self) -> None:
-        check_penalty(self.penalty)
+        if self.penalty is not None:
+            check_penalty(self.penalty, robot_with_task(self.robot))
+        if not 1 <= self.robots <= MAX_REQUESTS:
+            raise ValueError(f"a process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more of them")
+
+
+FOR_GOOD = f"{Refused.__name__}: {BadRequest.__name__}"  # begin of a failure that no repetition of a question mends
 
 
 class EnvironmentFactory(Protocol):
@@ -256,6 +265,7 @@ class ActorGroup(RobotGroup):
     def __init__(self, actors: Sequence[ActorRunner], world: SharedWorld | None = None, reserving: bool = True) -> None:
         super().__init__([actor.runner for actor in actors], world, reserving)
         self.actors = list(actors)
+        self._refusals = 0  # questions in a row that the service refused as a whole, while all robots stood
 
     def ready(self, stop: Stop) -> bool:
         """Wait for permission to step, and begin an episode if none is running. Return False at the end of the run."""
@@ -271,8 +281,17 @@ class ActorGroup(RobotGroup):
         return True
 
     def act(self, proposals: Sequence[Array], outcomes: Sequence[DecisionOutcome | None], stats: ActorStats) -> None:
-        """Act on the outcomes for one period, or wait if there are none and all robots stand."""
-        if self._wait(outcomes):
+        """Act on the outcomes for one period, or wait if there are none and all robots stand.
+
+        Raises:
+            BusError: the service refuses every question about the standing robots, such as one with too many obstacles.
+        """
+        waits = self._wait(outcomes)
+        refusals = {outcome.failure for outcome in outcomes if outcome and outcome.failure.startswith(FOR_GOOD)}
+        self._refusals = self._refusals + 1 if waits and refusals else 0
+        if self._refusals > MOST_REFUSALS:
+            raise BusError(f"the safety service refuses every question about these robots: {refusals.pop()}")
+        if waits:
             stats.waits += 1
             time.sleep(RETRY_INTERVAL)
             return
@@ -323,6 +342,7 @@ def run(
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
+        BusError: the safety service refuses every question about the robots.
     """
     stats = ActorStats()
     with Process(settings.bus, settings.name) as process:

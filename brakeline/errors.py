@@ -290,6 +290,10 @@ class DamagedPart(CheckpointError):
         self.part = part
 
 
+class Diverged(BrakelineError, RuntimeError):
+    """The learner's weights or losses are no longer finite. The message says what to do."""
+
+
 class BadStep(InvalidField):
     """The learner cannot learn from the step."""
 

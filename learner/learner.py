@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from brakeline.errors import BadStep, CheckpointError, DamagedPart
+from brakeline.errors import BadStep, CheckpointError, DamagedPart, Diverged
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
@@ -178,7 +178,7 @@ class Learner:
     def work(self, most: int) -> int:
         """Make at most `most` of the updates that are due. Return how many it made."""
         made = 0
-        while made < most and self._limiter.may_sample() and len(self._replay) > 0:
+        while made < most and self._update_due():
             self._replay.sample(self._draws, self._batch)
             if self._images is not None:
                 self._images.apply(self._batch)
@@ -187,6 +187,10 @@ class Learner:
             made += 1
         return made
 
+    def _update_due(self) -> bool:
+        """Return whether an update is due, and there is a step to learn from: windows of n steps fill late."""
+        return self._limiter.may_sample() and len(self._replay) > 0
+
     def _enough(self) -> bool:
         """Return whether all steps of the run have arrived."""
         return self._limiter.inserts >= self.config.steps and (self._episode_ended or not self.config.lockstep)
@@ -194,7 +198,7 @@ class Learner:
     @property
     def done(self) -> bool:
         """Whether all steps have arrived and all updates are made."""
-        return self._enough() and not self._limiter.may_sample()
+        return self._enough() and not self._update_due()
 
     @property
     def steps(self) -> int:
@@ -215,15 +219,30 @@ class Learner:
         """Return whether it is time for `publish`."""
         new = self._td3.updates - self._published_updates
         if self.config.lockstep or self.done:
-            return new > 0 and not self._limiter.may_sample()
+            return new > 0 and not self._update_due()
         return new >= self.config.publish_every
 
     def publish(self) -> pb.Weights:
-        """Return the present weights as a new version, which `weights` and `flow` give from now on."""
+        """Return the present weights as a new version, which `weights` and `flow` give from now on.
+
+        Raises:
+            Diverged: they are not finite. The last version stays.
+        """
+        self._check_finite()
         self._version += 1
         self._published_updates = self._td3.updates
         self._encode()
         return self._weights
+
+    def _check_finite(self) -> None:
+        """Raise Diverged if the training has diverged."""
+        if not self._td3.finite(self._batch):
+            td3 = self.config.td3
+            raise Diverged(
+                f"the training diverged by update {self.updates}, step {self.steps}: weights or losses are not finite. "
+                "Checkpoint and policy, if there are any, stay as they were. Train anew with lower learning rates "
+                f"(now --learner.td3.critic-rate {td3.critic_rate:g} --learner.td3.actor-rate {td3.actor_rate:g})"
+            )
 
     def _encode(self) -> None:
         noise = self.config.td3.exploration_noise
@@ -238,7 +257,7 @@ class Learner:
 
     def flow(self) -> pb.Flow:
         """Return up to which index each actor may publish. A limit never falls."""
-        if not (self.config.lockstep and (self._limiter.may_sample() or self.weights_due())):
+        if not (self.config.lockstep and (self._update_due() or self.weights_due())):
             self._grant()
         return pb.Flow(
             robot=self.robot.name,
@@ -261,6 +280,8 @@ class Learner:
 
     def _grant(self) -> None:
         room = 0 if self._enough() else self._limiter.room()
+        if not len(self._replay) and not self._enough():
+            room = max(room, len(self._limits))  # no update can make room before the first window is full
         if not self.config.lockstep:
             room = min(room, self.config.steps - self._limiter.inserts)
         if room < 1 or not self._limits:
@@ -299,7 +320,7 @@ class Learner:
 
     def may_save(self) -> bool:
         """Return whether a checkpoint is possible: in lockstep only between episodes, with no update due."""
-        settled = self._episode_ended and not self._limiter.may_sample() and not self.weights_due()
+        settled = self._episode_ended and not self._update_due() and not self.weights_due()
         return settled or not self.config.lockstep
 
     def checkpoint_due(self) -> bool:
@@ -311,7 +332,9 @@ class Learner:
 
         Raises:
             CheckpointError: the checkpoint could not be written; the previous one is unchanged.
+            Diverged: the weights are not finite; the previous checkpoint is unchanged.
         """
+        self._check_finite()
         saved_before, self._saved_at = self._saved_at, self.steps
         parts = {name: part.state() for name, part in self._parts().items()} | {"run": self._run_state()}
         try:
@@ -334,6 +357,8 @@ class Learner:
                 restore(states[name])
             except Exception as error:  # of another version, for instance
                 raise DamagedPart(name, root, f"damaged: {error}") from error
+        if not self._td3.finite(self._batch):
+            raise DamagedPart("td3", root, "not finite: an earlier version saved it after the training diverged")
         self._td3.cost_weight = 0.0 if self._multiplier is None else self._multiplier.value
         self._weigh_penalties()
         self._encode()

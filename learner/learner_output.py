@@ -32,12 +32,16 @@ class LearnerOutput:
         self._metrics_at = self._retry_at = -1e9
 
     def save_if_due(self) -> None:
-        """Write a checkpoint and the policy if it is time."""
+        """Write a checkpoint and the policy if it is time. Raises Diverged, as `save`."""
         if self._learner.checkpoint_due() and self._clock() > self._retry_at:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint and the policy; if that fails, log the reason and continue."""
+        """Write a checkpoint and the policy; if that fails, log the reason and continue.
+
+        Raises:
+            Diverged: the weights are not finite; the files stay as they are.
+        """
         try:
             place = self._learner.save(self._out / CHECKPOINT)
             self._process.notes["checkpoint"] = f"step {self._learner.steps}"

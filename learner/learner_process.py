@@ -59,6 +59,7 @@ def main(settings: LearnerSettings) -> bool:
 
     Raises:
         CheckpointError: the run cannot be resumed, or `out` holds a checkpoint and `resume` is False.
+        Diverged: the weights are no longer finite; the last checkpoint and policy stay.
         UnknownRobot: there is no such robot.
         Unreachable: no router answers.
     """

@@ -15,6 +15,7 @@ in place of another proposal.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,6 +110,14 @@ class TD3:
         if (weight := self.config.imitation) > 0.0:
             daction = daction + (2.0 * weight / self.config.batch) * batch.imitated * (action - batch.action)
         self.actor_adam.step(self.actor.parameter_gradient(daction * (1.0 - action * action)))
+
+    def finite(self, batch: Batch) -> bool:
+        """Return whether the losses, all weights and the actions in a batch's states are finite numbers."""
+        losses = self.losses
+        if not math.isfinite(losses.critic + losses.actor + losses.mean_q):
+            return False
+        tensors = (*self._tensors().values(), self.actor.forward(batch.observation).tanh_())
+        return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
 
     def policy_layers(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Return copies of the weight (out, in) and bias (out,) of the actor's layers."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.task import RobotWithTask
 
 # Bounds of plausible steps: beyond what tasks and sensors give, and below what would ruin the networks.
-MAX_REWARD_FACTOR = 10.0  # of the sum of all rewards of a task, with the progress of one metre
 MOST_OBSERVED = 10.0  # observations are clipped at 1.5
 MOST_PROPOSED = 1e2  # distance from the center of the bounds, in half ranges; proposals are clipped
 ROUNDING = 1e-3  # rounding of an executed action at its bounds, in half ranges
@@ -26,7 +24,7 @@ class StepReader:
 
     def __init__(self, robot: RobotWithTask) -> None:
         self.robot = robot
-        self.most_reward = MAX_REWARD_FACTOR * sum(map(abs, astuple(robot.task.reward)))
+        self.most_reward = robot.task.reward.most
         self._observed_size = robot.task.observation_dim
         self._centre, self._half = (robot.high() + robot.low()) / 2.0, (robot.high() - robot.low()) / 2.0
 

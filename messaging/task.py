@@ -14,8 +14,9 @@ import hashlib
 import importlib
 import importlib.util
 import json
+import math
 import sys
-from dataclasses import dataclass, field, fields
+from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +41,9 @@ from brakeline.messaging.robot_files import (
 _STRICT = ConfigDict(extra="forbid")
 
 
+MOST_REWARD_FACTOR = 10.0  # of the sum of all rewards of a task, with the progress of one metre
+
+
 @dataclass(frozen=True)
 class Reward:
     """Rewards of an episode. The progress of all steps sums to the distance gained, whatever the path."""
@@ -58,11 +62,27 @@ class Reward:
         check_numbers(self, "collision", "run_into", "cut")
         check_most(self, "collision", "run_into", "cut", most=0.0)
 
+    @property
+    def most(self) -> float:
+        """The largest plausible reward or penalty of a step; the learner refuses a step with a larger one."""
+        return MOST_REWARD_FACTOR * float(sum(map(abs, astuple(self))))
 
-def check_penalty(penalty: float | None) -> None:
-    """Raise ValueError for a penalty that cannot be subtracted from a reward. None stands for the task's."""
-    if penalty is not None and not 0.0 <= penalty < float("inf"):  # NaN fails too
+
+def check_penalty(penalty: float | None, robot: RobotWithTask | None = None) -> None:
+    """Raise ValueError for a penalty that cannot be subtracted from a reward. None stands for the task's.
+
+    Args:
+        penalty: for a correction by the whole range of an input.
+        robot: checks also that the learner accepts a correction by the whole range of all inputs.
+    """
+    if penalty is None:
+        return
+    if not 0.0 <= penalty < float("inf"):  # NaN fails too
         raise ValueError(f"a penalty is finite and not negative: {penalty:g} cannot be subtracted from a reward")
+    if robot is not None and penalty > (most := robot.task.reward.most / math.sqrt(robot.action_dim)):
+        raise ValueError(
+            f"a penalty of {penalty:g} is out of proportion to the rewards of {robot.name}: give at most {int(most)}"
+        )
 
 
 @dataclass(frozen=True)

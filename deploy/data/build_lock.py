@@ -1,4 +1,7 @@
-"""A lock on a folder of data: one process writes the missing files, the others wait and then read them."""
+"""Locks on folders: of data, whose missing files one process writes while others wait, and of a run's launcher.
+
+A lock ends with its process, however that ends.
+"""
 
 from __future__ import annotations
 
@@ -25,5 +28,20 @@ def folder_lock(folder: Path) -> Iterator[None]:
         lock.acquire()
     try:
         yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def lock_at_once(file: Path) -> Iterator[bool]:
+    """Hold the lock in a file until the block ends, unless another process holds it. Yields whether it is held."""
+    lock = FileLock(file)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
     finally:
         lock.release()

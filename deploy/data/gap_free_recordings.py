@@ -18,6 +18,8 @@ Indices = NDArray[np.signedinteger]
 
 GAP = 1.5  # times the usual time between two samples: a larger one is a gap
 JUMP = 2.0  # times the fastest motion: faster is a jump
+MOST_USUAL = 3.0  # times the fastest motion of the description, to which the usual speed of a log counts
+MOST_JUMPS, FEW_JUMPS = 0.01, 5  # share and number of rows with jumps, above which the rows are of several robots
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,12 @@ def gap_free_recordings(
         hold: time in s for which an input is valid after its last message.
 
     Raises:
-        NoSource: a coordinate has less than one sample per period, or its time decreases.
+        NoSource: a coordinate has less than one sample per period, its time decreases, or the rows are of several
+            robots.
     """
     names, input_names = column_names(robot)
     recordings: list[GapFreeRecording] = []
-    gaps = jumps = 0
+    gaps = jumps = shared = 0
     for run in sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0}):
         states, given = (
             [table.series(column, run) for table, column in (places[name] for name in columns)]
@@ -57,6 +60,9 @@ def gap_free_recordings(
             continue
         cuts = [_gaps(time, robot.period, name) for (time, _), name in zip(states, names, strict=True)]
         torn = _jumps(robot, states)
+        same, apart = _same_stamps(robot, [places[name] for name in names], run)
+        _refuse_several_robots(sum(map(len, torn.values())) + apart, sum(len(states[i][0]) for i in torn))
+        shared += same
         gaps += len(cuts[0])
         jumps += len({float(states[i][0][j]) for i, indices in torn.items() for j in indices})
         spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
@@ -70,6 +76,7 @@ def gap_free_recordings(
             if all(len(time) >= 2 for time, _ in part):
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
     counts = {"gaps": gaps, "jumps of the pose": jumps}
+    counts["rows with the stamp of the row before and another pose: left out"] = shared
     return recordings, [f"{count} {what}" for what, count in counts.items() if count]
 
 
@@ -84,22 +91,65 @@ def _gaps(time: Array, period: float, name: str) -> Indices:
     return np.flatnonzero(apart > max(GAP * usual, 0.5 * period))
 
 
-def _jumps(robot: Robot, states: list[Series]) -> dict[int, Indices]:
-    """Return for each coordinate of the pose the indices of the samples before a motion faster than the robot's."""
+def _pose(robot: Robot) -> tuple[int, ...]:
+    """Return the indices of the coordinates of the pose."""
+    return (*range(robot.position_dim), *(() if robot.heading is None else (robot.heading,)))
+
+
+def _fastest(robot: Robot) -> dict[str, float]:
+    """Return the fastest motion that the inputs' bounds allow, by unit; 0 if no input is in the unit."""
     fastest = {"m/s": 0.0, "rad/s": 0.0}
     for label, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True):
         if (unit := split(label)[1]) in fastest:
             fastest[unit] = float(np.hypot(fastest[unit], max(abs(low), abs(high))))
-    torn = {}
-    for i in (*range(robot.position_dim), *(() if robot.heading is None else (robot.heading,))):
+    return fastest
+
+
+def _moved(robot: Robot, i: int, values: Array) -> Array:
+    """Return how far a coordinate of the pose moved from each row to the next."""
+    moved = np.diff(values)
+    return np.abs((moved + np.pi) % (2.0 * np.pi) - np.pi if i == robot.heading else moved)
+
+
+def _jumps(robot: Robot, states: list[Series]) -> dict[int, Indices]:
+    """Return for each coordinate of the pose the indices of the samples before a motion faster than the robot's."""
+    fastest, torn = _fastest(robot), {}
+    for i in _pose(robot):
         time, values = states[i]
-        apart, moved = np.diff(time), np.abs(np.diff(values))
-        if i == robot.heading:
-            moved = np.abs((np.diff(values) + np.pi) % (2.0 * np.pi) - np.pi)
+        apart, moved = np.diff(time), _moved(robot, i, values)
         usual = float(np.quantile(moved / apart, 0.99))
-        most = JUMP * max(fastest["rad/s" if i == robot.heading else "m/s"], usual)
-        torn[i] = np.flatnonzero(moved > most * apart + 4.0 * robot.measurement_bound[i])
+        if known := fastest["rad/s" if i == robot.heading else "m/s"]:
+            usual = max(known, min(usual, MOST_USUAL * known))
+        torn[i] = np.flatnonzero(moved > JUMP * usual * apart + 4.0 * robot.measurement_bound[i])
     return torn
+
+
+def _same_stamps(robot: Robot, places: Sequence[tuple[Table, str]], run: int) -> tuple[int, int]:
+    """Return how many rows of a run have the stamp of the row before.
+
+    Returns:
+        The number of those with another pose, and of those with one that the robot cannot reach within a period.
+    """
+    fastest, other, apart = _fastest(robot), 0, 0
+    for i in _pose(robot):
+        table, column = places[i]
+        values = table.columns[column]
+        rows = np.isfinite(table.time) & np.isfinite(values) & ((table.run == run) if len(table.run) else True)
+        moved = _moved(robot, i, values[rows])[np.diff(table.time[rows]) == 0.0]
+        within = JUMP * MOST_USUAL * fastest["rad/s" if i == robot.heading else "m/s"] * robot.period
+        other = max(other, int(np.count_nonzero(moved)))
+        if within:
+            apart += int(np.count_nonzero(moved > within + 4.0 * robot.measurement_bound[i]))
+    return other, apart
+
+
+def _refuse_several_robots(jumps: int, rows: int) -> None:
+    """Raise NoSource if so many rows jump that they are of several robots."""
+    if jumps > max(MOST_JUMPS * rows, FEW_JUMPS):
+        raise NoSource(
+            f"the pose jumps {jumps} times in {rows} values, faster than the robot moves: are these rows of several "
+            "robots? Give a column `run` with another number for each recording, or one file for each robot"
+        )
 
 
 def _uncut(time: Array, cuts: Indices, hold: float = 0.0) -> list[Span]:

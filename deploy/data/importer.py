@@ -20,6 +20,7 @@ from brakeline.errors import NoSource
 from brakeline.logs.mcap_container import is_ros
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.repeated_driving import repeated_driving
 
 BAG_ENDINGS = (".bag", ".bag.active", ".db3", ".db3.zstd", ".mcap.zstd")  # besides .mcap, which logs of runs share
 BAG, PARQUET, JSON, OWN = "ros_bag:read", "parquet_files:read", "json_lines:read", "a log of a run"
@@ -125,6 +126,7 @@ def import_sources(
         {"origin": "import", "sources": ", ".join(path.name for path in paths)},
         max(part.data.chord_deviation for part in parts),
     )
+    _refuse_copies(paths, parts)
     report = replace(
         reports[0],
         periods=data.periods,
@@ -139,6 +141,19 @@ def import_sources(
         ),
     )
     return ImportedData(data, report)
+
+
+def _refuse_copies(paths: Sequence[Path], parts: Sequence[ImportedData]) -> None:
+    """Raise NoSource if two sources hold the same driving."""
+    if len(parts) < 2:
+        return
+    owners = [path for path, part in zip(paths, parts, strict=True) for _ in part.data.trajectories]
+    twice = repeated_driving(parts[0].data.robot, [t for part in parts for t in part.data.trajectories])
+    if twice is not None:
+        raise NoSource(
+            f"{owners[twice.first]} and {owners[twice.second]} hold the same driving, {twice.seconds:.0f} s in all: a "
+            "copy is no evidence. Give each recording once"
+        )
 
 
 def _import_one(path: Path, robot: Robot, options: LogOptions, delay: float, hold: float) -> ImportedData:

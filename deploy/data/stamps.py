@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.deploy.data.unit_table import NAMES as UNIT_NAMES
-from brakeline.deploy.data.unit_table import factor, split_header
+from brakeline.deploy.data.unit_table import factor, split_header, unknown_unit
 from brakeline.errors import NoSource
 
 TIME, RUN = "time", "run"
@@ -27,6 +27,7 @@ SECONDS = re.compile(r"secs?$", re.IGNORECASE)
 FRACTIONS = ("nsecs", "nsec", "nanosecs", "nanosec", "nanoseconds")  # beside SECONDS
 EPOCH = (6.3e8, 4.1e9)  # s since 1970, in 1990 and 2100
 FACTORS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNITS_OF_TIME = "s, ms, us, ns, min or h"
 STEPS = (5e-4, 1.0)  # s between two rows of a robot's log
 SENSIBLE_STEPS = (1e-5, 60.0)  # s: others are refused
 OUT_OF_ORDER = 1.0  # s: a smaller step back is a row out of order; a larger one begins another recording
@@ -70,7 +71,7 @@ def stamped(table: Table, column: str = "", unit: str = "") -> Table:
         unit, note = _unit(name, float(np.median(np.abs(stamps[valid]))), step)
         notes += [note] if note else []
     if (scale := factor(unit, "s")) is None:
-        raise NoSource(f"--unit {TIME}={unit}: the unit of stamps is s, ms, us or ns")
+        raise NoSource(f"--unit {TIME}={unit}: the unit of stamps is {UNITS_OF_TIME}")
     if len(steps) and not SENSIBLE_STEPS[0] <= step * scale <= SENSIBLE_STEPS[1]:
         raise NoSource(
             f"column {name}: in {unit}, the log would have a row every {step * scale:.3g} s, which is not plausible. "
@@ -88,7 +89,8 @@ def in_header_units(table: Table) -> Table:
     for name, values in table.columns.items():
         plain, unit = split_header(name)
         scale = factor(unit) if unit else None
-        if scale is None or plain in table.columns or plain in columns or factor(unit, "s") is not None:
+        kept = plain in table.columns or plain in columns or _letters(plain) in NAMES
+        if scale is None or kept or factor(unit, "s") is not None:
             columns[name] = values
             continue
         columns[plain] = values * scale
@@ -132,9 +134,14 @@ def _time_column(columns: dict[str, Array]) -> str:
     """Return the column with the time: `time`, else the first of `NAMES`; empty if there is none."""
     if TIME in columns:
         return TIME
-    plain = {name: re.sub(r"[^a-z]", "", SUFFIX.sub("", split_header(name)[0]).lower()) for name in columns}
-    plain |= {name: re.sub(r"[^a-z]", "", name.lower()) for name in columns if plain[name] not in NAMES}
+    plain = {name: _letters(SUFFIX.sub("", split_header(name)[0])) for name in columns}
+    plain |= {name: _letters(name) for name in columns if plain[name] not in NAMES}
     return next((name for wanted in NAMES for name, short in plain.items() if short == wanted), "")
+
+
+def _letters(name: str) -> str:
+    """Return the letters of a name, in lower case."""
+    return re.sub(r"[^a-z]", "", name.lower())
 
 
 def _fraction(name: str, columns: dict[str, Array]) -> str | None:
@@ -150,6 +157,9 @@ def _unit(name: str, size: float, step: float) -> tuple[str, str]:
 
     The header's unit counts first. The size of stamps since 1970 shows their unit. For others, it is the largest unit
     in which the step between two rows is plausible.
+
+    Raises:
+        NoSource: the header's unit is not known, or is no unit of time.
     """
     plain, declared = split_header(name)
     if not declared and (suffix := SUFFIX.search(plain)):
@@ -158,8 +168,16 @@ def _unit(name: str, size: float, step: float) -> tuple[str, str]:
         declared = UNIT_NAMES.get(declared, declared)
     since_1970 = [unit for unit, scale in FACTORS.items() if EPOCH[0] <= size * scale <= EPOCH[1]]
     plausible = [unit for unit, scale in FACTORS.items() if STEPS[0] <= step * scale <= STEPS[1]]
-    unit = next(iter((*([declared] if declared in FACTORS else []), *since_1970, *plausible)), "s")
+    unknown = declared if declared and factor(declared, "s") is None else "" if since_1970 else unknown_unit(name)
+    if unknown:
+        raise NoSource(
+            f"column {name}: {unknown!r} is no known unit of time; name one with --unit {TIME}=UNIT: {UNITS_OF_TIME}"
+        )
+    unit = next(iter((*([declared] if declared else []), *since_1970, *plausible)), "s")
     if name == TIME and unit == "s" and not since_1970:
         return unit, ""
     epoch = " since 1970" if unit in since_1970 else ""
-    return unit, f"column {name}: the time, in {unit}{epoch}, with a row every {step * FACTORS[unit]:.3g} s"
+    return (
+        unit,
+        f"column {name}: the time, in {unit}{epoch}, with a row every {step * (factor(unit, 's') or 1.0):.3g} s",
+    )

@@ -18,7 +18,7 @@ UNITS: dict[str, dict[str, float]] = {
     "m/s": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600, "ft/s": 0.3048},
     "rad/s": {"rad/s": 1.0, "deg/s": math.radians(1.0), "mrad/s": 1e-3, "rpm": math.pi / 30.0},
     "m/s2": {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "cm/s2": 1e-2, "mm/s2": 1e-3},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
 }
 NAMES = {
     **{
@@ -33,7 +33,7 @@ NAMES = {
     **{"rad*s^-1": "rad/s", "rad s^-1": "rad/s", "kmh": "km/h", "kph": "km/h", "mps": "m/s", "m s^-1": "m/s"},
     **{"knots": "kn", "m/s^2": "m/s2", "m/s²": "m/s2", "m s^-2": "m/s2", "m s-2": "m/s2", "µs": "us", "μs": "us"},
     **{"usec": "us", "nsec": "ns", "msec": "ms", "sec": "s", "secs": "s", "seconds": "s", "meter": "m", "meters": "m"},
-    **{"metre": "m", "metres": "m"},
+    **{"metre": "m", "metres": "m", "minutes": "min", "mins": "min", "hours": "h", "hour": "h", "hrs": "h"},
 }
 COMPASS = "compass"  # a heading in degrees, clockwise from north
 WITH_UNIT = re.compile(r"(.+?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]")
@@ -70,6 +70,12 @@ def split_header(name: str) -> tuple[str, str]:
     if match and factor(match[2]) is not None:
         return match[1], NAMES.get(match[2].lower(), match[2])
     return name.strip(), ""
+
+
+def unknown_unit(name: str) -> str:
+    """Return what a header `NAME [UNIT]` or `NAME (UNIT)` has in place of a known unit; empty if there is nothing."""
+    match = WITH_UNIT.fullmatch(name.strip())
+    return match[2] if match and factor(match[2]) is None else ""
 
 
 def chosen_units(words: Iterable[str]) -> dict[str, str]:

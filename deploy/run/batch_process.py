@@ -41,6 +41,7 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
     Raises:
         CheckpointError: the run cannot be resumed.
         BadModel: the run has no model set of this robot.
+        Diverged: the weights are no longer finite; the last checkpoint and policy stay.
         Unreachable: no router answers.
     """
     robot = robot_with_task(spec.robot)

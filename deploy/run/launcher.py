@@ -13,6 +13,7 @@ from typing import Any
 from brakeline.deploy.run.processes import CONFIG, LOG, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_keys import KEYS, check_adaptable, check_signer, sign_models
+from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.run_models import models_of_new_run, models_of_resumed_run
 from brakeline.deploy.run.supervisor import SupervisedProcess, last_line
 from brakeline.deploy.run.verdict import LatestEpisodes
@@ -20,6 +21,7 @@ from brakeline.errors import LaunchError, LogError
 from brakeline.learner.checkpoint import CHECKPOINT
 from brakeline.learner.checkpoint import exists as checkpoint_exists
 from brakeline.learner.checkpoint import latest as latest_checkpoint
+from brakeline.logs.json_values import finite
 from brakeline.logs.metrics import Metrics
 from brakeline.logs.reader import count_by_key
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -129,6 +131,7 @@ class Launcher:
         self.ending = False
         self._history = RunHistory()
         self._earlier: set[Path] = set()  # files of the log from before a resumption
+        self._resumed = False  # then the figures count from the resumption on
         self._inbox = Inbox()
         self._lacks_messages = False  # because the inbox was full
         self._rejected = RejectedMessages()  # replaced by that of the bus when the run starts
@@ -140,11 +143,15 @@ class Launcher:
             show: is called several times a second with this launcher.
 
         Raises:
-            LaunchError: a process failed several times in a row; the launcher has ended the others.
+            LaunchError: the run is running already. Or a process failed several times in a row, or cannot go on; the
+                launcher has ended the others.
             Unreachable: the launcher can't listen on the endpoint.
         """
         failure: LaunchError | None = None
-        with Process(self.bus, "launcher", stderr=False, reserved=True) as process:
+        with (
+            only_launcher(self.folder),
+            Process(self.bus, "launcher", stderr=False, reserved=True) as process,
+        ):
             self._rejected = process.bus.rejected
             self._claim_folder()
             for topic in RECORDED:
@@ -173,13 +180,17 @@ class Launcher:
                 process.notes["outcome"] = f"failed: {failure}" if failure is not None else outcome
         self._drain(LAST_MESSAGES_TIMEOUT)
         figures = self.figures()
-        try:
-            write_atomically(self.folder / FIGURES, json.dumps(figures, indent=2).encode())
-        except OSError as error:  # the caller shows them all the same
-            log.error("the figures were not saved: %s", error)
+        self._save(figures)
         if failure is not None:
             raise failure
         return figures
+
+    def _save(self, figures: dict[str, Any]) -> None:
+        """Save the figures in the run's folder. A number that is not finite, such as a diverged loss, becomes null."""
+        try:
+            write_atomically(self.folder / FIGURES, json.dumps(finite(figures), indent=2, allow_nan=False).encode())
+        except OSError as error:  # the caller shows them all the same
+            log.error("the figures were not saved: %s", error)
 
     def _update_health(self, process: Process) -> None:
         """Put the totals of the run into each health message, for viewers that connect in its middle."""
@@ -193,7 +204,10 @@ class Launcher:
         process.notes.update(seed=str(config.seed), steps=str(steps))
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures that `analyse` computes from the log, and those that only the launcher knows."""
+        """Return the figures that `analyse` computes from the log, and those that only the launcher knows.
+
+        Those of a resumed run count from the resumption on; `analyse` counts the whole run.
+        """
         setup = {
             "method": self.config.method,
             "certificate": self.config.model_config.certificate if self.config.method == "ddpc" else None,
@@ -202,7 +216,7 @@ class Launcher:
             "seed": self.config.seed,
         }
         restarts = {child.spec.name: child.restarts for child in self.processes if child.restarts}
-        outcome = {"finished": self.finished, "restarts": restarts} | self._from_logs()
+        outcome = {"finished": self.finished, "resumed": self._resumed, "restarts": restarts} | self._from_logs()
         paths = {
             "folder": str(self.folder),
             "log": str(self.folder / LOG) if self.config.record else None,
@@ -266,7 +280,7 @@ class Launcher:
 
     def _claim_folder(self) -> None:
         """Write the files that the processes read, and make runs/latest point to this run."""
-        self._earlier = set(self.folder.glob(SEGMENTS))
+        self._earlier, self._resumed = set(self.folder.glob(SEGMENTS)), (self.folder / CONFIG).exists()
         write_atomically(self.folder / CONFIG, encode(self.config).encode())
         write_endpoint(self.folder, self.bus)
         if self.bus.keys is None:

@@ -43,9 +43,10 @@ class FeederSettings:
 class LoggedSteps:
     """The steps of a robot kind in logs that a learner can use, each once, in the order of the log.
 
-    The names of actors of the n-th run, from the second on, end in `.run<n>`. After the iteration `counts` has the
-    numbers of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values. `damage` has
-    a line for each part that could not be read.
+    The names of actors of the n-th run, from the second on, end in `.run<n>`. An actor that was started again and
+    counted its episodes anew is another one, whose name has `.session<n>`. After the iteration `counts` has the numbers
+    of `taken`, `duplicate` and `unusable` steps; an unusable step has wrong sizes or values. `damage` has a line for
+    each part that could not be read.
     """
 
     logs: Sequence[str]
@@ -56,7 +57,7 @@ class LoggedSteps:
     def __iter__(self) -> Iterator[pb.Step]:
         intake = StepReader(self.robot)
         for number, files in enumerate(by_run(find(self.logs)).values(), 1):
-            ledger = StepLedger()
+            ledger, sessions = StepLedger(), _Sessions()
             log_of_run = open_log(files)
             for record in log_of_run:
                 if record.topic != "step" or record.message.robot != self.robot.name:
@@ -67,6 +68,7 @@ class LoggedSteps:
                 except BadStep:
                     self.counts["unusable"] += 1
                     continue
+                step.actor = sessions.name(step)
                 if not ledger.record(step.actor, step.episode, step.step, step.index):
                     self.counts["duplicate"] += 1
                     continue
@@ -75,6 +77,25 @@ class LoggedSteps:
                     step.actor = f"{step.actor}.run{number}"
                 yield step
             self.damage += log_of_run.damage.lines
+
+
+class _Sessions:
+    """Tells apart the sessions of an actor within one log."""
+
+    def __init__(self) -> None:
+        self._names: dict[tuple[str, int], str] = {}  # of each actor and process
+        self._latest: dict[str, tuple[int, int]] = {}  # of each actor: its session, and the highest episode of that
+
+    def name(self, step: pb.Step) -> str:
+        """Return the name of a step's actor. A restarted actor keeps its name if its episodes go on."""
+        actor, process = step.actor, (step.actor, step.header.run)
+        session, episode = self._latest.get(actor, (1, -1))
+        if process not in self._names:
+            if step.episode <= episode:
+                session, episode = session + 1, -1
+            self._names[process] = actor if session == 1 else f"{actor}.session{session}"
+        self._latest[actor] = session, max(episode, step.episode)
+        return self._names[process]
 
 
 def count(logs: Sequence[str], robot: RobotWithTask) -> int:

@@ -20,7 +20,7 @@ from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
 BATCH: Literal["batch"] = "batch"  # the backend that simulates all robots in the learner's process
-MOST_IN_BATCH = 64  # robots that the certificate of one process speaks for
+MOST_IN_PROCESS = 64  # robots of one process: its certificate speaks for so many, and a question to the service, too
 FORMER_NAMES = {"recipe": "model_config"}  # names that fields have in older files
 
 T = TypeVar("T")
@@ -116,10 +116,17 @@ class RunConfig:
             raise ValueError(
                 "actors (unless there are logs to learn from), robots per actor, replicas, steps: 1 or more"
             )
+        if self.robots_per_actor > MOST_IN_PROCESS:
+            more = "" if self.backend == BATCH else ", and give more --actors"
+            raise ValueError(
+                f"a process has at most {MOST_IN_PROCESS} robots, not {self.robots_per_actor}: lower "
+                f"--robots-per-actor{more}"
+            )
         if self.penalty is not None:
-            from brakeline.messaging.task import check_penalty
+            from brakeline.messaging.task import check_penalty, robot_with_task
 
-            check_penalty(self.penalty)
+            for robot in self.robots:
+                check_penalty(self.penalty, robot_with_task(robot))
         if self.adapt and self.method != DDPC:
             raise ValueError(f"--adapt certifies model sets of the method {DDPC}, not of {self.method}")
         if self.backend == BATCH:
@@ -174,8 +181,6 @@ def _check_batch(config: RunConfig) -> None:
     for what, given in refused.items():
         if given:
             raise ValueError(f"--backend batch does not support {what}: leave it out, or use --backend processes")
-    if config.robots_per_actor > MOST_IN_BATCH:
-        raise ValueError(f"--backend batch simulates at most {MOST_IN_BATCH} robots: lower --robots-per-actor")
     from brakeline.messaging.task import robot_with_task
     from brakeline.sim.batch.batch_support import check_batch
 

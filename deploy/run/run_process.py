@@ -21,6 +21,7 @@ from brakeline.deploy.interpreter import end_with_parent
 from brakeline.deploy.run.processes import (
     CONFIG,
     HELD,
+    HOPELESS,
     LOG,
     UNFINISHED,
     ProcessSpec,
@@ -30,7 +31,7 @@ from brakeline.deploy.run.processes import (
     process_specs,
 )
 from brakeline.deploy.run.run_config import BATCH, RunConfig, load
-from brakeline.errors import BusError
+from brakeline.errors import BusError, Diverged
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
@@ -174,9 +175,9 @@ def main() -> int:
         if held:
             sys.stdin.read()
         done = work()
-    except BusError as error:
+    except (BusError, Diverged) as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
-        return 1
+        return HOPELESS if isinstance(error, Diverged) else 1
     return 0 if done else UNFINISHED
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, PYTHON
-from brakeline.deploy.run.processes import HELD, UNFINISHED, ProcessSpec
+from brakeline.deploy.run.processes import HELD, HOPELESS, UNFINISHED, ProcessSpec
 from brakeline.errors import LaunchError
 
 log = logging.getLogger("brakeline.launcher")
@@ -77,7 +77,8 @@ class SupervisedProcess:
         """Start the process if it is time, and schedule a restart if it has failed.
 
         Raises:
-            LaunchError: it failed MOST_FAILURES times in a row, and the run needs it.
+            LaunchError: it failed MOST_FAILURES times in a row, or says itself that a restart would not help, and the
+                run needs it.
         """
         now = time.monotonic()
         if self.finished or self.alive:
@@ -96,7 +97,10 @@ class SupervisedProcess:
         self.failures = 1 if now - ready > HEALTHY_AFTER else self.failures + 1
         ending = describe_end(code, lifetime)
         log_file = self.folder / "logs" / f"{self.spec.name}.log"
-        output = f"its last output: {last_line(log_file) or 'none'}"
+        said = last_line(log_file)
+        output = f"its last output: {said or 'none'}"
+        if code == HOPELESS and self.spec.needed:
+            raise LaunchError(f"{said}; see {log_file}")
         if self.failures == MOST_FAILURES:
             said = f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
             if self.spec.needed:

@@ -41,9 +41,22 @@ def verdict(figures: dict[str, Any]) -> list[str]:
         lines.append(f"next: brakeline analyse {figures['folder']} --html report.html")
     if refused := figures.get("refused"):
         lines.append(f"{refused} steps do not count: repeated, or not permitted by the learner")
+    lines += _untrained(figures)
     if not figures["finished"] and figures.get("policy") in (None, "learning"):
         lines.append(f"stopped before the last step; continue with: brakeline train --resume {figures['folder']}")
     return lines
+
+
+def _untrained(figures: dict[str, Any]) -> list[str]:
+    """Return a line for each learner of a finished run that made no update."""
+    if not figures["finished"] or figures.get("policy") not in (None, "learning"):
+        return []
+    return [
+        f"the policy of {robot} has learned nothing: the run ended within the warm-up, whose steps are random; give "
+        "more --steps, or a smaller --learner.td3.warmup"
+        for robot, learner in figures["learners"].items()
+        if learner["updates"] == 0
+    ]
 
 
 def _outcome(figures: dict[str, Any]) -> str:
@@ -53,7 +66,10 @@ def _outcome(figures: dict[str, Any]) -> str:
         for robot, row in figures["latest"].items()
     ]
     corrected = f"{figures['interventions'] / figures['steps']:.1%} of {figures['steps']} steps corrected"
-    return f"{', '.join(latest) or 'no episode ended'}; {_counted(figures['collisions'], 'collision')}; {corrected}"
+    since = "since the resumption: " if figures.get("resumed") else ""
+    return (
+        f"{since}{', '.join(latest) or 'no episode ended'}; {_counted(figures['collisions'], 'collision')}; {corrected}"
+    )
 
 
 def _answers(figures: dict[str, Any]) -> str:

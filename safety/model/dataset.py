@@ -17,6 +17,7 @@ from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Array, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.structured_text import parse_json
+from brakeline.safety.model.repeated_driving import repeated_driving
 from brakeline.safety.model.tensor_file import pack, unpack
 
 ENTRY = "dataset"
@@ -124,7 +125,7 @@ class Dataset:
         return replace(self, trajectories=tuple(_chained(chain) for chain in chains))
 
     def check(self) -> None:
-        """Check shapes, finite values, the bounds of inputs, and that no position jumps.
+        """Check shapes, finite values, the bounds of inputs, that no position jumps, and that no driving occurs twice.
 
         Raises:
             BadData: a check fails; the message says which one, and in which trajectory.
@@ -157,6 +158,11 @@ class Dataset:
             jumps = np.flatnonzero(_jump(robot, t) > 0.0)
             if len(jumps):
                 raise BadData(f"trajectory {i}: the position jumps in period {jumps[0]}: two recordings in one?")
+        if (twice := repeated_driving(robot, self.trajectories)) is not None:
+            raise BadData(
+                f"trajectories {twice.first} and {twice.second} hold the same driving, {twice.seconds:.0f} s in all: a "
+                "copy is no evidence. Give each recording once"
+            )
 
     def split(self, shares: Sequence[float]) -> list[Dataset]:
         """Split the data set into parts with whole trajectories.

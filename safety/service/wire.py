@@ -33,6 +33,7 @@ KIND_NAMES = {number: name for name, number in KIND_NUMBERS.items()}
 # Limits on the cost of a batch, which the service checks before it does the work.
 MAX_BATCH_SIZE = 2**20  # bytes: about thirty requests with a range image each
 MAX_REQUESTS = 64  # of a batch
+MAX_OTHER_FIELDS = 16  # of a batch: its nonce, and fields of later versions
 MAX_OBSTACLES = 1000  # of all requests of a batch
 FIXED_64, LENGTH, FIXED_32 = 1, 2, 5  # wire types of protobuf; the others are one varint
 DIGEST_SIZE = 16  # bytes
@@ -52,7 +53,7 @@ def batch_of(payload: bytes) -> pb.RequestBatch:
     """Return the batch in a payload. Raises BadRequest if it is not a batch, or too large."""
     if len(payload) > MAX_BATCH_SIZE:
         raise BadRequest("payload", f"{len(payload)} bytes; a request batch has at most {MAX_BATCH_SIZE}")
-    if _count_fields(payload, MAX_REQUESTS) > MAX_REQUESTS:
+    if _count_requests(payload, MAX_REQUESTS) > MAX_REQUESTS:
         raise BadRequest("requests", f"a batch has at most {MAX_REQUESTS} requests")
     try:
         batch = pb.RequestBatch.FromString(payload)
@@ -66,21 +67,26 @@ def batch_of(payload: bytes) -> pb.RequestBatch:
     return batch
 
 
-def _count_fields(payload: bytes, most: int) -> int:
-    """Return the number of fields of a message on the wire, or `most + 1` if there are more.
+def _count_requests(payload: bytes, most: int) -> int:
+    """Return the number of requests of a batch on the wire, or `most + 1` if there are more, or too many other fields.
 
     Decoding half a million empty requests would take longer than a robot can wait.
     """
-    at = count = 0
+    at = count = others = 0
     while at < len(payload) and count <= most:
-        count += 1
         tag, at = _varint(payload, at)
+        if tag >> 3 == pb.RequestBatch.REQUESTS_FIELD_NUMBER:
+            count += 1
+        else:
+            others += 1
         kind = tag & 7
         if kind in (FIXED_64, FIXED_32):
             at += 8 if kind == FIXED_64 else 4
         else:
             value, at = _varint(payload, at)
             at += value if kind == LENGTH else 0
+        if others > MAX_OTHER_FIELDS:
+            return most + 1
     return count
 
 

@@ -11,11 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from brakeline.actors import actor_process
 from brakeline.actors.actor_process import STOP_PRACTICE, ActorSettings, StopPractice, run
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.vehicle_factory import environment, fleet_world
-from brakeline.errors import RefusedByLearner
+from brakeline.errors import BadRequest, BusError, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.policy_weights import MLP
@@ -214,6 +215,7 @@ class Service:
         self.batches: list[list[str]] = []
         self.proposals: list[list[float]] = []  # of the first robot
         self.failing = self.fails_when_moving = False
+        self.failure: Exception = RuntimeError("out of order")
         bus.serve(DECIDE, self._decide, robot="ground")
 
     def _decide(self, payload: bytes, asker: str) -> bytes:
@@ -222,7 +224,7 @@ class Service:
         self.proposals.append(list(requests[0].action))
         self.failing |= self.fails_when_moving and any(requests[0].input_in_force)
         if self.failing:
-            raise RuntimeError("out of order")
+            raise self.failure
         return self._answer(payload)
 
 
@@ -285,6 +287,21 @@ def test_one_question_is_about_all_robots_of_a_process(scene):
         assert [step.header.sequence for step in own] == list(range(1, 21))
     starts = {tuple(step.true_state) for step in steps if step.index == 1}
     assert len(starts) == 3, "each robot has its own arena"
+
+
+def test_an_actor_whose_questions_are_refused_for_good_ends_with_the_reason(buses, data_folder, monkeypatch):
+    monkeypatch.setattr(actor_process, "RETRY_INTERVAL", 0.0)
+    service, scripted = Service(buses[0], data_folder), ScriptedLearner(buses[0])
+    service.failing, service.failure = True, BadRequest("obstacles", "1200 obstacles; at most 1000")
+    scripted.flow.limit.update({"actor-0": STEPS})
+    settings = ActorSettings(BusSettings(connect=buses[0].settings.listen), deadline=2.0)
+    with pytest.raises(BusError, match=r"refuses every question about these robots: .*1200 obstacles"):
+        run(settings, environment)
+
+
+def test_a_process_has_no_more_robots_than_a_question():
+    with pytest.raises(ValueError, match="1 to 64 robots, not 65: start more of them"):
+        ActorSettings(BusSettings(), robots=65)
 
 
 def test_without_the_service_a_robot_brakes_along_its_plan_waits_and_drives_on(scene):

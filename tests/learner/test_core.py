@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from brakeline.errors import CheckpointError, DamagedPart
+from brakeline.errors import CheckpointError, DamagedPart, Diverged
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
@@ -156,6 +156,23 @@ def test_flow_holds_actors_back_until_the_updates_are_made():
     assert 0 < push_to_the_limit(learner) <= 20
 
 
+@pytest.mark.parametrize("steps", [150, 400])  # the run ends before the first window is full; or after it
+def test_many_actors_with_long_windows_do_not_wait_for_each_other(steps):
+    learner = asynchronous(td3=replace(CONFIG.td3, n_step=20, warmup=60), steps=steps)
+    names = [f"actor-{i}" for i in range(16)]
+    taken = dict.fromkeys(names, 0)
+    for name in names:
+        learner.join(joining(name))
+    for _ in range(steps):
+        for name in names:
+            if taken[name] < learner.flow().limit[name]:
+                taken[name] += 1
+                learner.insert(step(taken[name], actor=name))
+        learner.work(1000)
+    assert learner.done and learner.steps == steps
+    assert learner.updates == (0 if steps == 150 else steps - 60)
+
+
 def test_a_silent_actor_holds_up_nobody_and_the_run_ends_at_its_last_step():
     learner = asynchronous(steps=300)
     index = 0
@@ -214,6 +231,32 @@ def test_restore_refuses_what_is_not_this_run_and_names_a_part_of_another_shape(
     with pytest.raises(DamagedPart) as caught:
         other.restore(tmp_path)
     assert caught.value.part == "replay"
+
+
+def test_a_diverged_training_keeps_its_last_checkpoint_and_its_last_weights(tmp_path):
+    config = replace(CONFIG, td3=replace(CONFIG.td3, critic_rate=1e18, actor_rate=1e18))
+    learner, actor = started(config)
+    run(learner, actor, 2)
+    assert learner.warming_up
+    saved = learner.save(tmp_path)
+    with pytest.raises(Diverged, match="lower learning rates"):
+        run(learner, actor)
+    with pytest.raises(Diverged):
+        learner.save(tmp_path)
+    policy_weights.decode(learner.weights().file, TOY)  # which refuses numbers that are not finite
+    resumed = Learner(TOY, config)
+    resumed.restore(tmp_path)
+    assert resumed.steps == 40 and [path.name for path in tmp_path.glob("0*")] == [saved.name]
+
+
+def test_a_checkpoint_of_a_diverged_training_is_refused(tmp_path, monkeypatch):
+    learner, actor = started()
+    run(learner, actor, 4)
+    learner._td3.critics.parameters[3] = float("inf")
+    monkeypatch.setattr(learner, "_check_finite", lambda: None)  # as in versions before there was this check
+    learner.save(tmp_path)
+    with pytest.raises(DamagedPart, match="not finite"):
+        Learner(TOY, CONFIG).restore(tmp_path)
 
 
 def test_figures():

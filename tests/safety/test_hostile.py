@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from brakeline.errors import BadRequest, BadShape
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import BOX, CYLINDER, FARTHEST, SPHERE, WALL, Obstacle, Shapes
-from brakeline.safety.service.wire import MAX_BATCH_SIZE, MAX_REQUESTS, _count_fields, batch_of
+from brakeline.safety.service.wire import MAX_BATCH_SIZE, MAX_REQUESTS, _count_requests, batch_of
 
 NEAR = 1e-6  # m: what rounding may hide of a distance
 
@@ -102,11 +102,11 @@ def test_too_many_obstacles_are_refused_before_any_decision() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_counting_fields_ends_and_raises_nothing(payload: bytes) -> None:
-    assert 0 <= _count_fields(payload, MAX_REQUESTS) <= MAX_REQUESTS + 1
+def test_counting_requests_ends_and_raises_nothing(payload: bytes) -> None:
+    assert 0 <= _count_requests(payload, MAX_REQUESTS) <= MAX_REQUESTS + 1
 
 
 @given(st.integers(0, MAX_REQUESTS + 5), st.binary(max_size=20).map(lambda data: pb.Request(robot=data.hex())))
-def test_fields_are_counted_as_the_decoder_does(count: int, request: pb.Request) -> None:
-    payload = pb.RequestBatch(requests=[request] * count).SerializeToString()
-    assert _count_fields(payload, MAX_REQUESTS) == min(count, MAX_REQUESTS + 1)
+def test_requests_are_counted_as_the_decoder_does(count: int, request: pb.Request) -> None:
+    payload = pb.RequestBatch(requests=[request] * count, nonce=b"one of a kind").SerializeToString()
+    assert _count_requests(payload, MAX_REQUESTS) == min(count, MAX_REQUESTS + 1)

@@ -22,6 +22,7 @@ from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.errors import NoSource
 
 SEPARATORS = (";", "\t", "|", ",", " ")  # a comma may be a decimal mark, and a space may be within a name
+EXCEL = re.compile(r"\s*\"?sep=.?\"?\s*", re.IGNORECASE)  # a first line that tells Excel the separator
 COMMENT = re.compile(r"\s*(?:#|%|//)")
 NUMBER = re.compile(r"\s*\"?[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[-+]?\d+)?\"?\s*", re.IGNORECASE)
 MISSING = ("", "nan", "na", "n/a", "null", "none", "-")  # in any case: a cell without a value
@@ -92,7 +93,9 @@ def read(path: Path) -> list[Table]:
 def _dialect(path: Path) -> _Dialect:
     """Find out how a file is written."""
     text, whole = _text(path)
-    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = text.splitlines()
+    for_excel = {1} if lines and EXCEL.fullmatch(lines[0]) else set()
+    numbered = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and i not in for_excel]
     comments = [(i, line) for i, line in numbered if COMMENT.match(line)]
     rows = [(i, line) for i, line in numbered if not COMMENT.match(line)]
     if not rows:

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
-from brakeline.deploy.data.unit_table import in_si
+from brakeline.deploy.data.unit_table import in_si, unknown_unit
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
@@ -99,7 +99,12 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
             candidates = candidates or [(t, usual[name]) for t in tables if usual.get(name) in t.columns]
             wanted = f"a column {name!r}" + (f" or a message with {usual[name]}" if name in usual else "")
         candidates = first_ranked(candidates)
-        if len(candidates) == 1:
+        if name not in (*options.fields, *options.units) and (foreign := _in_unknown_units(candidates)):
+            problems.append(
+                f"{name}: {', '.join(foreign)} is in no known unit; name it with --unit {name!r}=UNIT. Or convert the "
+                f"column to {unit or '1'}, and take it with --map {name!r}=COLUMN"
+            )
+        elif len(candidates) == 1:
             places[name] = _in_unit(candidates[0], name, options.units.get(name, ""), unit)
         elif candidates:
             many = ", ".join(f"{t.name}/{f}" for t, f in candidates)
@@ -154,6 +159,11 @@ def with_values(place: Place, values: Array) -> Place:
 def _folded(name: str) -> str:
     """Return a name without case, spaces and signs."""
     return "".join(character for character in name.lower() if character.isalnum())
+
+
+def _in_unknown_units(candidates: Sequence[Place]) -> list[str]:
+    """Return the fields whose header has a unit that is not known; `-` means none."""
+    return [field for _, field in candidates if unknown_unit(field) not in ("", "-")]
 
 
 def _in_unit(place: Place, name: str, given: str, unit: str) -> Place:

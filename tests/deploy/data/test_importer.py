@@ -1,5 +1,7 @@
 """Recordings of any robot, in any format, become the same data set; and what they lack is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
@@ -9,7 +11,7 @@ from brakeline.deploy.data.importer import import_sources, tables_of
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
-from brakeline.errors import NoSource
+from brakeline.errors import BadData, NoSource
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import (
@@ -108,6 +110,22 @@ def test_one_of_several_odometries_is_taken_the_others_are_named_and_can_be_chos
     assert "x, y: from /odom_kf; /odom_noisy, /odom also hold them" in toml.read_text()
 
 
+def test_a_recording_counts_once_under_whatever_name(driven, from_csv, tmp_path):
+    one, copy = (write_csv(tmp_path / name, *driven) for name in ("a.csv", "b.csv"))
+    with pytest.raises(NoSource, match=r"a\.csv and .*b\.csv hold the same driving, \d\d s in all"):
+        import_sources([one, copy], porter())
+    both = tmp_path / "both.csv"
+    both.write_bytes(one.read_bytes() + one.read_bytes())
+    with pytest.raises(BadData, match=r"hold the same driving, \d\d s in all: a copy is no evidence"):
+        import_sources([both], porter())
+    twice = replace(from_csv, trajectories=from_csv.trajectories * 2)
+    twice.save(tmp_path / "twice.safetensors")
+    with pytest.raises(BadData, match="a copy is no evidence"):
+        Dataset.load(tmp_path / "twice.safetensors")
+    other = write_csv(tmp_path / "other.csv", *drive(seconds=60.0, seed=5))
+    assert import_sources([one, other], porter()).data.periods > 1.9 * from_csv.periods
+
+
 # --- periods out of columns --------------------------------------------------------------------------------------
 
 
@@ -153,7 +171,10 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     jumped = values + np.where(np.arange(101)[:, None] >= 40, [2.0, 0, 0, 0, 0, 0, 0], 0.0)
     made = resample([table(time, jumped)], porter(), LogOptions())
     assert lengths(made) == [38, 59] and "1 jumps of the pose" in made.report.notes
-    twice = np.r_[time, time], np.vstack([values, values])
+    twice = (
+        np.r_[time, time],
+        np.vstack([values, values + np.eye(7)[0]]),
+    )  # one metre beside: the same driving twice is refused
     runs = resample([table(*twice, run=np.repeat([0, 1], 101))], porter(), LogOptions())
     assert lengths(runs) == [99, 99]
     with pytest.raises(NoSource, match="time goes back from 20 to 0 s"):
@@ -161,6 +182,23 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     values[50, 5] = 0.7
     made = resample([table(time, values)], porter(), LogOptions())
     assert lengths(made) == [49, 48] and "1 periods left out: an input was outside" in made.report.notes[0]
+
+
+@pytest.mark.parametrize("later", [0.0, 0.01])  # s, of the second robot's rows
+def test_rows_of_two_robots_are_refused_and_a_column_tells_them_apart(later):
+    time, values = steady(step=0.1)
+    times, both = np.r_[time, time + later], np.vstack([values, values + 3.0 * np.eye(7)[0]])
+    order = np.argsort(times, kind="stable")
+    with pytest.raises(NoSource, match="are these rows of several robots"):
+        resample([table(times[order], both[order])], porter(), LogOptions())
+    told_apart = table(times, both, run=np.repeat([0, 1], len(time)))
+    assert lengths(resample([told_apart], porter(), LogOptions())) == [99, 99]
+
+
+def test_rows_with_the_same_stamp_are_named(driven):
+    time, values = driven[0][:2000], driven[1][:2000]
+    made = resample([table(np.floor(time * 10.0 + 1e-6) / 10.0, values)], porter(), LogOptions())
+    assert any("rows with the stamp of the row before and another pose: left out" in note for note in made.report.notes)
 
 
 def test_angles_are_unwrapped_before_they_are_looked_at_in_between():

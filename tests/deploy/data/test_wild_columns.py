@@ -24,6 +24,8 @@ EPOCH = 1_760_000_000
 STAMPS = {
     "time": lambda t: f"{t:.2f}",
     "timestamp": lambda t: f"{t:.2f}",
+    "time [min]": lambda t: f"{t / 60.0:.12f}",
+    "time [h]": lambda t: f"{t / 3600.0:.12f}",
     "t [ms]": lambda t: f"{1e3 * t:.0f}",
     "time_us": lambda t: f"{1e6 * t:.0f}",
     "Time": lambda t: f"{EPOCH + t:.2f}",
@@ -163,6 +165,25 @@ def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
     path = write_csv(tmp_path / "drive.csv", *driven)
     for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):
         assert said in refused(capsys, ["import", path, "--robot", FILE, "--unit", word])
+
+
+def test_a_unit_that_nobody_knows_is_refused_until_it_is_named(driven, tmp_path, capsys):
+    time, values = driven
+    names = ["speed [%]" if name == "speed" else name for name in COLUMNS]
+    path = write_cells(tmp_path / "drive.csv", ("time", *names), np.column_stack([time, values]))
+    text = refused(capsys, ["import", path, "--robot", FILE])
+    assert "speed [%] is in no known unit; name it with --unit 'speed'=UNIT" in text
+    imported(path, "--unit", "speed=m/s")
+    imported(path, "--map", "speed=speed [%]")
+    path = write_cells(tmp_path / "drive.csv", ("time [m]", *COLUMNS), np.column_stack([time, values]))
+    assert "'m' is no known unit of time" in refused(capsys, ["import", path, "--robot", FILE])
+    imported(path, "--unit", "time=s")
+
+
+def test_the_first_line_for_excel_is_passed_over(driven, plain, tmp_path):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    path.write_text("sep=,\n" + path.read_text())
+    same(plain, imported(path), 1e-9)
 
 
 def test_stamps_in_a_given_unit_that_the_motion_contradicts_are_refused(driven, tmp_path, capsys):

@@ -29,7 +29,8 @@ def view() -> Launcher:
     metrics = Metrics()
     for number in range(1000):
         metrics.add("step/ground/actor-0", step(number))
-    learner = pb.LearnerMetrics(robot="ground", critic_loss=-12345.678, actor_loss=-12345.678, missing=123456)
+    values = {"critic_loss": -12345.678, "actor_loss": -12345.678, "missing": 123456, "updates": 800}
+    learner = pb.LearnerMetrics(robot="ground", **values)
     metrics.add("metrics/ground", learner)
     exchange = pb.Exchange(round_trip_ms=543.21)
     metrics.add("exchange/ground/actor-0", exchange)
@@ -99,6 +100,17 @@ def test_a_run_ends_with_a_verdict_in_three_lines_and_one_for_each_thing_that_we
     assert "brakeline train --resume /very/long" in stopped and log == "messages in the log: 6; NOT in the log: 4"
     (only,) = rows_of(ended(view, steps=0, learners={}))
     assert only.startswith("ended before the first step") and "resume" not in only
+
+
+def test_a_resumed_run_and_an_untrained_policy_are_named_as_such(view: Launcher) -> None:
+    figures = ended(view, finished=True, resumed=True)
+    assert rows_of(figures)[0].startswith("since the resumption: 97 of the last 100 episodes")
+    assert not any("learned nothing" in row for row in rows_of(figures))
+    learner = {"steps": 100, "updates": 0}
+    (untrained,) = [row for row in rows_of(figures | {"learners": {"ground": learner}}) if "learned nothing" in row]
+    assert untrained.startswith("the policy of ground has learned nothing: the run ended within the warm-up")
+    stopped = figures | {"learners": {"ground": learner}, "finished": False}
+    assert not any("learned nothing" in row for row in rows_of(stopped))
 
 
 def test_two_kinds_of_robots_and_no_episode(view: Launcher) -> None:

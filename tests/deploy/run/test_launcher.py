@@ -18,8 +18,9 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.interpreter import spawning
 from brakeline.deploy.run.display import summary
 from brakeline.deploy.run.launcher import Launcher, prepare
-from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec
+from brakeline.deploy.run.processes import UNFINISHED, ProcessSpec, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, encode, load
+from brakeline.deploy.run.run_lock import only_launcher
 from brakeline.deploy.run.supervisor import SupervisedProcess
 from brakeline.errors import DamagedPart, LaunchError
 from brakeline.learner import checkpoint
@@ -134,6 +135,27 @@ def test_a_run_whose_checkpoint_is_lost_is_not_resumed_at_step_0(tmp_path: Path)
     prepare(replace(config, from_logs=(str(tmp_path),)), tmp_path, resume=True)
 
 
+def test_a_run_that_is_running_is_not_resumed_and_its_lock_ends_with_its_process(tmp_path: Path) -> None:
+    write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+    hold = f"""
+import time
+from pathlib import Path
+from brakeline.deploy.run.run_lock import only_launcher
+with only_launcher(Path({str(tmp_path)!r})):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
+            with pytest.raises(LaunchError, match=rf"is running \(process {os.getpid()}\)"):
+                Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",))).run()
+        finally:
+            holder.kill()
+    with only_launcher(tmp_path):
+        pass
+
+
 @pytest.mark.parametrize("text", ["", "[]", "\xff", '{"a":' * 100_000, '{"steps": 1e999}', '{"robots": 5}'])
 def test_a_damaged_configuration_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.json").write_bytes(text.encode("latin1"))
@@ -167,6 +189,17 @@ def test_the_summary_says_what_the_log_lacks_not_what_the_launcher_missed(tmp_pa
     assert "run_0003.mcap is not an MCAP file" in failure
 
 
+def test_figures_that_are_not_finite_are_saved_as_null(tmp_path: Path, launcher: Launcher) -> None:
+    learner = pb.LearnerMetrics(header=pb.Header(sequence=1), robot="ground", steps=5, critic_loss=float("nan"))
+    launcher.metrics.add("metrics/ground", learner, 1)
+    launcher._save(launcher.figures() | {"loss": float("inf")})
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    assert json.loads((tmp_path / "figures.json").read_text(), parse_constant=refuse)["loss"] is None
+
+
 def test_a_run_without_a_recorder_has_no_log(tmp_path: Path) -> None:
     launcher = Launcher(RunConfig(record=False), tmp_path, BusSettings())
     assert launcher.figures()["log"] is None and launcher.processes[0].spec.name == "safety-0"
@@ -188,6 +221,13 @@ def test_a_run_that_is_resumed_as_the_latest_stays_the_latest(tmp_path: Path) ->
     (tmp_path / "latest").symlink_to("first")
     Launcher(RunConfig(), tmp_path / "latest", BusSettings(listen=("tcp/127.0.0.1:7447",)))._claim_folder()
     assert (tmp_path / "latest").readlink() == Path("first")
+
+
+def test_the_figures_say_whether_they_count_from_a_resumption_on(tmp_path: Path) -> None:
+    for resumed in (False, True):
+        launcher = Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",)))
+        launcher._claim_folder()
+        assert launcher.figures()["resumed"] is resumed
 
 
 def summary_of(figures: dict[str, object]) -> str:

@@ -47,12 +47,23 @@ def test_actors_of_different_runs_differ_and_of_one_run_stay_the_same(tmp_path: 
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         record(tmp_path / folder / "run.mcap", step(0), step(1))
-    record(tmp_path / "one" / "run_0001.mcap", step(1), step(2))
+    record(tmp_path / "one" / "run.mcap", step(1), step(2))  # goes on in run_0001.mcap
     steps = LoggedSteps([str(tmp_path / "one"), str(tmp_path / "two")], GROUND)
     assert names(steps) == [("a", 0, 0), ("a", 0, 1), ("a", 0, 2), ("a.run2", 0, 0), ("a.run2", 0, 1)]
     assert count([str(tmp_path / "one"), str(tmp_path / "two")], GROUND) == 5
     with pytest.raises(ValueError, match="no steps of quadrotor"):
         count([str(tmp_path / "one")], QUADROTOR)
+
+
+def test_two_sessions_of_an_actor_in_one_log_are_two_actors_and_a_restart_is_one(tmp_path: Path) -> None:
+    first = [step(i, header=pb.Header(run=1)) for i in range(2)]
+    restarted = [step(i, episode=1, header=pb.Header(run=2)) for i in range(2)]
+    anew = [step(i, episode=e, header=pb.Header(run=3)) for e in range(2) for i in range(2)]
+    record(tmp_path / "run.mcap", *first, *restarted, restarted[1], *anew, anew[0])
+    steps = LoggedSteps([str(tmp_path)], GROUND)
+    mine = [("a", 0, 0), ("a", 0, 1), ("a", 1, 0), ("a", 1, 1)]
+    assert names(steps) == [*mine, *(("a.session2", *numbers) for _, *numbers in mine)]
+    assert steps.counts == {"taken": 8, "duplicate": 2}
 
 
 def test_a_truncated_log_gives_its_remaining_steps(log: Path, tmp_path: Path) -> None:

@@ -66,9 +66,15 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     for name in ("actors", "steps", "replicas", "robots_per_actor"):
         with pytest.raises(ValueError, match="1 or more"):
             RunConfig(**{name: 0})
+    with pytest.raises(ValueError, match="at most 64 robots, not 65: lower --robots-per-actor, and give more --actors"):
+        RunConfig(robots_per_actor=65)
+    assert RunConfig(robots_per_actor=64).robots_per_actor == 64
     for penalty in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="a penalty is finite and not negative"):
             RunConfig(penalty=penalty)
+    with pytest.raises(ValueError, match="20000 is out of proportion to the rewards of ground: give at most 2057"):
+        RunConfig(penalty=20_000.0)
+    assert RunConfig(penalty=300.0).penalty == 300.0
     with pytest.raises(ValueError, match="--actors 1"):
         RunConfig(deterministic=True)
     assert RunConfig(deterministic=True, actors=1).learning().lockstep

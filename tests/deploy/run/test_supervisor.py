@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from brakeline.deploy.run import supervisor
-from brakeline.deploy.run.processes import ProcessSpec
+from brakeline.deploy.run.processes import HOPELESS, ProcessSpec
 from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, START_ALLOWANCE, SupervisedProcess
 from brakeline.errors import LaunchError
 
@@ -65,3 +65,21 @@ def test_a_run_goes_on_without_a_process_that_it_does_not_need(clock, tmp_path, 
     for _ in range(MOST_FAILURES):
         lives(child, clock, 0.5, 2.0)
     assert child.finished and "the run goes on without it" in caplog.text
+
+
+class Diverging(SupervisedProcess):
+    """A process that says why no restart would help."""
+
+    def start(self, held: bool = False) -> None:
+        log = self.folder / "logs" / f"{self.spec.name}.log"
+        log.parent.mkdir(exist_ok=True)
+        log.write_text("learner: Diverged: lower the learning rates\n")
+        self.popen = subprocess.Popen([sys.executable, "-c", f"raise SystemExit({HOPELESS})"])
+        self.popen.wait()
+        self.started, self.first_sign_of_life = supervisor.time.monotonic(), None
+
+
+def test_a_process_that_a_restart_does_not_help_ends_the_run_at_once_with_its_own_words(clock, tmp_path) -> None:
+    child = Diverging(ProcessSpec("learner", "learner", "ground"), tmp_path)
+    with pytest.raises(LaunchError, match=r"^learner: Diverged: lower the learning rates; see "):
+        lives(child, clock, 0.5, 2.0)
