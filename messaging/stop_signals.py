@@ -1,4 +1,4 @@
-"""Turn SIGINT and SIGTERM into an event."""
+"""Turn SIGINT, SIGTERM and SIGHUP into an event."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 REPEAT_TIME = 0.5  # signals within this time are one [s]: the kernel repeats it for each thread of a dead parent
-NUMBERS = (signal.SIGINT, signal.SIGTERM)
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
 def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[threading.Event]:
-    """Set `stop` on SIGINT and SIGTERM within the block; only in the main thread.
+    """Set `stop` on SIGINT, SIGTERM and SIGHUP (a terminal was closed) within the block; only in the main thread.
 
     A second signal more than `REPEAT_TIME` later ends the process at once, with status 128 + its number, unless
     `patient`.
@@ -31,7 +31,9 @@ def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[th
         return
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
-    before = {number: signal.signal(number, lambda *_: None) for number in NUMBERS}
+    # `nohup` has SIGHUP ignored.
+    numbers = [one for one in NUMBERS if one != signal.SIGHUP or signal.getsignal(one) != signal.SIG_IGN]
+    before = {number: signal.signal(number, lambda *_: None) for number in numbers}
     previous = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=_listen, args=(receiver, stop, patient), name="signals", daemon=True).start()
     try:

@@ -143,7 +143,9 @@ class MavlinkDecoder:
             case "HEARTBEAT" if message.autopilot in KINDS:
                 self.kind = KINDS[message.autopilot]
                 self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-                self.emergency = message.system_status in (mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY)
+                self.emergency = (
+                    message.system_status >= mavlink.MAV_STATE_CRITICAL
+                )  # also: ends its flight, powers off
                 self.custom_mode = message.custom_mode
                 self.message_counts["mode"] += 1
             case "COMMAND_ACK" if message.result != mavlink.MAV_RESULT_IN_PROGRESS:

@@ -17,7 +17,7 @@ from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVehicle
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
-from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array, resampled
+from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array, missing, resampled
 from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -199,6 +199,8 @@ class MavlinkVehicle(PeriodicVehicle):
 
     def _begin_next(self, now: float) -> None:
         """Begin a period: send its input first, then report on the period before."""
+        # Without setpoints the autopilot has braked: the inputs of missed periods would set it in motion again.
+        del self._plan[: int((now - self._due) / self._robot.period)]
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
         self._velocity = self._robot.clip_input(following, self.current_period.input)
         self._send_setpoint(now)
@@ -230,6 +232,8 @@ class MavlinkVehicle(PeriodicVehicle):
         if not (client.offboard and client.armed):
             state = client.mode if client.armed else "it is disarmed"
             return f"the autopilot does not follow our setpoints ({state})"
+        if client.estimator is not None and (unknown := missing(client.estimator)):
+            return f"its estimator does not know {', '.join(unknown)}"
         if client.outside:
             return f"the autopilot says that it is outside of its geofence ({client.outside})"
         return "the autopilot says that it is in an emergency" if client.emergency else ""

@@ -108,6 +108,16 @@ class CommandGate:
                 outcome = ask(np.where(self.robot.translates, 0.0, proposal), obstacles)
         self.outcome, self._command = outcome, command
 
+    def slip(self, periods: int) -> None:
+        """Pass over the committed plan's inputs for periods in which the process stood still.
+
+        Meanwhile the base went on with the last input, or its own timeout stopped it. The rest of the plan as it was
+        would set a robot that already stands in motion again.
+        """
+        self.stats.slips += 1
+        for _ in range(min(periods, len(self.backup_plan.plan))):
+            self.backup_plan.fallback()
+
     def begin(self, now: float, in_time: bool = True, why: str = "") -> Array:
         """Return the input (m,) of the period that begins now [s].
 

@@ -24,7 +24,7 @@ from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, Mismatch
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Array, Robot
-from brakeline.messaging.ros2 import LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
+from brakeline.messaging.ros2 import ALL_LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
 from brakeline.messaging.ros2.cdr_messages import (
     Clock,
     DiagnosticArray,
@@ -115,6 +115,7 @@ class FilterNode:
         self.gate = CommandGate(self.robot, ask, settings.name, settings.turn_aside)
         self.clock = RosSimulatedClock() if settings.sim_time else SystemClock()
         self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
+        self._missing_logged = False  # whether the log has the error that prevents decisions
         self._ending = False
         self._diagnosed_at, self._diagnosed = -math.inf, ("", "")  # s; kind and reason of the last diagnostics
         self.node = RosNode(settings.ros, settings.name, tap)
@@ -129,12 +130,14 @@ class FilterNode:
         """Run until asked to stop; then follow the committed plan to a stop."""
         due = self._first_period()
         ends = due + self.settings.seconds if self.settings.seconds else math.inf
-        while not self._stop.is_set() and due < ends:
-            due = self._period(due, self._stop)
-        self._ending, never = True, threading.Event()
-        while self.gate.backup_plan.plan.any():
-            due = self._period(due, never)
-        self._send(np.zeros(self.robot.action_dim))
+        try:
+            while not self._stop.is_set() and due < ends:
+                due = self._period(due, self._stop)
+        finally:  # also after an error: the base would go on with the last command until its own timeout
+            self._ending, never = True, threading.Event()
+            while self.gate.backup_plan.plan.any():
+                due = self._period(due, never)
+            self._send(np.zeros(self.robot.action_dim))
 
     def close(self) -> None:
         """Leave the graph."""
@@ -164,7 +167,8 @@ class FilterNode:
             self.inputs.forget()
             self._missing = "the clock was set"
         if jump or clock.now() > due + period:  # the decision was for another time
-            gate.stats.slips += not jump
+            if not jump:
+                gate.slip(int((clock.now() - due) / period))
             in_time = False
             due = math.floor(clock.now() / period) * period
         number = gate.stats.periods
@@ -186,10 +190,16 @@ class FilterNode:
                 raise InputMissing("the filter ends")
             state = self.inputs.state(began, now)
             around: tuple[Obstacle, ...] = self.inputs.obstacles(state[:2], now)
+            self.gate.decide(state, around, self.inputs.command(now), began, number)
         except InputMissing as error:
             self._missing = str(error)
             return
-        self.gate.decide(state, around, self.inputs.command(now), began, number)
+        except Exception as error:  # whatever a message holds: without a decision the robot brakes along its plan
+            if not self._missing_logged:
+                log.exception("no decision")
+            self._missing, self._missing_logged = f"no decision: {type(error).__name__}: {error}", True
+            return
+        self._missing_logged = False
         outcome = self.gate.outcome
         if outcome is not None and outcome.answer is not None:
             self._markers.put(markers(began, self.inputs.frame, outcome.answer, around))
@@ -227,7 +237,7 @@ class FilterNode:
         names, inputs, subscribe = self.settings.topics, self.inputs, self.node.subscribe
         if isinstance(self.clock, RosSimulatedClock):
             subscribe("/clock", Clock, self.clock.on_clock, SENSOR)
-        subscribe(names.fixed_transforms, TFMessage, inputs.on_fixed_transforms, LATCHED)
+        subscribe(names.fixed_transforms, TFMessage, inputs.on_fixed_transforms, ALL_LATCHED)
         if self.settings.sensors.base_frame:
             subscribe(names.transforms, TFMessage, inputs.on_transforms)
         else:

@@ -141,18 +141,21 @@ class RosInputs:
             beams, frame = self._scan
             self._check_age("the scan", float(beams.times[0]), now, self.limits.scan)
             poses = self._odometry.at(beams.times)
-            mount = self.settings.mount or self._transforms.pose(frame, self._base or frame)
+            mount, base = self.settings.mount, self._base
+            if mount is None and base:
+                mount = self._transforms.pose(frame, base)
         if poses is None:
             raise InputMissing("no odometry of when the scan was made")
         if mount is None:
-            raise InputMissing(f"no level transform from {self._base!r} to {frame!r}: give the lidar's place")
+            why = f"no level transform from {base!r} to {frame!r}" if base else "the odometry names no child frame"
+            raise InputMissing(f"{why}: give the lidar's place")
         return obstacles(beams, poses, mount, self.robot, self._errors, around)
 
     def command(self, now: float) -> RawCommand | None:
         """Return the last command; None if it is older than its age limit."""
         with self._lock:
             command = self._command
-        if command is None or now - command.at > self.limits.command:
+        if command is None or not now - command.at <= self.limits.command:  # a limit of NaN accepts nothing
             return None
         return command
 
@@ -160,7 +163,7 @@ class RosInputs:
         age = now - stamp
         if age > OTHER_CLOCK:
             raise InputMissing(f"{what} has the time of another clock: compare the clocks")
-        if age > limit:
+        if not age <= limit:
             raise InputMissing(f"{what} is {age:.2f} s old")
-        if age < -self.limits.ahead:
+        if not age >= -self.limits.ahead:
             raise InputMissing(f"{what} is {-age:.2f} s in the future: compare the clocks")

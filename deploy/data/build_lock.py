@@ -5,6 +5,7 @@ A lock ends with its process, however that ends.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from filelock import FileLock, Timeout
 from brakeline.deploy.progress import console
 
 LOCK = ".lock"
+WITHOUT_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 @contextmanager
@@ -34,12 +36,21 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def lock_at_once(file: Path) -> Iterator[bool]:
-    """Hold the lock in a file until the block ends, unless another process holds it. Yields whether it is held."""
-    lock = FileLock(file)
+    """Hold the lock in a file until the block ends, unless another process holds it. Yields whether it is held.
+
+    On a file system without locks, nobody holds any: then it yields True.
+    """
+    lock = FileLock(file, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)
     except Timeout:
         yield False
+        return
+    except (NotImplementedError, OSError) as error:
+        if getattr(error, "errno", errno.ENOSYS) not in WITHOUT_LOCKS:
+            raise
+        console.print(f"{file.parent}: its file system has no locks, so no second process is noticed", markup=False)
+        yield True
         return
     try:
         yield True

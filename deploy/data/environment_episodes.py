@@ -23,6 +23,7 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import STATE, View
 from brakeline.safety.model.dataset import Dataset, Trajectory, bends
+from brakeline.safety.model.repeated_driving import without_repeats
 from brakeline.safety.model.windows import displacement
 
 FEWEST = 3  # periods; shorter trajectories are dropped
@@ -94,7 +95,7 @@ def collect(
         sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
         chord_deviation = 0.0 if sampled else max((float(size.max()) for size in sizes), default=0.0) / 4.0
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
-    data = Dataset(robot, tuple(trajectories), about, chord_deviation)
+    data = Dataset(robot, without_repeats(robot, trajectories)[0], about, chord_deviation)
     data.check()
     return data
 

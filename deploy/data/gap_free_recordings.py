@@ -19,7 +19,7 @@ Indices = NDArray[np.signedinteger]
 GAP = 1.5  # times the usual time between two samples: a larger one is a gap
 JUMP = 2.0  # times the fastest motion: faster is a jump
 MOST_USUAL = 3.0  # times the fastest motion of the description, to which the usual speed of a log counts
-MOST_JUMPS, FEW_JUMPS = 0.01, 5  # share and number of rows with jumps, above which the rows are of several robots
+MOST_JUMPS, FEW_JUMPS = 0.1, 5  # share and number of rows with jumps, above which the rows are of several robots
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
+from brakeline.safety.model.repeated_driving import without_repeats
 
 FEWEST_STEPS = 5  # shorter trajectories are dropped
 MOST_NAMED = 5  # keys of other messages that an error names
@@ -36,7 +37,7 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
         else:
             others[record.key] += 1
     damage = "".join(f"; {cut}" for cut in log.cuts)
-    trajectories = tuple(trajectories_of(steps, robot))
+    trajectories, repeats = without_repeats(robot, tuple(trajectories_of(steps, robot)))
     if not trajectories:
         content = ", ".join(f"{count} of {key}" for key, count in others.most_common(MOST_NAMED)) or "none"
         raise BadData(
@@ -45,7 +46,8 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
         )
     data = Dataset(robot, trajectories, {"origin": "log"})
     data.check()
-    return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{damage}"
+    left_out = f"; {repeats} repeated episodes left out" if repeats else ""
+    return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"
 
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:

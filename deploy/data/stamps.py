@@ -168,7 +168,11 @@ def _unit(name: str, size: float, step: float) -> tuple[str, str]:
         declared = UNIT_NAMES.get(declared, declared)
     since_1970 = [unit for unit, scale in FACTORS.items() if EPOCH[0] <= size * scale <= EPOCH[1]]
     plausible = [unit for unit, scale in FACTORS.items() if STEPS[0] <= step * scale <= STEPS[1]]
-    unknown = declared if declared and factor(declared, "s") is None else "" if since_1970 else unknown_unit(name)
+    unknown = "" if since_1970 else unknown_unit(name)
+    if unknown == "-" or unknown.isdecimal():  # no unit, or the index of a field
+        unknown = ""
+    if declared and factor(declared, "s") is None:
+        unknown = declared
     if unknown:
         raise NoSource(
             f"column {name}: {unknown!r} is no known unit of time; name one with --unit {TIME}=UNIT: {UNITS_OF_TIME}"

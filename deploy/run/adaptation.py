@@ -22,6 +22,7 @@ from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
+from brakeline.safety.model.repeated_driving import without_repeats
 from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
 from brakeline.safety.model.windows import FREE, PLAN, windows
@@ -210,7 +211,8 @@ class Adaptation:
         widening = self.widening
         version = max(self._driving_robots().values(), key=lambda state: state.heard).version
         try:
-            data = Dataset(self.robot, tuple(trajectories_of(steps, self.robot)), {"origin": "adaptation", "why": why})
+            trajectories, _ = without_repeats(self.robot, tuple(trajectories_of(steps, self.robot)))
+            data = Dataset(self.robot, trajectories, {"origin": "adaptation", "why": why})
             data.check()
             model, report = certify(data, ModelConfig(mode=ONE_STEP))
             looser = _looser(model, self.in_use(version), widening, data)

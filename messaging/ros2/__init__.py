@@ -4,7 +4,18 @@ The node has a Zenoh session of its own, beside the bus. The bus has one schema,
 its senders. In a ROS graph the names, types, QoS and senders are not ours, so those rules cannot hold here.
 """
 
-from brakeline.messaging.ros2.rmw_names import LATCHED, SENSOR, GraphEntity, Qos
+from brakeline.messaging.ros2.rmw_names import ALL_LATCHED, LATCHED, SENSOR, GraphEntity, Qos
 from brakeline.messaging.ros2.ros2_node import ROUTER, MessageTap, RosNode, RosPublisher, RosSettings
 
-__all__ = ["LATCHED", "ROUTER", "SENSOR", "GraphEntity", "MessageTap", "Qos", "RosNode", "RosPublisher", "RosSettings"]
+__all__ = [
+    "ALL_LATCHED",
+    "LATCHED",
+    "ROUTER",
+    "SENSOR",
+    "GraphEntity",
+    "MessageTap",
+    "Qos",
+    "RosNode",
+    "RosPublisher",
+    "RosSettings",
+]

@@ -45,6 +45,7 @@ class Qos:
 
 SENSOR = Qos(depth=5, reliable=False)  # the sensor profile of ROS
 LATCHED = Qos(depth=1, latched=True)
+ALL_LATCHED = Qos(depth=100, latched=True)  # as tf2 subscribes to /tf_static: each publisher has a part
 
 
 def full_name(name: str, namespace: str = "/", node: str = "") -> str:

@@ -59,6 +59,19 @@ def repeated_driving(robot: Robot, trajectories: Sequence[Trajectory]) -> Repeat
     return None if seconds < LEAST else RepeatedDriving(int(owner[origins[0]]), int(owner[copies[0]]), seconds)
 
 
+def without_repeats(robot: Robot, trajectories: Sequence[Trajectory]) -> tuple[tuple[Trajectory, ...], int]:
+    """Return the trajectories without those that repeat an earlier one, and how many are left out.
+
+    For steps that belong together, such as those of a log or an environment: an actor that begins again with the same
+    seeds drives the same episodes.
+    """
+    unique = {(t.states.tobytes(), t.inputs.tobytes()): t for t in reversed(trajectories)}
+    kept = list(reversed(unique.values()))
+    while (twice := repeated_driving(robot, kept)) is not None:  # a part of an episode
+        del kept[twice.second]
+    return tuple(kept), len(trajectories) - len(kept)
+
+
 def _chains(trajectories: Sequence[Trajectory]) -> NDArray[np.intp]:
     """Return a number for each trajectory, which one that goes on where the one before it ends shares with that one."""
     goes_on = [np.array_equal(one.states[-1], two.states[0]) for one, two in pairwise(trajectories)]

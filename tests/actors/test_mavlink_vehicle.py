@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -172,6 +173,35 @@ def test_a_period_outside_of_the_geofence_is_lost(flying: Flying) -> None:
     assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.current_period.number + 2).lost
     vehicle._client.outside = ""
     assert recovers(vehicle)
+
+
+@of_one_autopilot
+def test_a_period_whose_position_the_estimator_does_not_know_is_lost(flying: Flying) -> None:
+    """Also if telemetry goes on: the autopilot extrapolates what it no longer measures."""
+    vehicle, _, _ = flying
+    healthy, lost = vehicle._client.estimator, ""
+    for _ in range(25):  # a message of the healthy estimator comes twice a second
+        vehicle._client.estimator = 0
+        if "its estimator does not know" in (lost := vehicle.wait(vehicle.current_period.number + 1).lost):
+            break
+    assert "its estimator does not know" in lost and "velocity" in lost
+    vehicle._client.estimator = healthy
+    assert recovers(vehicle)
+
+
+@of_one_autopilot
+def test_after_a_standstill_of_the_process_the_plan_does_not_go_on_where_it_was(flying: Flying) -> None:
+    """Without setpoints the vehicle has braked: the inputs of the missed periods would set it in motion again."""
+    vehicle, _, _ = flying
+    begins = vehicle.current_period.number + 2
+    rows = np.outer(0.05 * np.arange(9, 0, -1), np.ones(3))
+    assert vehicle.commit(rows, begins)
+    assert vehicle.wait(begins).input == pytest.approx(rows[0])
+    with vehicle._changed:
+        time.sleep(3.5 * vehicle._robot.period)
+    after = vehicle.wait(vehicle.current_period.number + 1)
+    assert after.input[0] <= rows[after.number - begins + 2, 0] + 1e-9
+    assert vehicle.timing.slips >= 1
 
 
 def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:

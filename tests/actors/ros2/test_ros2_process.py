@@ -14,7 +14,7 @@ from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFF
 from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings, driven
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RawCommand, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
-from brakeline.errors import Mismatch
+from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle, Shapes
@@ -90,6 +90,15 @@ def test_a_command_that_is_not_finite_is_a_failsafe():
     assert gate.begin(0.2).tolist() == [0.2, 0.0]
     gate.decide(STATE, (), command(float("nan"), number=2), 0.2, 1)
     assert gate.begin(0.4).tolist() == [0.0, 0.0] and (gate.kind, gate.reason) == ("failsafe", NOT_FINITE)
+
+
+def test_after_a_standstill_of_the_process_the_plan_does_not_go_on_where_it_was():
+    gate = CommandGate(ROBOT, allow)
+    gate.decide(STATE, (), command(0.25), 0.0, 0)
+    gate.begin(0.2)
+    gate.backup_plan.plan[:] = 0.1  # a robot that brakes slowly
+    gate.slip(1_000_000)
+    assert gate.begin(9.0).tolist() == [0.0, 0.0] and not gate.backup_plan.plan.any() and gate.stats.slips == 1
 
 
 def test_without_a_command_the_proposal_is_to_stand():
@@ -289,6 +298,21 @@ def test_a_missing_input_stops_the_robot_until_it_comes_again_and_the_end_of_the
         robot.drives()
     assert robot.speeds[-1] == 0.0 and not node_under_test.gate.backup_plan.plan.any()
     assert node_under_test.gate.stats.kinds["allowed"] > 0
+
+
+def test_an_error_in_a_decision_brakes_the_robot_and_the_process_goes_on():
+    """Such as an obstacle at 1e200 m, or more obstacles than a request may hold."""
+    with steered() as (robot, node_under_test):
+        robot.drives()
+        ask = node_under_test.gate._ask
+
+        def refuse(requests):
+            raise BadRequest("obstacles", "1321 obstacles; at most 1000")
+
+        node_under_test.gate._ask = refuse
+        robot.stops("at most 1000")
+        node_under_test.gate._ask = ask
+        robot.drives()
 
 
 def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():

@@ -313,6 +313,30 @@ def test_the_message_names_the_missing_input():
         bare.obstacles(np.zeros(2), 10.1)
 
 
+def test_without_a_child_frame_the_lidar_has_no_place():
+    """A lidar that looks backwards would show a wall ahead as one behind if its place counted as the robot's centre."""
+    bare = RosInputs(ROBOT, SensorSettings(), AgeLimits())
+    bare.on_fixed_transforms(cdr.TFMessage(transforms=[transform("base_footprint", "base_scan", -0.03)]))
+    bare.on_scan(scan_of(np.full(BEAMS, 1.0)))
+    message = odometry(10.0)
+    message.child_frame_id = ""
+    bare.on_odometry(message)
+    with pytest.raises(InputMissing, match="names no child frame: give the lidar's place"):
+        bare.obstacles(np.zeros(2), 10.1)
+
+
+def test_an_age_limit_that_is_no_number_accepts_nothing():
+    limits = AgeLimits(odometry=math.nan, scan=math.nan, command=math.nan)
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose()), limits)
+    inputs.on_odometry(odometry(10.0))
+    inputs.on_scan(scan_of(np.full(BEAMS, math.inf)))
+    inputs.on_command(cdr.twist(0.2, 0.1), 10.0)
+    assert inputs.command(10.0) is None
+    for ask in (lambda: inputs.state(10.0, 10.0), lambda: inputs.obstacles(np.zeros(2), 10.0)):
+        with pytest.raises(InputMissing):
+            ask()
+
+
 def test_transforms_can_replace_odometry():
     inputs = RosInputs(ROBOT, SensorSettings(base_frame="base"), AgeLimits())
     for i in range(30):

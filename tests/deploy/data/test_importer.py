@@ -195,6 +195,13 @@ def test_rows_of_two_robots_are_refused_and_a_column_tells_them_apart(later):
     assert lengths(resample([told_apart], porter(), LogOptions())) == [99, 99]
 
 
+def test_a_robot_that_is_put_back_every_few_seconds_is_one_robot():
+    time, values = steady(step=0.1)
+    values[:, 0] -= 3.0 * (np.arange(len(time)) // 30)  # m
+    made = resample([table(time, values)], porter(), LogOptions())
+    assert lengths(made) == [13] * 6 + [9]
+
+
 def test_rows_with_the_same_stamp_are_named(driven):
     time, values = driven[0][:2000], driven[1][:2000]
     made = resample([table(np.floor(time * 10.0 + 1e-6) / 10.0, values)], porter(), LogOptions())

@@ -260,6 +260,24 @@ def test_trajectories_from_a_log_are_cut_at_gaps_episodes_actors_and_restarts():
         assert np.allclose(t.inputs[:, 1], 0.01 * (t.states[1:, 4] % 10))
 
 
+def test_episodes_that_a_restarted_actor_drove_again_count_once(tmp_path):
+    """It began again with the same seeds; the last episode of the first session was cut."""
+    episodes = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 80, 3))
+
+    def session(run, lengths):
+        for number, length in enumerate(lengths):
+            for k, (a, b, c) in enumerate(episodes[number][:length]):
+                about = {"actor": "a", "robot": "ground", "episode": number, "step": k, "header": pb.Header(run=run)}
+                place = [0.001 * k, 0.001 * a]
+                yield pb.Step(**about, state=[*place, 0.0, 0.0, c], action=[0.1, b], path=place * 10)
+
+    log = [*session(1, (80, 60)), *session(2, (80, 80, 80))]
+    written(tmp_path / "run.mcap", ((f"step/ground/{s.actor}", s, i) for i, s in enumerate(log)))
+    data, said = from_log(tmp_path / "run.mcap", GROUND, len(log))
+    assert sorted(len(t.inputs) for t in data.trajectories) in ([59, 79, 79], [79, 79, 79])
+    assert "2 repeated episodes left out" in said
+
+
 def test_the_last_steps_of_a_log(tmp_path):
     made = [*steps("a", 0, range(50)), *steps("a", 1, range(50))]
     log = written(tmp_path / "run.mcap", (("step/ground/a", step, i) for i, step in enumerate(made)))

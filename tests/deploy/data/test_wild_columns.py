@@ -177,6 +177,8 @@ def test_a_unit_that_nobody_knows_is_refused_until_it_is_named(driven, tmp_path,
     imported(path, "--map", "speed=speed [%]")
     path = write_cells(tmp_path / "drive.csv", ("time [m]", *COLUMNS), np.column_stack([time, values]))
     assert "'m' is no known unit of time" in refused(capsys, ["import", path, "--robot", FILE])
+    for name in ("time [-]", "time [0]"):  # no unit, and the index of a field
+        imported(write_cells(tmp_path / "drive.csv", (name, *COLUMNS), np.column_stack([time, values])))
     imported(path, "--unit", "time=s")
 
 

@@ -1,5 +1,7 @@
 """Test the launcher against malformed messages, and its processes against modules in the working directory."""
 
+import errno
+import fcntl
 import io
 import itertools
 import json
@@ -152,6 +154,18 @@ with only_launcher(Path({str(tmp_path)!r})):
                 Launcher(RunConfig(), tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",))).run()
         finally:
             holder.kill()
+    with only_launcher(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_run_begins_on_a_file_system_without_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
     with only_launcher(tmp_path):
         pass
 
