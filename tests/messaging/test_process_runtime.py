@@ -145,6 +145,20 @@ def test_a_signal_that_another_thread_was_handed(spawn: Spawn) -> None:
     ended(process)
 
 
+def test_a_closed_terminal_ends_a_process_in_order_but_not_under_nohup(spawn: Spawn) -> None:
+    process = spawn(WAITS.format(wait="stop.wait()"))
+    process.send_signal(signal.SIGHUP)
+    ended(process)
+    with stop_on_signals(threading.Event()) as stop:
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        try:
+            with stop_on_signals(threading.Event()):
+                signal.raise_signal(signal.SIGHUP)
+                assert not stop.wait(0.2)
+        finally:
+            signal.signal(signal.SIGHUP, before)
+
+
 def test_the_handlers_are_restored_and_another_thread_changes_none() -> None:
     before = [signal.getsignal(number) for number in NUMBERS]
     with stop_on_signals(threading.Event()) as stop:

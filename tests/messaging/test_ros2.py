@@ -14,7 +14,7 @@ from rosbags.typesys.stores import Stores, get_typestore
 
 from brakeline.errors import BadRosName, Malformed, Unreachable
 from brakeline.messaging.free_ports import free_endpoint
-from brakeline.messaging.ros2 import LATCHED, SENSOR, GraphEntity, Qos, RosNode, RosSettings
+from brakeline.messaging.ros2 import ALL_LATCHED, LATCHED, SENSOR, GraphEntity, Qos, RosNode, RosSettings
 from brakeline.messaging.ros2 import cdr_messages as cdr
 from brakeline.messaging.ros2.rmw_names import (
     NODE,
@@ -26,6 +26,7 @@ from brakeline.messaging.ros2.rmw_names import (
     gid_of,
     topic_key,
 )
+from tests.actors.ros2.test_ros_inputs import transform
 from tests.waiting import until
 
 KINDS = (
@@ -177,6 +178,18 @@ def test_a_later_subscriber_gets_latched_messages(nodes):
     received = []
     nodes("late").subscribe("/tf_static", cdr.TFMessage, received.append, LATCHED)
     until(lambda: received, "the transforms of before", 20.0)
+
+
+def test_a_later_subscriber_gets_the_static_transforms_of_every_publisher(nodes):
+    """A robot has several: each of its drivers publishes the place of its sensor once."""
+    frames, received = {"laser", "camera", "imu", "sonar"}, []
+    nodes("router")
+    for frame in frames:
+        message = cdr.TFMessage(transforms=[transform("base", frame)])
+        nodes(frame).publisher("/tf_static", cdr.TFMessage, LATCHED).put(message)
+    time.sleep(0.5)  # all have found each other: then their messages arrive together
+    nodes("late").subscribe("/tf_static", cdr.TFMessage, received.append, ALL_LATCHED)
+    until(lambda: {m.transforms[0].child_frame_id for m in received} == frames, lambda: f"all of {received}", 20.0)
 
 
 def test_the_graph_lists_all_entities_of_a_node_until_it_is_closed(nodes):
