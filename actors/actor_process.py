@@ -73,10 +73,10 @@ class ActorSettings:
         if self.penalty is not None:
             check_penalty(self.penalty, robot_with_task(self.robot))
         if not 1 <= self.robots <= MAX_REQUESTS:
-            raise ValueError(f"a process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more of them")
+            raise ValueError(f"a process has 1 to {MAX_REQUESTS} robots, not {self.robots}: start more actors")
 
 
-FOR_GOOD = f"{Refused.__name__}: {BadRequest.__name__}"  # begin of a failure that no repetition of a question mends
+FOR_GOOD = f"{Refused.__name__}: {BadRequest.__name__}"  # how a failure begins that asking again does not mend
 
 
 class EnvironmentFactory(Protocol):

@@ -122,7 +122,7 @@ Item = Row | Header | Metadata | Attachment | DamagedBytes
 
 
 class Undeclared(ValueError):
-    """Messages of a chunk that nothing readable declares a channel for.
+    """Messages of a chunk on channels that no readable record declares.
 
     Attributes:
         size: of these messages, bytes.

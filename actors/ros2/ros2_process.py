@@ -115,7 +115,7 @@ class FilterNode:
         self.gate = CommandGate(self.robot, ask, settings.name, settings.turn_aside)
         self.clock = RosSimulatedClock() if settings.sim_time else SystemClock()
         self._missing = "not begun"  # why there is no decision about the next period; empty: there is one
-        self._missing_logged = False  # whether the log has the error that prevents decisions
+        self._error_logged = False  # since the last decision
         self._ending = False
         self._diagnosed_at, self._diagnosed = -math.inf, ("", "")  # s; kind and reason of the last diagnostics
         self.node = RosNode(settings.ros, settings.name, tap)
@@ -195,11 +195,11 @@ class FilterNode:
             self._missing = str(error)
             return
         except Exception as error:  # whatever a message holds: without a decision the robot brakes along its plan
-            if not self._missing_logged:
+            if not self._error_logged:
                 log.exception("no decision")
-            self._missing, self._missing_logged = f"no decision: {type(error).__name__}: {error}", True
+            self._missing, self._error_logged = f"no decision: {type(error).__name__}: {error}", True
             return
-        self._missing_logged = False
+        self._error_logged = False
         outcome = self.gate.outcome
         if outcome is not None and outcome.answer is not None:
             self._markers.put(markers(began, self.inputs.frame, outcome.answer, around))

@@ -24,7 +24,7 @@ def nominal_stopping_distance(robot: Robot) -> float:
 
 
 def stands_somewhere(robot: Robot) -> bool:
-    """Return whether a state meets all limits whose speeds and accelerations are zero, but for those that are held."""
+    """Return whether the robot can stand within its limits: only speeds whose input is held need not be zero."""
     if not robot.limits:
         return True
     from scipy.optimize import linprog  # here: it takes half a second to load

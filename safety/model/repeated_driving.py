@@ -73,13 +73,13 @@ def without_repeats(robot: Robot, trajectories: Sequence[Trajectory]) -> tuple[t
 
 
 def _chains(trajectories: Sequence[Trajectory]) -> NDArray[np.intp]:
-    """Return a number for each trajectory, which one that goes on where the one before it ends shares with that one."""
+    """Number the trajectories (T,); one that begins where the one before it ends has the same number."""
     goes_on = [np.array_equal(one.states[-1], two.states[0]) for one, two in pairwise(trajectories)]
     return np.cumsum([0, *(not on for on in goes_on)])
 
 
 def _window_values(words: Words, length: int) -> Words:
-    """Return a number for each window of so many rows, which differs for windows that differ."""
+    """Return a hash of each window of `length` rows."""
     draw = np.random.default_rng(0)
     factors = draw.integers(0, 2**63, words.shape[1], np.uint64) * np.uint64(2) + np.uint64(1)
     row = (words * factors).sum(1, dtype=np.uint64)

@@ -300,7 +300,7 @@ def test_an_actor_whose_questions_are_refused_for_good_ends_with_the_reason(buse
 
 
 def test_a_process_has_no_more_robots_than_a_question():
-    with pytest.raises(ValueError, match="1 to 64 robots, not 65: start more of them"):
+    with pytest.raises(ValueError, match="1 to 64 robots, not 65: start more actors"):
         ActorSettings(BusSettings(), robots=65)
 
 
