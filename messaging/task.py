@@ -196,7 +196,7 @@ class Task:
     steps: int = 60_000  # training steps in a comparison
     learner: dict[str, Any] = field(default_factory=dict)  # settings of TD3 for this task, in place of the defaults
     batch: dict[str, Any] = field(default_factory=dict)  # more of them for `train --backend batch`
-    at_once: int = 64  # robots that train at once in a comparison, where batches simulate them
+    at_once: int = 16  # robots that train at once in a comparison, where batches simulate them
     simulator_version: int = 1  # raise it if the motion changes: what an older simulator recorded is recorded again
     turn_aside: bool = False  # the filter turns blocked robots aside (docs/method.md §4)
     symmetry: Literal["none", "turns"] = "none"  # turns: the task is invariant to quarter turns and mirroring

@@ -53,10 +53,13 @@ Begin = Callable[[pb.Episode], object]
 
 
 class CellRun:
-    """The run of one cell in a folder."""
+    """The run of one cell in a folder.
 
-    def __init__(self, cell: CellConfig, folder: Path, say: Report) -> None:
-        self.cell, self.folder, self.say = cell, folder, say
+    seed_key: of the episodes that evaluate it.
+    """
+
+    def __init__(self, cell: CellConfig, folder: Path, say: Report, seed_key: int = FRESH) -> None:
+        self.cell, self.folder, self.say, self.seed_key = cell, folder, say, seed_key
         self.robot = robot_with_task(cell.robot)
         methods = {METHODS[cell.method].filter, *(trial.method for trial in cell.trials())} - {NONE}
         self.models = {method: method_for(self.robot, method, cell.model_config) for method in methods}
@@ -149,13 +152,13 @@ class CellRun:
         policy = network_named(name, self.robot, self.cell.seed)
         with self._log(trial.name, trial) as log:
             if self.cell.backend == "single":
-                driver, ask = self._driver(trial, FRESH, trial.name)
+                driver, ask = self._driver(trial, self.seed_key, trial.name)
                 table = run_trial(driver, driving(policy), ask, trial.episodes, log)
             else:
                 table = self._evaluate_batch(trial, policy, log)
         figures = _checked(table, log.path)
         if self.cell.backend == "batch":
-            driver, ask = self._driver(trial, FRESH, trial.name)
+            driver, ask = self._driver(trial, self.seed_key, trial.name)
             figures["decision_ms"] = run_trial(driver, driving(policy), ask, min(TIMED, trial.episodes)).decision_ms()
         return figures
 
@@ -168,7 +171,7 @@ class CellRun:
             log.put_step(step)
 
         begin, numbers = partial(log.put, EPISODE), range(trial.episodes)
-        drive_episodes(self.robot, self._safety(trial), policy, trial.arena, FRESH, numbers, take, begin)
+        drive_episodes(self.robot, self._safety(trial), policy, trial.arena, self.seed_key, numbers, take, begin)
         return table
 
     def _safety(self, trial: TrialConfig) -> BatchMethod | None:

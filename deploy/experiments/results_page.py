@@ -339,10 +339,10 @@ The probability that a run of ours reaches more goals than a run of the other me
 (Agarwal et al. 2021). 0.5: no difference.
 """
 TUNING = """\
-Every rival tries as many values of one setting, with the same number of episodes. A filter: 60 with A*, 60 with a
-greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy policy, then the
-most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own and 120
-episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin of ours
+Every rival tries as many values of one setting, with as many episodes, which evaluate nothing else. A filter: 120
+with A*, 120 with a greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy
+policy, then the most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own
+and 120 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin of ours
 follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map: it was
 chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from trainings of
 ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share
@@ -358,9 +358,8 @@ THREATS = """## Threats to validity
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
   data and in models by hand: see *Methods*. The equations by hand describe these
   simulated robots well.
-- **Tuning.** Each rival tuned one setting over four values, a filter on the first 60 and a learner on the first 120 of
-  the episodes in `default` that also evaluate it. Penalty, its growth and imitation were chosen on trainings of ours
-  whose seeds are in the table. More tuning may help every method, also ours. Where the
+- **Tuning.** Each rival tuned one setting over four values, in `default`. Penalty, its growth and imitation were chosen
+  on trainings of ours whose seeds are in the table. More tuning may help every method, also ours. Where the
   best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from one seed.
 - **Turning aside.** Our filter turns a blocked robot aside (`docs/method.md`, section 4). The rivals' filters do not;
   the same could be done with them.

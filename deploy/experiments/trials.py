@@ -217,9 +217,11 @@ def run_trial(
     return table
 
 
-def fresh_trial(robot: RobotWithTask, arena: str, policy: str, question: Ask | None, episodes: int) -> EpisodeTable:
+def fresh_trial(
+    robot: RobotWithTask, arena: str, policy: str, question: Ask | None, episodes: int, seed_key: int = FRESH
+) -> EpisodeTable:
     """Run a policy by its name through fresh episodes, which no training has."""
-    driver = EpisodeRunner(robot, environment(robot, arena, FRESH), ActorIdentity("trial", 0, 0))
+    driver = EpisodeRunner(robot, environment(robot, arena, seed_key), ActorIdentity("trial", 0, 0))
     return run_trial(driver, policy_named(policy, robot, 0), question, episodes)
 
 

@@ -4,9 +4,11 @@ Each rival tries four values. Among the values of a filter with which A* loses n
 collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then
 by the interventions on A*. The results are the `rivals` of the task files.
 
-A learner trains once with each value, from a seed that no comparison uses, and drives 120 fresh episodes in the first
+A learner trains once with each value, from a seed that no comparison uses, and drives 120 episodes in the first
 arena. Among the values whose goals come within `NEARLY` of the most, its best one has the fewest collisions, then the
 most goals.
+
+The episodes of a tuning evaluate nothing else, so the choice cannot favour a value by the rooms of the comparison.
 
 results/<robot>/tuning-<method>-<value>.json
 """
@@ -29,7 +31,8 @@ from brakeline.safety.model.model_config import CBF, DDPC, PSF, SAILR, SECAS, Mo
 from brakeline.safety.rivals.pretrained import Pretrained
 
 SEED = 1000  # of the trainings
-EPISODES = 60  # for each of the two policies that try a filter
+EPISODES = 120  # of a learner, and of each of the two policies that try a filter
+SEED_KEY = 2_000_000  # of the episodes of the tunings, which no training and no evaluation has
 NEARLY = 0.05  # of the episodes
 SETTINGS: dict[str, tuple[str, tuple[float, ...]]] = {  # of learners: field of `TD3Config`, values
     "lagrange": ("multiplier_rate", (1.0, 3.0, 10.0, 30.0)),
@@ -52,13 +55,15 @@ def values_of(method: str, robot: RobotWithTask) -> tuple[float, ...]:
 
 
 def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episodes: int) -> dict[str, Any]:
-    """Return the figures of the model with another value of `SETTING` on fresh episodes of each policy.
+    """Return the figures of the model with another value of `SETTING` on the tuning's episodes, with each policy.
 
     value: of SECAS, its margin to the footprint. The interventions are a share of the steps.
     """
     setting = robot.footprint + value if model.method == SECAS else value
     question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    oracle, greedy = (fresh_trial(robot, "default", policy, question, episodes) for policy in (ORACLE, GREEDY))
+    oracle, greedy = (
+        fresh_trial(robot, "default", policy, question, episodes, SEED_KEY) for policy in (ORACLE, GREEDY)
+    )
     reached, driven = oracle.columns(), greedy.columns()
     return {
         "value": value,
@@ -86,6 +91,7 @@ class FilterTuning:
     value: float
     physics: int
     episodes: int = EPISODES
+    seed_key: int = SEED_KEY
 
     @property
     def name(self) -> str:
@@ -110,6 +116,7 @@ class LearnerTuning:
     method: str
     value: float
     cell: CellConfig
+    seed_key: int = SEED_KEY
 
     @property
     def name(self) -> str:
@@ -120,7 +127,7 @@ class LearnerTuning:
         """Train and evaluate, and return the figures."""
         from brakeline.deploy.experiments.cell_run import CellRun
 
-        result = CellRun(self.cell, folder, say).result()
+        result = CellRun(self.cell, folder, say, self.seed_key).result()
         episodes = next(iter(result["evaluations"].values()))["episodes"]
         return {
             "study": configuration(self),
@@ -153,7 +160,7 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
             used = learning(TD3Config(), method, task.learner)
             for value in values:
                 changed: dict[str, Any] = {name: value}
-                own = replace(cell, td3=replace(used, **changed), episodes=2 * EPISODES)
+                own = replace(cell, td3=replace(used, **changed), episodes=EPISODES)
                 jobs.append(LearnerTuning(robot, method, value, own))
         elif rival not in (NONE, DDPC) and METHODS[method].learner != SAC_LEARNER:
             values = values_of(rival, robot_with_task(robot))

@@ -12,9 +12,16 @@ from brakeline.deploy.experiments import bootstrap, conservatism
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
 from brakeline.deploy.experiments.conservatism import Conservatism
+from brakeline.deploy.experiments.evaluate import FRESH
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.results_page import RobotResults, page, stored_cells
-from brakeline.deploy.experiments.tuning_trials import FilterTuning, LearnerTuning, best_learner, tuning_jobs
+from brakeline.deploy.experiments.tuning_trials import (
+    SEED_KEY,
+    FilterTuning,
+    LearnerTuning,
+    best_learner,
+    tuning_jobs,
+)
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import robot_with_task
@@ -122,6 +129,9 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
     counts = {job.method: sum(other.method == job.method for other in jobs) for job in jobs}
     assert counts == dict.fromkeys(("sailr", "secas", "lagrange", "cbf", "psf", "sac"), 4)
     assert len({job.name for job in jobs}) == len(jobs)
+    assert {job.seed_key for job in jobs} == {SEED_KEY} and abs(SEED_KEY - FRESH) > 1000, (
+        "other rooms than the evaluation"
+    )
     assert {job.cell.td3.multiplier_rate for job in jobs if job.method == "lagrange"} == {1.0, 3.0, 10.0, 30.0}
     for job in jobs:
         if isinstance(job, FilterTuning):

@@ -7,7 +7,9 @@ import pytest
 
 from brakeline.deploy.data.rival_pretraining import CONFIGS, SailrConfig, SecasConfig, config_for, made_by, pretrain
 from brakeline.deploy.data.rival_rollouts import costs, transitions
-from brakeline.deploy.experiments.tuning_trials import best_threshold, try_threshold, values_of
+from brakeline.deploy.experiments import trials
+from brakeline.deploy.experiments.evaluate import FRESH
+from brakeline.deploy.experiments.tuning_trials import SEED_KEY, best_threshold, try_threshold, values_of
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.safety.methods import ready
 from tests.robots import GROUND, QUADROTOR
@@ -67,6 +69,13 @@ def test_a_threshold_that_never_steps_in_and_one_that_always_does():
     never, always = (try_threshold(model, GROUND, value, 1) for value in (1.0, -1.0))
     assert never["oracle_goals"] == 1 and never["oracle_interventions"] == 0.0
     assert always["oracle_goals"] == 0 and always["oracle_interventions"] == 1.0 and always["greedy_collisions"] == 0
+
+
+def test_a_tuning_drives_other_rooms_than_the_evaluation(monkeypatch):
+    keys, created = [], trials.environment
+    monkeypatch.setattr(trials, "environment", lambda *given: (keys.append(given[2]), created(*given))[1])
+    try_threshold(pretrain(GROUND, SailrConfig(**LITTLE)), GROUND, 1.0, 1)
+    assert keys == [SEED_KEY, SEED_KEY] and SEED_KEY != FRESH
 
 
 def test_each_robot_has_values_of_its_own():
