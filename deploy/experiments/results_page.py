@@ -342,11 +342,10 @@ TUNING = """\
 Every rival tries as many values of one setting, with as many episodes, which evaluate nothing else. A filter: 120
 with A*, 120 with a greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy
 policy, then the most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own
-and 120 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin of ours
-follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map: it was
-chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from trainings of
-ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share
-TD3's other settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
+and 120 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin
+of ours follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map:
+it was chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from
+trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share TD3's other settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 
