@@ -345,7 +345,8 @@ policy, then the most of its goals, then the fewest interventions on A*. A learn
 and 120 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin
 of ours follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map:
 it was chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from
-trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share TD3's other settings, and those were chosen on ours (`deploy/experiments/experiments.md`).
+trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share TD3's other settings, and those
+were chosen on ours (`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 
