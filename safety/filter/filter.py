@@ -23,22 +23,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brakeline.messaging.robot import Array
-from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
-from brakeline.safety.filter.backup_plan import UNVERIFIED
+from brakeline.messaging.scan import MAX_SCAN_AGE
 from brakeline.safety.filter.constraints import TubeConstraints
-from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
 from brakeline.safety.filter.plan_inputs import PlanInputs, recorded_inputs
 from brakeline.safety.filter.plan_search import DecisionRecord, PlanCandidate, PlanSearch
 from brakeline.safety.filter.qp import QPBuilder
-from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
+from brakeline.safety.filter.recovery_search import RecoverySearch
 from brakeline.safety.filter.request import (
     ADJUSTED,
     ALLOWED,
     FAILSAFE,
     NOT_FINITE,
-    RECOVERING,
     Decision,
     FastRequestCheck,
     Request,
@@ -52,7 +49,6 @@ from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
-from brakeline.safety.perception.scan_free_space import shows_free
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.batch_filter import BatchFilter
@@ -208,7 +204,7 @@ class Filter:
         if candidate is None:
             candidate = self._committed(request, local_map, z_0, record, in_domain)
             if in_domain and not blind and request.reservation is None:  # other robots rely on the reservation
-                candidate = self._recovered(request, local_map, z_0) or candidate
+                candidate = RecoverySearch(self, request, local_map, z_0).candidate() or candidate
         return self._decision(request, local_map, candidate, record)
 
     @cached_property
@@ -302,66 +298,6 @@ class Filter:
         if candidates[-1].verified:
             return candidates[-1]
         return max(candidates, key=lambda candidate: np.nan_to_num(candidate.margin, nan=-np.inf))
-
-    def _recovered(self, request: Request, local_map: LocalMap, z_0: Array) -> PlanCandidate | None:
-        """Return a slow way out for a robot that stands, or is on such a way, where standing is not verified.
-
-        The violation must exceed what two measurement errors explain, plus the clearance margin for a robot that stays
-        where it stands (docs/method.md §11).
-        """
-        robot, m = self.robot, self.robot.action_dim
-        slow = np.where(robot.translates, SLOW + 0.05, 1.0) * np.maximum(robot.high(), -robot.low())
-        going = np.vstack([request.input_in_force, request.plan[: robot.committed_steps]])
-        on_a_way = request.model == UNVERIFIED and bool(going.any() and (np.abs(going) <= slow).all())
-        if not (request.still(robot) or on_a_way):
-            return None
-        if isinstance(request.scan, Scan) and not shows_free(request.scan, local_map.start):
-            return None
-        before = z_0[-m:]
-        stand = self.inputs.regressors(z_0, self.executable.stop(request.state, before))
-        parked = local_map.parked
-        seeming = 0.0
-        if not on_a_way:
-            seeming = 2.0 * self.constraints.measurement_error + (
-                self.clearance_margin if self.constraints.stays else 0.0
-            )
-        if self.constraints_for(stand, local_map.widening).margin_in(parked, stand) >= -seeming:
-            return None
-        constraints = self.constraints.at(stand, local_map.widening)
-        planes = constraints.planes(local_map, stand, leaving=True)
-        rows = constraints.rows(local_map, stand, planes)
-        if not np.isfinite(rows.bound).all():  # an obstacle that is just touched, or NaN, has no known side
-            return None
-        standing = rows.support(self.tube, stand) - rows.bound
-        # In real time an input is taken back a period late, so it must be reachable within one slew.
-        most = np.asarray(robot.action_slew) if robot.committed_steps else np.full(m, np.inf)
-        inputs = np.array([self.inputs.limited(np.clip(u, -most, most), before) for u in slow_inputs(robot)])
-        plans = [self.inputs.regressors(z_0, action) for action in inputs]
-        # Compare all candidates with the tube width of standing. With their own widths, a robot with a loose model set
-        # would go where its motion is known best, which is not the way out.
-        violated = standing + (np.array(plans) - stand) @ rows.gradient.T
-        rows_each = rows_per_obstacle(robot.horizon)
-        obstacle_rows = rows_each * sum(len(disc.normals) for disc in planes)
-        ends = np.zeros(len(rows.bound), dtype=bool)
-        ends[rows_each - 1 : obstacle_rows : rows_each] = True  # the row after the stop
-        if not robot.position_dim:
-            ends[robot.horizon * len(robot.limits) : (robot.horizon + 1) * len(robot.limits)] = True
-        best = least_violating(violated, standing, ends)
-        if best is not None:
-            z = plans[best]
-        elif robot.heading is not None and (away := local_map.away) is not None:
-            z = self.inputs.regressors(z_0, self.inputs.limited(turn_towards(robot, local_map.heading, away), before))
-            # A turn moves only the discs beside the measured position; they must not come nearer to anything.
-            rows_of_disc = [rows_each * len(disc.normals) for disc in planes]
-            aside = np.repeat([disc.aside for disc in constraints.discs], rows_of_disc)
-            swung = np.flatnonzero(aside)
-            turned = standing[swung] + rows.gradient[swung] @ (z - stand)
-            if not harmless(turned[None], standing[swung])[0]:
-                return None
-        else:
-            return None
-        margin, constraints = constraints.margin(rows, z), self.constraints.at(z, local_map.widening)
-        return PlanCandidate(RECOVERING, self.inputs.plan(z), z, margin, False, constraints)
 
     def _decision(
         self, request: Request, local_map: LocalMap, candidate: PlanCandidate, record: DecisionRecord
