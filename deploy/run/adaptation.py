@@ -136,18 +136,24 @@ class Adaptation:
         self._driven += 1
 
     def exchange(self, exchange: pb.Exchange, heard: float) -> None:
-        """Add an exchange with the safety service. Raises Implausible if there are too many robots.
+        """Add an exchange with the safety service; one without a decision names no version, and is left out.
+
+        Raises Implausible if there are too many robots.
 
         heard: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
         """
+        if not exchange.reply.HasField("decision"):
+            return
         request, decision = exchange.request, exchange.reply.decision
         now = DrivenPeriod(exchange.header.run, request.episode, request.step)
         state = self._robots.get(request.actor)
         if state is None or state.since.run != now.run:
             if state is None and len(self._robots) >= MOST_ROBOTS:
+                self._robots = self._driving_robots()
+            if state is None and len(self._robots) >= MOST_ROBOTS:
                 raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
             state = self._robots[request.actor] = RobotState(decision.model, now)
-        elif decision.model and decision.model != state.version:
+        elif decision.model != state.version:
             state.version, state.since = decision.model, now
         state.widening, state.heard = (request.widening if 1.0 <= request.widening < math.inf else 1.0), heard
         if state.widening > WIDENING:
@@ -233,7 +239,7 @@ def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -
         return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
     new, old = (_mean_half_width(m, data) for m in (model, in_use))
     old *= Filter(in_use).constraints.plan_widening(widening)
-    if new > TIGHTER * old:
+    if not new <= TIGHTER * old:  # NaN too
         return f"its sets are {new / old:.2g} times as wide as those in use, as widened"
     return ""
 

@@ -278,6 +278,18 @@ def test_a_full_disk_or_a_kill_in_a_write_to_the_archive_leaves_a_whole_model_or
             assert error is Died or registry.filters["ground"].version == model.version, "the service goes on"
 
 
+def test_a_signer_whose_private_key_is_kept_elsewhere_stays_the_trusted_one(signed, keys: Path) -> None:
+    """Another certificate by `brakeline keys` made a new signer in its place: services refused the models in use."""
+    private = (keys / "signer.key").read_bytes()
+    (keys / "signer.key").unlink()
+    write_signer(keys)
+    assert not (keys / "signer.key").exists() and TrustedSigners.load(keys).open(signed)
+    (keys / "signer.key").write_bytes(private)
+    (keys / "signers" / "certify.json").unlink()  # the process ended between the two files
+    write_signer(keys)
+    assert (keys / "signer.key").read_bytes() == private and TrustedSigners.load(keys).open(signed)
+
+
 SERVICE = """
 import sys
 from pathlib import Path

@@ -13,7 +13,7 @@ from brakeline.deploy.run import adaptation
 from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
 from brakeline.deploy.run.adaptation_process import _follow
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
-from brakeline.errors import BadModel, BadStep, Untrusted
+from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.filter.filter import Filter
@@ -23,6 +23,7 @@ from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelC
 from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
 from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
+from tests.safety.joints import joints
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
 from tests.safety.unicycle import Unicycle
 
@@ -159,6 +160,29 @@ def test_a_change_of_one_robot_alone_makes_no_set_for_all(kind, monkeypatch):
     assert kind.attempt() is not None, "the other robot has been silent for minutes"
 
 
+@pytest.mark.parametrize("reply", [None, pb.Reply(error=pb.Error(type="NoModel"))])
+def test_a_robot_that_gets_no_decisions_is_no_robot_whose_sets_count(kind, reply):
+    """It held up the new set of the others, and its empty version was then the one to compare with."""
+    step = next(steps_of(driven(1, 3)))
+    for _ in range(REQUESTS):
+        kind.exchange(exchange_of(step, 8.0), 0.0)
+    lost = pb.Exchange(request=pb.Request(actor="actor-1"), reply=reply, failure="no answer")
+    kind.exchange(lost, 1.0)
+    assert kind.widening == 8.0 and kind._changed()
+
+
+def test_robots_that_are_gone_make_room_for_others(kind, monkeypatch):
+    monkeypatch.setattr(adaptation, "MOST_ROBOTS", 2)
+    step, later = next(steps_of(driven(1, 3))), adaptation.SILENT + 1.0
+    for name, heard in (("a", 0.0), ("b", later), ("c", later)):
+        step.actor = name
+        kind.exchange(exchange_of(step, 1.0), heard)
+    assert sorted(kind._robots) == ["b", "c"]
+    step.actor = "d"
+    with pytest.raises(Implausible, match="already 2 robots"):
+        kind.exchange(exchange_of(step, 1.0), later)
+
+
 def test_a_break_begins_the_change_anew(kind):
     trajectories = driven(2, 8, slip=-0.15)
     assert not drive(kind, trajectories[:4], widening=8.0)
@@ -257,5 +281,7 @@ def test_nothing_adapts_without_a_key_to_sign_or_with_a_set_of_mode_recursion(tm
     with pytest.raises(Untrusted, match="no key to sign models with"):
         check_signer(tmp_path)
     check_adaptable(in_use())
+    with pytest.raises(ValueError, match="2-joints has none: certify it by hand"):
+        check_adaptable(SimpleNamespace(robot=joints(2)))
     with pytest.raises(ValueError, match="--mode one-step"):
         check_adaptable(replace(in_use(), model_config=ModelConfig(mode=RECURSION)))

@@ -66,8 +66,9 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     for name in ("actors", "steps", "replicas", "robots_per_actor"):
         with pytest.raises(ValueError, match="1 or more"):
             RunConfig(**{name: 0})
-    with pytest.raises(ValueError, match="at most 64 robots, not 65: lower --robots-per-actor, and give more --actors"):
-        RunConfig(robots_per_actor=65)
+    for method in ("ddpc", "none"):  # the access list is the same with and without a filter
+        with pytest.raises(ValueError, match="at most 64 robots, not 65, with any .* give more --actors"):
+            RunConfig(robots_per_actor=65, method=method)
     assert RunConfig(robots_per_actor=64).robots_per_actor == 64
     for penalty in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="a penalty is finite and not negative"):
