@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from multiprocessing import connection
 from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
@@ -139,12 +140,22 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
     os.environ |= ONE_THREAD  # of the certifier; NumPy of this process has its threads already
     process = spawning().Process(target=_start_beside, args=(replace(settings, bus=client),), daemon=True)
     process.start()
+    leaving = threading.Event()
+    threading.Thread(target=_report_end, args=(process.sentinel, leaving), name="certifier", daemon=True).start()
     try:
         yield
     finally:
+        leaving.set()
         process.terminate()
         process.join(TERMINATION_TIMEOUT)
         process.kill()
+
+
+def _report_end(sentinel: int, leaving: threading.Event) -> None:
+    """Say so if a certifier ends before the service beside it does: nothing starts it again."""
+    connection.wait([sentinel])
+    if not leaving.is_set():
+        log.error("the certifier has ended: the robots keep the model set in use until you start this service again")
 
 
 def _start_beside(settings: CertifierSettings) -> None:

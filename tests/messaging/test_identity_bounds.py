@@ -32,6 +32,7 @@ def message(topic: Topic, key: str, content: object) -> object:
         (STEP, "step/ground/actor-1", pb.Step(actor="actor-0")),
         (STEP, "step/ground/actor-1", pb.Step(header=pb.Header(source="actor-10"))),
         (HEALTH, "health/actor-1", pb.Health(process="safety")),
+        (HEALTH, "health/actor-1", pb.Health(process="actor-1.7")),
         (HEALTH, "health/actor-1", pb.Health(published={"step/ground/actor-0": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"metrics/ground": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"logged/ground/actor-1": 10**9})),
@@ -95,6 +96,18 @@ def test_one_identity_cannot_take_all_places_of_the_figures(monkeypatch: pytest.
     with pytest.raises(Implausible, match="actor-0 has 10"):
         metrics.add("log/actor-0", pb.LogLine(header=pb.Header(sequence=1, run=10)))
     metrics.add("log/actor-1", pb.LogLine(header=pb.Header(sequence=1, run=1)))
+
+
+def test_one_identity_cannot_take_all_names_of_the_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It took the 4,000 places of the actors, and every actor that joined later had no figures."""
+    monkeypatch.setattr(metrics_module, "MOST_NAMES_OF_ONE", 10)
+    metrics = Metrics()
+    for number in range(10):
+        metrics.add(f"step/ground/actor-0.{number}", pb.Step(actor=f"actor-0.{number}"))
+    with pytest.raises(Implausible, match="actor-0 has 10 names"):
+        metrics.add("step/ground/actor-0.10", pb.Step(actor="actor-0.10"))
+    metrics.add("step/ground/actor-1", pb.Step(actor="actor-1"))
+    assert len(metrics.actors) == 11
 
 
 def test_two_processes_with_one_name_are_two_starts() -> None:

@@ -1,7 +1,10 @@
 """When the certifier makes a new model set of a robot that has changed, from which driving, and when it refuses."""
 
+import os
+import threading
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -9,12 +12,13 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.certification import certify
-from brakeline.deploy.run import adaptation
+from brakeline.deploy.run import adaptation, adaptation_process
 from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
-from brakeline.deploy.run.adaptation_process import _follow
+from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
 from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
@@ -26,6 +30,7 @@ from brakeline.safety.service.signature import ModelSigner, SignedModel, Trusted
 from tests.safety.joints import joints
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
 from tests.safety.unicycle import Unicycle
+from tests.waiting import until
 
 ACCEPTED = 0.03
 MINUTE = 300  # periods
@@ -273,6 +278,25 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     assert TrustedSigners.load(tmp_path).open(signed, ROBOT.name).version == message.version
     assert process.figures[f"published {ROBOT.name}"] == process.figures[f"refused {ROBOT.name}"] == 1.0
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_a_service_says_that_the_certifier_beside_it_has_ended(monkeypatch, caplog, ordered):
+    """It went on without a word, and no set was ever replaced."""
+    sentinel, certifier = os.pipe()
+    process = SimpleNamespace(sentinel=sentinel, **dict.fromkeys(("start", "terminate", "kill"), lambda: None))
+    process.join = lambda timeout: os.close(certifier)
+    monkeypatch.setattr(adaptation_process, "spawning", lambda: SimpleNamespace(Process=lambda **_: process))
+    with certifier_beside(CertifierSettings(BusSettings(listen=("tls/127.0.0.1:1",)), (ROBOT.name,), Path())):
+        if not ordered:
+            os.close(certifier)
+            until(lambda: "the certifier has ended" in caplog.text)
+            process.join = lambda timeout: None
+    for thread in threading.enumerate():
+        if thread.name == "certifier":
+            thread.join()
+    os.close(sentinel)
+    assert ("the certifier has ended" in caplog.text) == (not ordered)
 
 
 def test_nothing_adapts_without_a_key_to_sign_or_with_a_set_of_mode_recursion(tmp_path):
