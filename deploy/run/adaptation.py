@@ -149,9 +149,9 @@ class Adaptation:
         state = self._robots.get(request.actor)
         if state is None or state.since.run != now.run:
             if state is None and len(self._robots) >= MOST_ROBOTS:
-                self._robots = self._driving_robots()
-            if state is None and len(self._robots) >= MOST_ROBOTS:
-                raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
+                self._robots = self._driving_robots()  # those that are gone make room
+                if len(self._robots) >= MOST_ROBOTS:
+                    raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
             state = self._robots[request.actor] = RobotState(decision.model, now)
         elif decision.model != state.version:
             state.version, state.since = decision.model, now
