@@ -136,9 +136,9 @@ def signed_last(in_use: Path, archive: Path, robot: str, trust: TrustedSigners, 
     if newest is None or trust.number(SignedModel.load(newest)) <= trust.number(SignedModel.load(in_use)):
         return in_use
     later = trust.load_model(newest)
-    both_sets = isinstance(later, ModelSet) and isinstance(chosen, ModelSet)
-    fits = both_sets and mode in (AUTO, later.model_config.mode)
-    return newest if later.robot.name == robot and fits else in_use
+    if not (isinstance(later, ModelSet) and isinstance(chosen, ModelSet) and later.robot.name == robot):
+        return in_use
+    return newest if mode in (AUTO, later.model_config.mode) else in_use
 
 
 def _noted_model(archive: Path, paths: list[Path]) -> Path | None:
