@@ -152,9 +152,12 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
 
 
 def _report_end(sentinel: int, leaving: threading.Event) -> None:
-    """Say so if a certifier ends before the service beside it does: nothing starts it again."""
+    """Say so if a certifier ends before the service beside it does: nothing starts it again.
+
+    ^C in a terminal reaches both, and the service takes longer to leave.
+    """
     connection.wait([sentinel])
-    if not leaving.is_set():
+    if not leaving.wait(TERMINATION_TIMEOUT):
         log.error("the certifier has ended: the robots keep the model set in use until you start this service again")
 
 
