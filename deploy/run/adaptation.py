@@ -81,11 +81,13 @@ class Recertification:
     Attributes:
         text: why the model set is published, or why there is none.
         model, data: the model set to publish, and its data; None if it may not be used.
+        replaces: version of the set in use with which it was compared.
     """
 
     text: str
     model: ModelSet | None = None
     data: Dataset | None = None
+    replaces: str = ""
 
 
 @dataclass
@@ -162,6 +164,11 @@ class Adaptation:
             state.widened, state.requests = None, 0
 
     @property
+    def version(self) -> str:
+        """The model set of the latest decision."""
+        return max(self._driving_robots().values(), key=lambda state: state.heard).version
+
+    @property
     def widening(self) -> float:
         """The least widening of the robots. A model set is for all of them."""
         return min((state.widening for state in self._driving_robots().values()), default=1.0)
@@ -214,8 +221,7 @@ class Adaptation:
 
     def _certified(self, steps: list[pb.Step], why: str) -> Recertification:
         """Return the model set of these steps, or why it may not be used."""
-        widening = self.widening
-        version = max(self._driving_robots().values(), key=lambda state: state.heard).version
+        widening, version = self.widening, self.version
         try:
             trajectories, _ = without_repeats(self.robot, tuple(trajectories_of(steps, self.robot)))
             data = Dataset(self.robot, trajectories, {"origin": "adaptation", "why": why})
@@ -228,7 +234,13 @@ class Adaptation:
             return Recertification(f"none {why}: {refused}")
         width, bound = f"±{1e3 * report.half_width_full:.0f} mm", percent(report.bound_plan)
         stated = f"{width} after a full stop, at most {bound} outside"
-        return Recertification(f"{model.version} {why}: {stated}", model, data)
+        return Recertification(f"{model.version} {why}: {stated}", model, data, version)
+
+    def confirmed(self, attempt: Recertification) -> Recertification:
+        """Return an attempt as it stands after a fit of minutes: without its set, if another one came into use."""
+        if attempt.model is None or attempt.replaces == self.version:
+            return attempt
+        return Recertification(f"none: {self.version} came into use during the fit; it was compared with another set")
 
 
 def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -> str:

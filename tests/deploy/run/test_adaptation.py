@@ -176,6 +176,17 @@ def test_a_robot_that_gets_no_decisions_is_no_robot_whose_sets_count(kind, reply
     assert kind.widening == 8.0 and kind._changed()
 
 
+def test_a_set_that_was_compared_with_one_no_longer_in_use_is_not_published(kind):
+    """A fit takes minutes, and the operator may publish a set meanwhile, with a lower number than the fit's."""
+    step = next(steps_of(driven(1, 3)))
+    kind.exchange(exchange_of(step, 8.0, "old"), 0.0)
+    attempt = Recertification("why", in_use(), replaces="old")
+    assert kind.confirmed(attempt) is attempt
+    kind.exchange(exchange_of(step, 1.0, "theirs"), 1.0)
+    confirmed = kind.confirmed(attempt)
+    assert confirmed.model is None and "theirs came into use during the fit" in confirmed.text
+
+
 def test_robots_that_are_gone_make_room_for_others(kind, monkeypatch):
     monkeypatch.setattr(adaptation, "MOST_ROBOTS", 2)
     step, later = next(steps_of(driven(1, 3))), adaptation.SILENT + 1.0
@@ -265,13 +276,14 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     process = SimpleNamespace(bus=bus, notes={}, figures={}, announce=lambda: None)
     write_signer(tmp_path)
     signer, data = ModelSigner.load(tmp_path), Dataset(ROBOT, record(1, 6).trajectories)
-    attempts = [None, Recertification("why", in_use(), data), Recertification("no")]
+    kind.exchange(exchange_of(next(steps_of(driven(1, 3))), 1.0, "old"), 0.0)
+    attempts = [None, Recertification("why", in_use(), data, "old"), Recertification("no")]
     attempt = Mock(side_effect=[ZeroDivisionError("one of these"), *attempts])
     monkeypatch.setattr(kind, "attempt", attempt)
-    _follow(kind, signer, process)
+    _follow(kind, lambda: None, signer, process)
     assert "one of these" in process.notes[f"adaptation {ROBOT.name}"] and "no new model set" in caplog.text
     for _ in range(3):
-        _follow(kind, signer, process)
+        _follow(kind, lambda: None, signer, process)
     ((topic, message),) = published
     assert topic is MODEL
     signed = SignedModel(message.file, message.claim, message.signature)
