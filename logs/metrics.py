@@ -34,6 +34,7 @@ V = TypeVar("V")
 MOST_STREAMS = 20_000  # keys and process starts; a message beyond them is rejected
 MOST_STREAMS_OF_ONE = 5_000  # of one identity, so that it cannot take the place of the others
 MOST_NAMES = 4_000  # actors, learners or processes; the sketches of one actor take 10 kB and more
+MOST_NAMES_OF_ONE = 1_000  # of one identity
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 SILENT = HEALTH.stale_after or 3.0  # s without a Health message after which a process counts as silent
 
@@ -261,8 +262,15 @@ def _get_or_create(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
         most = MOST_STREAMS if make is PublisherStream else MOST_NAMES
         if len(table) >= most:
             raise Implausible(f"{name} is rejected: there are already {most}")
+        if isinstance(name, str) and _names_of(identity_of(name), table) >= MOST_NAMES_OF_ONE:
+            raise Implausible(f"{name} is rejected: {identity_of(name)} has {MOST_NAMES_OF_ONE} names already")
         table[name] = make()
     return table[name]
+
+
+def _names_of(identity: str, table: Mapping[Any, object]) -> int:
+    """Return how many names in a table an identity answers for."""
+    return sum(identity_of(name) == identity for name in table)
 
 
 def merge_runs(runs: Mapping[str, Metrics]) -> Figures:

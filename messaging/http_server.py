@@ -17,6 +17,7 @@ from typing import Any
 
 from brakeline.messaging.allowed_hosts import rejection_reason
 
+LARGEST_PORT = 65535
 MOST_CLIENTS = 64  # at the same time
 REQUEST_TIME = 5.0  # from the connection, or the reply before, to the last header of a request [s]
 REPLY_TIME = 10.0  # for a client that does not read a reply [s]
@@ -106,8 +107,10 @@ class BoundedServer(ThreadingHTTPServer):
             own_port: whether a request must name the port of this server; a container may map it to another one.
 
         Raises:
-            OSError: the address is in use, or not of this machine.
+            OSError: the address is in use, or not of this machine, or its port is no port.
         """
+        if not 0 <= address[1] <= LARGEST_PORT:  # the socket would raise an OverflowError
+            raise OSError(f"{address[1]} is no port: ports are 0 to {LARGEST_PORT}")
         self.slots = ConnectionSlots()
         super().__init__(address, handler)
         self.hosts = (address[0], socket.gethostname())

@@ -16,6 +16,7 @@ MAX_WALL_TIME = 2**62  # [ns since the Unix epoch]
 MAX_VALUE = 1e9  # of a robot's time [s], and of the numbers of a step
 MAX_OBSTACLES = 1000  # in one message
 MAX_NUMBERS = 10_000  # in one repeated field
+MAX_ENTRIES = 2048  # in one map, or in one field with messages: a learner permits so many actors
 STEP_NUMBERS = ("reward", "penalty", "speed")  # the numbers of a step that statistics add up
 
 
@@ -31,9 +32,11 @@ class _CheckedFields(NamedTuple):
 def _checked_fields(kind: Descriptor) -> _CheckedFields:
     fields = kind.fields_by_name
     names = tuple(name for name in NAME_FIELDS if name in fields and fields[name].type == fields[name].TYPE_STRING)
-    sizes = [(name, MAX_NUMBERS) for name, field in fields.items() if field.is_repeated and field.message_type is None]
+    repeated = [field for field in fields.values() if field.is_repeated]
+    sizes = [(field.name, MAX_NUMBERS if field.message_type is None else MAX_ENTRIES) for field in repeated]
     if "obstacles" in fields:
-        sizes.insert(0, ("obstacles", MAX_OBSTACLES))
+        sizes.append(("obstacles", MAX_OBSTACLES))
+    sizes.sort(key=lambda one: one[1])
     numbers = STEP_NUMBERS if "reward" in fields else ()
     return _CheckedFields("header" in fields, names, tuple(sizes), numbers, "request" in fields)
 
@@ -42,7 +45,7 @@ def check(message: Any, size: int) -> None:
     """Check a message.
 
     Args:
-        size: of its payload [bytes]. A number takes at least one byte, and an obstacle two.
+        size: of its payload [bytes]. A number takes at least one byte, an obstacle or an entry two.
 
     Raises:
         Implausible: a time, a name or a size is out of bounds; the error names the field.

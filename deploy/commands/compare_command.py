@@ -94,7 +94,10 @@ class CompareCommand:
             results = QUICK / "results" if results == RESULTS else results
             runs = QUICK / "runs" if runs == RUNS else runs
         tables: dict[str, Any] = {}
-        for robot in map(address, self.robots):
+        robots = [address(robot) for robot in self.robots]
+        # A wrong option ends the command before the first of hours of training.
+        jobs_of = {} if self.table or self.tune else {robot: self._jobs(robot) for robot in robots}
+        for robot in robots:
             if self.table:
                 tables[robot] = self._write(stored_cells(results, robot), [], robot_folder(results, robot))
                 continue
@@ -102,7 +105,7 @@ class CompareCommand:
                 trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]
                 complete(trials, results, runs, self.engine, self.again, say)
                 continue
-            jobs = self._jobs(robot)
+            jobs = jobs_of[robot]
             filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
             for method in sorted(filters):  # make the models that several trainings need, before all of them
                 method_for(robot_with_task(robot), method, ModelConfig())
@@ -126,8 +129,10 @@ class CompareCommand:
 
     def _jobs(self, robot: str) -> list[Job]:
         from brakeline.deploy.experiments.conservatism import Conservatism
-        from brakeline.messaging.task import robot_with_task
+        from brakeline.messaging.task import check_penalty, robot_with_task
 
+        described = robot_with_task(robot)
+        check_penalty(self.penalty, described)
         cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
         numbers: dict[str, Any] = {"steps": self.steps, "episodes": self.episodes, "robots": self.at_once}
@@ -137,7 +142,7 @@ class CompareCommand:
         if self.penalty is not None:
             changed["penalty"] = self.penalty
         jobs: list[Job] = []
-        settings = robot_with_task(robot).task.learner if self.task_settings else {}
+        settings = described.task.learner if self.task_settings else {}
         for cell in cells:
             own = replace(cell, td3=learning(self.td3, cell.method, settings))
             jobs.append(replace(quick(own) if self.quick else own, **changed))

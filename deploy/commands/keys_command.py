@@ -11,7 +11,7 @@ import tyro
 from brakeline.deploy.commands.command_output import console
 from brakeline.messaging.atomic_files import write_secret
 from brakeline.messaging.bus.certificate_authority import DAYS, Authority
-from brakeline.messaging.bus.identity import SERVERS, role_of
+from brakeline.messaging.bus.identity import SERVERS, role_of, role_on_certificate
 from brakeline.safety.methods import load
 from brakeline.safety.service.plan_token import KEY_FILE as PLAN_TOKEN_KEY
 from brakeline.safety.service.plan_token import write_key
@@ -33,7 +33,8 @@ class KeysCommand:
     days: int = DAYS
     """Let the certificates be valid for this many days."""
     signer: bool = True
-    """Make a key that signs models, if there is none. Keep it offline, with the person who certifies models."""
+    """Make a key that signs models, if the folder trusts no signer yet. Keep it offline, with the person who certifies
+    models."""
     robots: tuple[str, ...] = (ANY,)
     """Let a new signer sign the models of these robots; * stands for all."""
     sign: tuple[Path, ...] = ()
@@ -51,7 +52,7 @@ class KeysCommand:
                 console.print(str(seal_of(path)), markup=False)
             return 0
         for name in self.names:
-            role_of(name)  # a wrong name is refused before there is a folder
+            role_on_certificate(name)  # a wrong name is refused before there is a folder
         authority = Authority(self.folder, self.days)
         for name in self.names:
             authority.issue(name, self.host)
@@ -73,7 +74,7 @@ def hand_out(keys: Path, name: str, to: Path) -> None:
         files.append("names")
     if role == "safety":
         files += [PLAN_TOKEN_KEY, *(str(path.relative_to(keys)) for path in (keys / SIGNERS).glob("*.json"))]
-    if role == "certify":
+    if role == "certify" and (keys / SIGNING_KEY).exists():  # it may be kept offline
         files.append(SIGNING_KEY)
     for file in files:
         write_secret(to / file, (keys / file).read_bytes())

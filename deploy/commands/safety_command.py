@@ -32,6 +32,7 @@ class SafetyCommand:
     def run(self) -> int:
         """Answer requests until SIGINT or SIGTERM. Returns the exit status."""
         from brakeline.deploy.run.run_keys import check_adaptable, check_signer
+        from brakeline.deploy.run.run_models import signed_last
         from brakeline.safety.service.server import SafetySettings, main
         from brakeline.safety.service.signature import TrustedSigners
 
@@ -40,20 +41,23 @@ class SafetyCommand:
         bus = self.endpoints.bus()
         if self.adapt:
             check_signer(bus.keys)
-        paths = tuple(method_path(robot, self.filtering.method, model_config) for robot in robots)
         trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
-        for robot, path in zip(robots, paths, strict=True):
+        paths = []
+        for robot in robots:
+            path = method_path(robot, self.filtering.method, model_config)
             if trust is None:
                 model = method_for(robot, self.filtering.method, model_config, accept_bound)
             else:  # a model that this service built would have no signature
+                path = signed_last(path, data_root(), robot.name, trust, model_config.mode)
                 model = trust.load_model(path)
             if self.adapt:
                 check_adaptable(model)
+            paths.append(path)
         limits = {robot.name: robot.accept_bound for robot in robots}
         with ExitStack() as beside:
             if self.adapt:
                 from brakeline.deploy.run.adaptation_process import CertifierSettings, certifier_beside
 
                 beside.enter_context(certifier_beside(CertifierSettings(bus, self.robots, data_root(), accept_bound)))
-            main(SafetySettings(bus, paths, data_root(), self.name, limits, accept_bound))
+            main(SafetySettings(bus, tuple(paths), data_root(), self.name, limits, accept_bound))
         return 0

@@ -81,11 +81,13 @@ class Recertification:
     Attributes:
         text: why the model set is published, or why there is none.
         model, data: the model set to publish, and its data; None if it may not be used.
+        replaces: version of the set in use with which it was compared.
     """
 
     text: str
     model: ModelSet | None = None
     data: Dataset | None = None
+    replaces: str = ""
 
 
 @dataclass
@@ -136,24 +138,35 @@ class Adaptation:
         self._driven += 1
 
     def exchange(self, exchange: pb.Exchange, heard: float) -> None:
-        """Add an exchange with the safety service. Raises Implausible if there are too many robots.
+        """Add an exchange with the safety service; one without a decision names no version, and is left out.
+
+        Raises Implausible if there are too many robots.
 
         heard: when it arrived [s], by a clock of this process. The clocks of other machines may differ by hours.
         """
+        if not exchange.reply.HasField("decision"):
+            return
         request, decision = exchange.request, exchange.reply.decision
         now = DrivenPeriod(exchange.header.run, request.episode, request.step)
         state = self._robots.get(request.actor)
         if state is None or state.since.run != now.run:
             if state is None and len(self._robots) >= MOST_ROBOTS:
-                raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
+                self._robots = self._driving_robots()  # those that are gone make room
+                if len(self._robots) >= MOST_ROBOTS:
+                    raise Implausible(f"{request.actor} is rejected: there are already {MOST_ROBOTS} robots")
             state = self._robots[request.actor] = RobotState(decision.model, now)
-        elif decision.model and decision.model != state.version:
+        elif decision.model != state.version:
             state.version, state.since = decision.model, now
         state.widening, state.heard = (request.widening if 1.0 <= request.widening < math.inf else 1.0), heard
         if state.widening > WIDENING:
             state.widened, state.requests = state.widened or now, state.requests + 1
         else:
             state.widened, state.requests = None, 0
+
+    @property
+    def version(self) -> str:
+        """The model set of the latest decision."""
+        return max(self._driving_robots().values(), key=lambda state: state.heard).version
 
     @property
     def widening(self) -> float:
@@ -208,8 +221,7 @@ class Adaptation:
 
     def _certified(self, steps: list[pb.Step], why: str) -> Recertification:
         """Return the model set of these steps, or why it may not be used."""
-        widening = self.widening
-        version = max(self._driving_robots().values(), key=lambda state: state.heard).version
+        widening, version = self.widening, self.version
         try:
             trajectories, _ = without_repeats(self.robot, tuple(trajectories_of(steps, self.robot)))
             data = Dataset(self.robot, trajectories, {"origin": "adaptation", "why": why})
@@ -222,7 +234,13 @@ class Adaptation:
             return Recertification(f"none {why}: {refused}")
         width, bound = f"±{1e3 * report.half_width_full:.0f} mm", percent(report.bound_plan)
         stated = f"{width} after a full stop, at most {bound} outside"
-        return Recertification(f"{model.version} {why}: {stated}", model, data)
+        return Recertification(f"{model.version} {why}: {stated}", model, data, version)
+
+    def confirmed(self, attempt: Recertification) -> Recertification:
+        """Return an attempt as it stands after a fit of minutes: without its set, if another one came into use."""
+        if attempt.model is None or attempt.replaces == self.version:
+            return attempt
+        return Recertification(f"none: {self.version} came into use during the fit; it was compared with another set")
 
 
 def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -> str:
@@ -233,7 +251,7 @@ def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -
         return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
     new, old = (_mean_half_width(m, data) for m in (model, in_use))
     old *= Filter(in_use).constraints.plan_widening(widening)
-    if new > TIGHTER * old:
+    if not new <= TIGHTER * old:  # NaN too
         return f"its sets are {new / old:.2g} times as wide as those in use, as widened"
     return ""
 

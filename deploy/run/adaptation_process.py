@@ -7,9 +7,11 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import connection
 from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
@@ -84,9 +86,10 @@ def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:
 
 def _run(inbox: Inbox, kinds: dict[str, Adaptation], signer: ModelSigner, process: Process) -> None:
     while not process.stop.wait(PERIOD):
-        _take_in(inbox, kinds, process)
+        take_in = partial(_take_in, inbox, kinds, process)
+        take_in()
         for kind in kinds.values():
-            _follow(kind, signer, process)
+            _follow(kind, take_in, signer, process)
 
 
 def _take_in(inbox: Inbox, kinds: dict[str, Adaptation], process: Process) -> None:
@@ -100,12 +103,16 @@ def _take_in(inbox: Inbox, kinds: dict[str, Adaptation], process: Process) -> No
                 kinds[message.request.robot].exchange(message, time.monotonic())
 
 
-def _follow(kind: Adaptation, signer: ModelSigner, process: Process) -> None:
-    """Make an attempt for a robot kind, if it is time. An error ends the attempt, and nothing else."""
+def _follow(kind: Adaptation, take_in: Callable[[], None], signer: ModelSigner, process: Process) -> None:
+    """Make an attempt for a robot kind, if it is time. An error ends the attempt, and nothing else.
+
+    take_in: gives the received messages to the kinds; after a fit they say whether another set came into use.
+    """
     name = kind.robot.name
     try:
         if (attempt := kind.attempt()) is not None:
-            _settle(attempt, kind.robot, signer, process)
+            take_in()
+            _settle(kind.confirmed(attempt), kind.robot, signer, process)
         process.figures[f"widening {name}"] = kind.widening
         process.figures[f"minutes since the change {name}"] = kind.since_change
     except Exception as error:
@@ -139,12 +146,25 @@ def certifier_beside(settings: CertifierSettings) -> Iterator[None]:
     os.environ |= ONE_THREAD  # of the certifier; NumPy of this process has its threads already
     process = spawning().Process(target=_start_beside, args=(replace(settings, bus=client),), daemon=True)
     process.start()
+    leaving = threading.Event()
+    threading.Thread(target=_report_end, args=(process.sentinel, leaving), name="certifier", daemon=True).start()
     try:
         yield
     finally:
+        leaving.set()
         process.terminate()
         process.join(TERMINATION_TIMEOUT)
         process.kill()
+
+
+def _report_end(sentinel: int, leaving: threading.Event) -> None:
+    """Say so if a certifier ends before the service beside it does: nothing starts it again.
+
+    ^C in a terminal reaches both, and the service takes longer to leave.
+    """
+    connection.wait([sentinel])
+    if not leaving.wait(TERMINATION_TIMEOUT):
+        log.error("the certifier has ended: the robots keep the model set in use until you start this service again")
 
 
 def _start_beside(settings: CertifierSettings) -> None:

@@ -14,10 +14,11 @@ import numpy as np
 
 from brakeline.actors.episode_runner import EPISODE_STRIDE, ActorIdentity
 from brakeline.deploy.batch_robots import BatchRobots
-from brakeline.errors import LaunchError
+from brakeline.errors import BadStep, LaunchError
 from brakeline.learner.learner import Learner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Array
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -63,7 +64,7 @@ class BatchTrainer:
         """
         robot: RobotWithTask = learner.robot
         self.learner, self._robot, self._sink, self._size = learner, robot, sink, size
-        self.actors = actor_names(name, size)
+        self.actors, self._rejected = actor_names(name, size), RejectedMessages()
         self._episodes = [self._join(actor) for actor in self.actors]
         self._identities = [ActorIdentity(actor, i, seed) for i, actor in enumerate(self.actors)]
         options = {"seed_key": seed} | options
@@ -92,7 +93,10 @@ class BatchTrainer:
             self.learner.publish()
         steps, begun = self._robots.end_period(self.policy.version)
         for i, step in enumerate(steps):
-            self.learner.insert(step)
+            try:
+                self.learner.insert(step)
+            except BadStep as error:  # such as a state that is not finite: one lost step, as on the bus
+                self._rejected.reject(step.actor, error)
             self._sink(i, step)
         self._announce(begun)
         if self.learner.weights().version != self.policy.version:

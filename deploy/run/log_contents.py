@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from brakeline.actors.mavlink.frame_log import decode_frame
 from brakeline.deploy.run.run_config import RunConfig, encode
 from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import BadModel
@@ -43,7 +42,7 @@ def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
     groups = {
         "run": run,
         "configuration": {"json": encode(config)},
-        "versions": {name: version(name) for name in packages},
+        "versions": {name: _version(name) for name in packages},
         "conditions": config.conditions.describe(),
     }
     robots = [robot_maybe_with_task(name) for name in config.robots]
@@ -52,6 +51,14 @@ def metadata(config: RunConfig, folder: Path) -> dict[str, dict[str, str]]:
         if (model := _model(config, folder, robot)) is not None:
             groups[f"model {robot.name}"] = {"version": model.version, **model.about}
     return groups
+
+
+def _version(package: str) -> str:
+    """Return the version of a package, which may be one that this run does not need."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def _model(config: RunConfig, folder: Path, robot: Robot) -> Model | None:
@@ -105,6 +112,8 @@ def frames_as_json(sample: Sample) -> list[Entry]:
     """
     if sample.topic is not FRAMES:
         return []
+    from brakeline.actors.mavlink.frame_log import decode_frame  # needs pymavlink, which other robots do not
+
     entries = []
     for frame in sample.message().frames:
         message = decode_frame(frame.raw, frame.outgoing)

@@ -46,7 +46,7 @@ def process_specs(config: RunConfig) -> list[ProcessSpec]:
         table += [ProcessSpec(name, "autopilot", number=i) for i, name in enumerate(names)]
     one = len(config.robots) == 1
     for robot in config.robots:
-        kind = robot_named(robot).name
+        kind = robot_named(robot).name.replace(".", "_")  # a dot ends the name on the process's certificate
         if not config.policy:
             nice = 2 if config.backend == BATCH else 10  # a batch drives and filters its robots in this process
             table.append(ProcessSpec("learner" if one else f"learner-{kind}", "learner", robot, nice=nice))

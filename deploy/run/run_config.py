@@ -20,7 +20,7 @@ from brakeline.sim.sim_conditions import Conditions
 
 METHODS = (*FILTERS, "none")
 BATCH: Literal["batch"] = "batch"  # the backend that simulates all robots in the learner's process
-MOST_IN_PROCESS = 64  # robots of one process: its certificate speaks for so many, and a question to the service, too
+MOST_IN_PROCESS = 64  # robots for which the access list lets a process publish, and requests of a batch
 FORMER_NAMES = {"recipe": "model_config"}  # names that fields have in older files
 
 T = TypeVar("T")
@@ -119,8 +119,8 @@ class RunConfig:
         if self.robots_per_actor > MOST_IN_PROCESS:
             more = "" if self.backend == BATCH else ", and give more --actors"
             raise ValueError(
-                f"a process has at most {MOST_IN_PROCESS} robots, not {self.robots_per_actor}: lower "
-                f"--robots-per-actor{more}"
+                f"a process has at most {MOST_IN_PROCESS} robots, not {self.robots_per_actor}, with any method: it may "
+                f"publish under the names of so many. Lower --robots-per-actor{more}"
             )
         if self.penalty is not None:
             from brakeline.messaging.task import check_penalty, robot_with_task

@@ -60,7 +60,12 @@ def check_signer(keys: Path | None) -> None:
 
 
 def check_adaptable(model: Model) -> None:
-    """Check that a model set states sets of whole plans, with which new sets can be compared. Raises ValueError."""
+    """Check that a model set states boxes of positions for whole plans, with which new ones can be compared.
+
+    Raises ValueError.
+    """
+    if not model.robot.position_dim:
+        raise ValueError(f"--adapt compares sets of positions, and {model.robot.name} has none: certify it by hand")
     if not isinstance(model, ModelSet) or model.model_config.mode == RECURSION:
         raise ValueError(
             f"--adapt needs a model set of mode {ONE_STEP} or {DIRECT}, for {model.robot.name} another one is in use: "

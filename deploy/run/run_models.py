@@ -121,6 +121,26 @@ def newest_model(folder: Path, robot: str, trust: TrustedSigners | None) -> Path
     return None
 
 
+def signed_last(in_use: Path, archive: Path, robot: str, trust: TrustedSigners, mode: str) -> Path:
+    """Return the model with which a restarted service goes on: that in use, or a later one that it was sent.
+
+    Args:
+        in_use: the file of the model in use.
+        archive: the service's, with the versions that it was sent.
+        mode: of the model sets that the service may use; `AUTO`: any.
+
+    Raises:
+        BadModel: the model in use is missing, damaged or not signed.
+    """
+    chosen, newest = trust.load_model(in_use), newest_model(archive, robot, trust)
+    if newest is None or trust.number(SignedModel.load(newest)) <= trust.number(SignedModel.load(in_use)):
+        return in_use
+    later = trust.load_model(newest)
+    if not (isinstance(later, ModelSet) and isinstance(chosen, ModelSet) and later.robot.name == robot):
+        return in_use
+    return newest if mode in (AUTO, later.model_config.mode) else in_use
+
+
 def _noted_model(archive: Path, paths: list[Path]) -> Path | None:
     """Return the model that an archive of these models notes as put to use last, or its only one, if it is whole."""
     try:

@@ -20,6 +20,7 @@ RUN_PROCESS = (*PYTHON, "-m", "brakeline.deploy.run.run_process")
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s from a failure to the restart; doubles with each failure in a row
 HEALTHY_AFTER = 20.0  # s after its first sign of life at which a process counts as healthy
 START_ALLOWANCE = 60.0  # s from the start of a process that gives no sign of life: imports are slow on a busy machine
+LAST_BYTES = 2**16  # of a process's output, in which its last line is looked for
 MOST_FAILURES = 5  # in a row, none of them after a healthy time, before the run ends
 
 
@@ -133,16 +134,19 @@ class SupervisedProcess:
 def describe_end(code: int, lifetime: float) -> str:
     """Say how a process ended too early. code: exit status; lifetime [s]."""
     if code < 0:
-        return f"was killed by {signal.Signals(-code).name} after {lifetime:.1f} s"
+        name = next((one.name for one in signal.Signals if one == -code), f"signal {-code}")  # of real time: no name
+        return f"was killed by {name} after {lifetime:.1f} s"
     if code == UNFINISHED:
         return f"was asked to end after {lifetime:.1f} s, not by the launcher"
     return f"ended with {code} after {lifetime:.1f} s"
 
 
 def last_line(path: Path) -> str:
-    """Return the last line of a text file; empty if there is none."""
+    """Return the last line of a text file, which may be of any size; empty if there is none."""
     try:
-        lines = path.read_text(errors="replace").strip().splitlines()
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - LAST_BYTES))
+            lines = file.read(LAST_BYTES).decode(errors="replace").strip().splitlines()
     except OSError:
         return ""
     return lines[-1] if lines else ""

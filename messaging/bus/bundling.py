@@ -85,8 +85,16 @@ class Unbundler:
         self._routes = {}
 
     def take(self, sample: Sample) -> None:
-        """Take a bundle apart. A message that its sender may not publish is rejected, the others are not."""
-        for number, one in enumerate(sample.message().messages):
+        """Take a bundle apart. A message that its sender may not publish is rejected, the others are not.
+
+        Raises:
+            Malformed: the bundle holds more messages than a publisher bundles: each takes the receiver's time, empty
+                ones too.
+        """
+        messages = sample.message().messages
+        if len(messages) > MOST_BUNDLED:
+            raise Malformed(f"{sample.key}: a bundle of {len(messages)} messages; it has at most {MOST_BUNDLED}")
+        for number, one in enumerate(messages):
             with self._rejected.skip_on_error(sample.key):
                 key = one.key
                 routes = self._routes.get((sample.key, key))

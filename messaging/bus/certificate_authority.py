@@ -24,9 +24,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from brakeline.errors import BadKeys
 from brakeline.messaging.atomic_files import write_atomically, write_secret
-from brakeline.messaging.bus.identity import SERVERS, certificate_file, key_file, role_of
+from brakeline.messaging.bus.identity import SERVERS, certificate_file, key_file, role_on_certificate
 
 DAYS = 365  # validity of a certificate; the authority's own certificate is valid ten times as long
+MOST_DAYS = 100 * DAYS
 EARLIER = datetime.timedelta(days=1)  # certificates are valid from that time before now, since clocks differ
 HERE = ("localhost", "127.0.0.1", "::1")
 
@@ -42,7 +43,10 @@ class Authority:
 
         Raises:
             BadKeys: the folder has the certificate of an authority, but not its key.
+            ValueError: certificates cannot be valid for so many days.
         """
+        if not 1 <= days <= MOST_DAYS:
+            raise ValueError(f"certificates are valid for 1 to {MOST_DAYS} days, not {days}")
         self.folder, self.days = folder, days
         if (folder / "ca.pem").exists():
             try:
@@ -63,9 +67,9 @@ class Authority:
             hosts: names and addresses of a router besides those of this machine.
 
         Raises:
-            ValueError: the name does not begin with a role.
+            ValueError: the name does not begin with a role, or cannot be on a certificate.
         """
-        role = role_of(name)
+        role = role_on_certificate(name)
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
         if role in SERVERS:
             uses.append(ExtendedKeyUsageOID.SERVER_AUTH)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from brakeline.errors import BadKeys
+from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.topics import ROLES
 
 SERVERS = ("safety", "launcher", "router")  # roles that may be routers; other certificates are for clients only
@@ -14,12 +15,25 @@ def role_of(name: str) -> str:
     """Return the role of a process: its name up to the first hyphen or dot.
 
     Raises:
-        ValueError: there is no such role.
+        ValueError: there is no such role, or the name cannot be part of a key.
     """
     role = name.split(".", 1)[0].split("-", 1)[0]
     if role not in ROLES:
         raise ValueError(f"{name!r} begins with no role; there are: {', '.join(ROLES)}")
+    if not NAME.fullmatch(name):  # a wildcard would speak for others, and a slash is a place elsewhere
+        raise ValueError(f"{name!r} cannot be the name of a process: letters, digits, '_', '.' and '-' only")
     return role
+
+
+def role_on_certificate(name: str) -> str:
+    """Return the role of the holder of a certificate with this name.
+
+    Raises:
+        ValueError: as `role_of`, or the name has a dot: no process would look for that certificate.
+    """
+    if (holder := certified_name(name)) != name:
+        raise ValueError(f"{name!r}: a certificate's name has no dot; that of {holder!r} serves all {holder}.MORE")
+    return role_of(name)
 
 
 def certified_name(source: str) -> str:

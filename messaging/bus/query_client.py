@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 
 import zenoh
+from google.protobuf.message import DecodeError
 
 from brakeline.errors import Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
@@ -67,7 +68,7 @@ class QueryClient:
                     return reply.ok.payload.to_bytes()
                 assert reply.err is not None
                 if reply.err.encoding == zenoh.Encoding.APPLICATION_PROTOBUF:
-                    refusal = Refused(pb.Error.FromString(reply.err.payload.to_bytes()))
+                    refusal = _refusal(reply.err.payload.to_bytes())
                 else:  # Zenoh's own error: its timer ran out
                     late = True
         self._forget(key, HELD if late or refusal is not None else 0.0)
@@ -110,3 +111,11 @@ class QueryClient:
                     express=True,
                 )
             return self._queriers[key, timeout]
+
+
+def _refusal(payload: bytes) -> Refused:
+    """Return the error that a service replied; of a broken service, that its reply is no error message."""
+    try:
+        return Refused(pb.Error.FromString(payload))
+    except DecodeError as error:
+        return Refused(pb.Error(type="BadReply", message=f"not an error message: {error}"))

@@ -13,7 +13,7 @@ from brakeline.messaging.bus.identity import role_of, speaks_for
 from brakeline.messaging.bus.topic_keys import names_of
 from brakeline.messaging.topics import topic_of
 
-SOURCES = ("actor", "process")  # fields with the name of a process, or of a robot that it drives
+SOURCES = ("actor",)  # fields with the name of a process, or of a robot that it drives
 
 
 def check_names(names: Mapping[str, str], message: Any) -> None:
@@ -34,6 +34,8 @@ def check_names(names: Mapping[str, str], message: Any) -> None:
         for stated in fields.sources(message):
             if stated and not speaks_for(source, stated):
                 raise Implausible(f"says that its source is {stated!r}")
+        if fields.process and message.process not in ("", source):  # each further name would take a place in tables
+            raise Implausible(f"says that its process is {message.process!r}")
         for key in message.published if fields.counts else ():
             if not _publishes(source, key):
                 raise Implausible(f"says that it publishes at {key[:200]!r}")
@@ -65,7 +67,7 @@ class _NameFields:
         self._robots, self._robots_within = _names_in(kind, "robot"), _names_in(request, "robot")
         self._sources, self._sources_within = _names_in(kind, *SOURCES), _names_in(request, *SOURCES)
         self._header = "header" in kind.fields_by_name
-        self.counts = "published" in kind.fields_by_name
+        self.counts, self.process = "published" in kind.fields_by_name, "process" in kind.fields_by_name
 
     def robots(self, message: Any) -> list[str]:
         return _stated(message, self._robots, self._robots_within)

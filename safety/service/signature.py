@@ -90,13 +90,7 @@ class ModelSigner:
     @classmethod
     def load(cls, folder: Path) -> Self:
         """Read the private key in a folder. Raises Untrusted if there is none."""
-        try:
-            key = load_pem_private_key((folder / KEY).read_bytes(), None)
-        except (OSError, ValueError) as error:
-            raise Untrusted(f"{folder / KEY}: no key to sign models with: {error}") from error
-        if not isinstance(key, Ed25519PrivateKey):
-            raise Untrusted(f"{folder / KEY}: not an Ed25519 key")
-        return cls(key, folder / LAST)
+        return cls(_private_key(folder), folder / LAST)
 
     def sign(self, model: Model, data: Dataset | None = None) -> SignedModel:
         """Return a model with a signed claim about it.
@@ -212,14 +206,32 @@ class TrustedSigners:
 
 
 def write_signer(folder: Path, robots: tuple[str, ...] = (ANY,)) -> None:
-    """Write a new private key, and its public key among the trusted ones, if the folder has none yet."""
-    if (folder / KEY).exists():
+    """Write a new private key, and its public key among the trusted ones, if the folder trusts no signer yet.
+
+    The private key of a trusted signer may be kept elsewhere; a new one would take its place.
+
+    Raises:
+        Untrusted: the folder has a private key that cannot be read.
+    """
+    if any((folder / SIGNERS).glob("*.json")):
         return
-    key = Ed25519PrivateKey.generate()
-    public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
-    write_secret(folder / KEY, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    if not (folder / KEY).exists():  # else the process ended between these two files
+        key = Ed25519PrivateKey.generate()
+        write_secret(folder / KEY, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public = _private_key(folder).public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     signer = {"key": public.hex(), "robots": list(robots)}
     write_atomically(folder / SIGNERS / "certify.json", json.dumps(signer, indent=2).encode())
+
+
+def _private_key(folder: Path) -> Ed25519PrivateKey:
+    """Read the private key in a folder. Raises Untrusted if there is none."""
+    try:
+        key = load_pem_private_key((folder / KEY).read_bytes(), None)
+    except (OSError, ValueError) as error:
+        raise Untrusted(f"{folder / KEY}: no key to sign models with: {error}") from error
+    if not isinstance(key, Ed25519PrivateKey):
+        raise Untrusted(f"{folder / KEY}: not an Ed25519 key")
+    return key
 
 
 def _claim(signed: SignedModel) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from brakeline.messaging import topics
 from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
 from brakeline.messaging.bus.access_control import MOST_ROBOTS, grants
 from brakeline.messaging.bus.bus_settings import local
+from brakeline.messaging.bus.certificate_authority import Authority
+from brakeline.messaging.bus.identity import names_in
 from brakeline.messaging.free_ports import HERE, free_endpoint
 from brakeline.messaging.process_runtime import Process
 from tests.messaging.keyring import keyring
@@ -356,3 +358,25 @@ def test_private_keys_are_their_owners(keys: Path) -> None:
     for path in keys.glob("*.key"):
         assert path.stat().st_mode & 0o077 == 0, path
     assert keys.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.fast
+def test_a_name_that_no_key_can_hold_gets_no_certificate_and_is_no_name_to_accept(tmp_path: Path) -> None:
+    """A router with `actor-*` in its list did not start any more, and `safety-/../x` put keys into another folder."""
+    authority = Authority(tmp_path / "keys")
+    authority.issue("router")
+    for name in ("actor-*", "actor-$*", "actor-1 safety", "safety-/../../evil", "actor-é", "actor.0"):
+        with pytest.raises(ValueError, match=r"cannot be the name of a process|no dot"):
+            authority.issue(name)
+    assert (tmp_path / "keys" / "names").read_text() == "router\n" and not list(tmp_path.glob("evil*"))
+    (tmp_path / "keys" / "names").write_text("router\nactor-*\n")
+    with pytest.raises(BadKeys, match=r"'actor-\*' cannot be the name"):
+        names_in(tmp_path / "keys")
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("days", [0, -5, 10**6])
+def test_certificates_of_an_impossible_validity_are_refused_before_there_is_a_folder(tmp_path: Path, days: int) -> None:
+    with pytest.raises(ValueError, match=f"valid for 1 to .* days, not {days}"):
+        Authority(tmp_path / "keys", days)
+    assert not (tmp_path / "keys").exists()

@@ -248,6 +248,22 @@ def test_what_waits_leaves_before_the_process_does(join: Join) -> None:
 
 
 @pytest.mark.fast
+def test_a_bundle_of_more_messages_than_are_bundled_costs_one_rejection() -> None:
+    """A million empty ones fit into one bundle, and blocked every receiver for a quarter of a minute."""
+    rejected, got = RejectedMessages(), list[Sample]()
+    unbundler, bundle = Unbundler(rejected), pb.Bundle()
+    unbundler.add(STEP, {}, _listener(STEP, got).deliver)
+    for count in range(1, MOST_BUNDLED + 2):
+        bundle.messages.add(key="step/ground/actor-0", payload=b"")
+        sample = Sample(BUNDLE, "bundle/ground/actor-0", bundle.SerializeToString(), 1)
+        if count == MOST_BUNDLED:
+            unbundler.take(sample)
+    with pytest.raises(Malformed, match=f"{MOST_BUNDLED + 1} messages"):
+        unbundler.take(sample)
+    assert len(got) == MOST_BUNDLED and not rejected.count
+
+
+@pytest.mark.fast
 @pytest.mark.parametrize(
     "key",
     ["step/ground/actor-1", "step/ground/actor-00", "step/quadrotor/actor-0", "model/ground/actor-0", "weights/ground",

@@ -212,6 +212,8 @@ def test_where_nothing_can_be_served_is_said(exposed):
         MetricsServer("nonsense", everything)
     with pytest.raises(OSError, match="in use"):
         MetricsServer(str(exposed(everything())), everything)
+    with pytest.raises(OSError, match="70000 is no port"):
+        MetricsServer("127.0.0.1:70000", everything)
 
 
 @pytest.mark.parametrize("path", ["grafana/brakeline.json", "kubernetes/autoscaler.yaml"])

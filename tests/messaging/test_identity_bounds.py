@@ -15,6 +15,7 @@ from brakeline.messaging.bus import Bus, BusSettings, Sample, configuration
 from brakeline.messaging.bus.identity import identity_of, speaks_for
 from brakeline.messaging.bus.subscription import MOST_KEYS_OF_ONE
 from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.message_checks import MAX_ENTRIES
 from brakeline.messaging.topics import EXCHANGE, HEALTH, LOG, STEP, Topic
 from tests.waiting import until
 
@@ -31,6 +32,7 @@ def message(topic: Topic, key: str, content: object) -> object:
         (STEP, "step/ground/actor-1", pb.Step(actor="actor-0")),
         (STEP, "step/ground/actor-1", pb.Step(header=pb.Header(source="actor-10"))),
         (HEALTH, "health/actor-1", pb.Health(process="safety")),
+        (HEALTH, "health/actor-1", pb.Health(process="actor-1.7")),
         (HEALTH, "health/actor-1", pb.Health(published={"step/ground/actor-0": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"metrics/ground": 10**9})),
         (HEALTH, "health/actor-1", pb.Health(published={"logged/ground/actor-1": 10**9})),
@@ -50,6 +52,19 @@ def test_a_process_speaks_for_itself_and_its_robots() -> None:
     message(HEALTH, "health/learner-ground", pb.Health(process="learner-ground", published={"metrics/ground": 3}))
     message(EXCHANGE, "exchange/ground/actor-1.3", pb.Exchange(request=pb.Request(robot="ground", actor="actor-1.3")))
     assert speaks_for("actor-1", "actor-1.3") and not speaks_for("actor-1", "actor-10")
+
+
+@pytest.mark.parametrize("field", ["published", "figures", "notes"])
+def test_a_map_with_very_many_entries_is_malformed(field: str) -> None:
+    """Else each costs every receiver time: 45,000 keys of published messages took about a second."""
+    of_type = {"published": 1, "figures": 1.0, "notes": ""}[field]
+    for count in (MAX_ENTRIES, MAX_ENTRIES + 1):
+        content = pb.Health(**{field: {f"step/r{i}/actor-1": of_type for i in range(count)}})  # type: ignore[arg-type]
+        if count == MAX_ENTRIES:
+            message(HEALTH, "health/actor-1", content)
+        else:
+            with pytest.raises(Malformed, match=f"{count} {field}"):
+                message(HEALTH, "health/actor-1", content)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +96,18 @@ def test_one_identity_cannot_take_all_places_of_the_figures(monkeypatch: pytest.
     with pytest.raises(Implausible, match="actor-0 has 10"):
         metrics.add("log/actor-0", pb.LogLine(header=pb.Header(sequence=1, run=10)))
     metrics.add("log/actor-1", pb.LogLine(header=pb.Header(sequence=1, run=1)))
+
+
+def test_one_identity_cannot_take_all_names_of_the_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It took the 4,000 places of the actors, and every actor that joined later had no figures."""
+    monkeypatch.setattr(metrics_module, "MOST_NAMES_OF_ONE", 10)
+    metrics = Metrics()
+    for number in range(10):
+        metrics.add(f"step/ground/actor-0.{number}", pb.Step(actor=f"actor-0.{number}"))
+    with pytest.raises(Implausible, match="actor-0 has 10 names"):
+        metrics.add("step/ground/actor-0.10", pb.Step(actor="actor-0.10"))
+    metrics.add("step/ground/actor-1", pb.Step(actor="actor-1"))
+    assert len(metrics.actors) == 11
 
 
 def test_two_processes_with_one_name_are_two_starts() -> None:

@@ -17,7 +17,7 @@ import zenoh
 
 from brakeline.errors import BusError, Late, NoReply, Refused
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusSettings, fair_queue, query_server
+from brakeline.messaging.bus import Bus, BusSettings, configuration, fair_queue, query_server
 from brakeline.messaging.bus.fair_queue import MAX_PER_CLIENT, FairQueue, T
 from brakeline.messaging.bus.query_client import HELD, PATIENT, QueryClient
 from brakeline.messaging.free_ports import free_endpoint
@@ -82,6 +82,29 @@ class _Silent:
     def get(self, **_):
         time.sleep(self._after)
         return iter(())
+
+
+def test_an_error_reply_that_is_no_message_is_a_refusal(join: Join, endpoint: str) -> None:
+    """It was an error of protobuf, on which an actor ended instead of braking its robot."""
+    join("launcher", listen=True)
+    actor = join("actor-0")
+    service = zenoh.open(configuration(BusSettings(connect=(endpoint,)), "safety"))
+    service.declare_queryable(
+        "brakeline/safety/ground/decide/*",
+        lambda query: query.reply_err(b"\xff\xff", encoding=zenoh.Encoding.APPLICATION_PROTOBUF),
+    )
+
+    def refusal() -> Refused | None:
+        try:
+            actor.ask(DECIDE, b"", PATIENCE, robot="ground")
+        except NoReply:  # the router does not know the service yet
+            return None
+        except Refused as error:
+            return error
+        raise AssertionError("an answer")
+
+    assert until(refusal).type == "BadReply"
+    service.close()  # type: ignore[no-untyped-call]
 
 
 def test_a_question_that_ends_without_a_word_is_late_after_its_deadline_and_unheard_before(monkeypatch):

@@ -15,6 +15,7 @@ from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan, correcti
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, correction_penalties
+from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
@@ -118,18 +119,33 @@ def test_a_row_without_a_valid_decision_brakes_along_its_committed_plan(broken: 
     assert np.array(["", SAFETY.version, UNVERIFIED])[plans._status[0]] == single.backup_plan.model
 
 
-def test_a_state_that_is_not_finite_costs_a_batch_one_period() -> None:
-    plans = BackupPlanBatch(one_step(), 2)
-    free, given = ObstacleArrays.of([Shapes.of([], 2)] * 2), []
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e300])
+def test_a_state_that_is_not_possible_costs_its_robot_one_period(value: float) -> None:
+    """The other robots are decided as if it were not there; its past begins anew."""
+    safety = one_step()
+    plans, alone = BackupPlanBatch(safety, 3), BackupPlanBatch(safety, 2)
+    free, given = [ObstacleArrays.of([Shapes.of([], 2)] * size) for size in (3, 2)], []
     for period in range(16):
-        states = np.zeros((2, 5))
-        states[1, 0] = math.nan if period == 6 else 0.0
-        outcome = plans.decide(states, np.zeros((2, 2)), free)
-        assert outcome.decided.all() == (period != 6), outcome.failure
-        past = plans.request(states, np.zeros((2, 2)), free).past
-        given.append([False, False] if past is None else past.given.tolist())
+        states, actions = np.zeros((3, 5)), np.tile([0.1, 0.0], (3, 1))
+        states[1, 0] = value if period == 6 else 0.0
+        outcome = plans.decide(states, actions, free[0])
+        others = alone.decide(states[::2], actions[::2], free[1])
+        assert outcome.decided.tolist() == [True, period != 6, True] and bool(outcome.failure) == (period == 6)
+        assert (outcome.inputs[::2] == others.inputs).all() and np.isfinite(outcome.inputs).all()
+        past = plans.request(states, actions, free[0]).past
+        given.append([False] * 3 if past is None else past.given.tolist())
     N = plans.robot.horizon
-    assert given[N : 6 + N] == [[True, True]] * (6 - N) + [[True, False]] * N and given[6 + N] == [True, True]
+    assert given[N : 6 + N] == [[True] * 3] * (6 - N) + [[True, False, True]] * N and given[6 + N] == [True] * 3
+    assert plans.widening.tolist() == [alone.widening[0], plans.widening[1], alone.widening[1]]
+
+
+def test_an_observation_that_is_not_finite_costs_its_robot_alone_a_rivals_decision() -> None:
+    observations = np.zeros((2, 3), np.float32)
+    observations[0, 1] = np.nan
+    plans, free = BackupPlanBatch(RowByRow(SAFETY), 2), ObstacleArrays.of([Shapes.of([], 2)] * 2)
+    outcome = plans.decide(np.zeros((2, 5)), np.tile([0.2, 0.0], (2, 1)), free, observations)
+    assert outcome.decided.tolist() == [False, True] and outcome.inputs.tolist() == [[0.0, 0.0], [0.2, 0.0]]
+    assert np.isnan(observations[0, 1]), "the caller's array stays"
 
 
 def test_plans_of_other_robots_are_not_kept_in_batches() -> None:

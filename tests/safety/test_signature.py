@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from brakeline.deploy.data.data_paths import model_path
 from brakeline.deploy.run.log_contents import attachments
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.deploy.run.run_models import newest_model
+from brakeline.deploy.run.run_models import newest_model, signed_last
 from brakeline.errors import BadModel, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
@@ -30,6 +30,7 @@ from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.topics import HEALTH, MODEL
 from brakeline.safety.methods import archive_path, decode
 from brakeline.safety.model.error_bounds import ErrorBound
+from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.model.windows import recorded_domain
 from brakeline.safety.service.server import ModelRegistry
@@ -154,6 +155,27 @@ def test_a_restart_uses_the_newest_signed_model(model: ModelSet, signed, trust, 
     assert newest_model(tmp_path, "ground", trust) == good
 
 
+def test_a_restarted_service_goes_on_with_a_set_that_it_was_sent_after_the_one_in_use(
+    model: ModelSet, newer: ModelSet, trust, keys: Path, tmp_path: Path
+) -> None:
+    """It began with the older one again: an adapted set was lost, and two replicas had two versions."""
+    signer, in_use, archive = ModelSigner.load(keys), tmp_path / "in_use.safetensors", tmp_path / "archive"
+    sent = archive_path(archive, "ground", newer.version)
+
+    def chosen(mode: str = AUTO) -> Path:
+        return signed_last(in_use, archive, "ground", trust, mode)
+
+    signer.sign(model).save(in_use)
+    assert chosen() == in_use
+    signer.sign(newer).save(sent)
+    assert chosen() == chosen(newer.model_config.mode) == sent and chosen("recursion") == in_use
+    signer.sign(model).save(in_use)  # put to use again
+    assert chosen() == in_use
+    seal_of(in_use).unlink()
+    with pytest.raises(Untrusted, match="no seal"):
+        chosen()
+
+
 def test_the_times_of_files_and_a_clock_set_back_bring_no_older_model_into_use(
     model: ModelSet, newer: ModelSet, trust, keys: Path, tmp_path: Path, monkeypatch
 ) -> None:
@@ -276,6 +298,18 @@ def test_a_full_disk_or_a_kill_in_a_write_to_the_archive_leaves_a_whole_model_or
             path = newest_model(archive, "ground", trust)
             assert path is None or trust.load_model(path).version == model.version
             assert error is Died or registry.filters["ground"].version == model.version, "the service goes on"
+
+
+def test_a_signer_whose_private_key_is_kept_elsewhere_stays_the_trusted_one(signed, keys: Path) -> None:
+    """Another certificate by `brakeline keys` made a new signer in its place: services refused the models in use."""
+    private = (keys / "signer.key").read_bytes()
+    (keys / "signer.key").unlink()
+    write_signer(keys)
+    assert not (keys / "signer.key").exists() and TrustedSigners.load(keys).open(signed)
+    (keys / "signer.key").write_bytes(private)
+    (keys / "signers" / "certify.json").unlink()  # the process ended between the two files
+    write_signer(keys)
+    assert (keys / "signer.key").read_bytes() == private and TrustedSigners.load(keys).open(signed)
 
 
 SERVICE = """

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest
+from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import SAME_SET, UNVERIFIED
 from brakeline.safety.filter.batch.decision_arrays import DecisionArrays
@@ -31,6 +32,7 @@ Observations = NDArray[np.float32]
 log = logging.getLogger(__name__)
 
 SAME_INPUT = 1e-9  # rounding allowed in a plan at the bounds of its inputs
+NO_DECISION = "a state, observation or proposal that is not finite or too large, or a plan that is not possible"
 STANDING, VERIFIED, OPEN = range(3)  # of a committed plan: it stands, the model set verified it, nothing did
 
 
@@ -120,29 +122,34 @@ class BackupPlanBatch:
 
         observations (B, o): by which a rival decides; the filter does not need them.
         """
-        finite = np.asarray(np.isfinite(actions).all(axis=1))
-        proposals = np.where(finite[:, None], actions, self.input_in_force)
+        usable = _plausible(states) & np.isfinite(actions).all(axis=1)
+        if observations is not None:
+            usable &= np.isfinite(observations).all(axis=1)
+            observations = np.where(usable[:, None], observations, np.float32(0.0))
+        # One row that is not valid would cost all others their decisions: it gets valid values, and no decision.
+        measured, proposals = np.where(usable[:, None], states, 0.0), np.where(usable[:, None], actions, 0.0)
         try:
-            answers = self.safety.decide_batch(self.request(states, proposals, obstacles, observations))
+            answers = self.safety.decide_batch(self.request(measured, proposals, obstacles, observations))
         except (BadRequest, ArithmeticError, np.linalg.LinAlgError) as error:
             log.exception("no decisions, so all robots brake along their committed plans")
             failure = f"{type(error).__name__}: {error}"
             nothing = np.zeros(self._size, dtype=bool)
             return BatchOutcome(self._follow(states, nothing, None), nothing, None, failure)
-        decided = finite & self._is_possible(answers)
-        failure = "" if decided.all() else "a proposal that is not finite, or a plan that is not possible"
+        decided = usable & self._is_possible(answers)
+        failure = "" if decided.all() else NO_DECISION
         return BatchOutcome(self._follow(states, decided, answers), decided, answers, failure)
 
     def contains(self, states: Array) -> Flags:
         """Return whether measured states (B, n) lie in the predicted sets: `Prediction.contains` for each row."""
         sets = self.predicted
-        errors = sets.errors(np, states, self.robot.heading)
+        with np.errstate(all="ignore"):  # states may be infinite
+            errors = sets.errors(np, states, self.robot.heading)
         return np.asarray(sets.given & (errors <= sets.half_width + SAME_SET).all(axis=1))
 
     def _shares_used(self, states: Array) -> Array:
         """Return the shares (B,) of the predicted sets that measured states (B, n) use: see `Prediction.share_used`."""
-        errors = self.predicted.errors(np, states, self.robot.heading)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
+            errors = self.predicted.errors(np, states, self.robot.heading)
             shares = np.where(errors == 0.0, 0.0, errors / self.predicted.half_width)
         return np.asarray(shares.max(axis=1))  # `_judge` takes NaN as infinite
 
@@ -190,7 +197,7 @@ class BackupPlanBatch:
         robot, now = self.robot, self.plan[:, 0].copy()
         self._states = np.concatenate([self._states[:, 1:], states[:, None]], axis=1)
         self._inputs = np.concatenate([self._inputs[:, 1:], now[:, None]], axis=1)
-        self._periods = np.where(np.isfinite(states).all(axis=1), self._periods + 1, 0)  # a gap ends the window
+        self._periods = np.where(_plausible(states), self._periods + 1, 0)  # a gap ends the window
         rests = robot.is_stop_input(now)
         last = np.where(robot.zero_at_rest, 0.0, self.plan[:, -1])
         self.plan = np.concatenate([self.plan[:, 1:], last[:, None]], axis=1)
@@ -199,6 +206,11 @@ class BackupPlanBatch:
         stopped = (self._status != OPEN) | (self._still >= robot.horizon)
         self._status[stopped & rests & robot.is_stop_input(self.plan).all(axis=1)] = STANDING
         return now.copy()
+
+
+def _plausible(states: Array) -> Flags:
+    """Return which measured states (B, n) a request may hold."""
+    return np.asarray((np.abs(states) <= FARTHEST).all(axis=1))  # NaN fails too
 
 
 def correction_penalties(robot: Robot, proposed: Array, before: Array, executed: Array, weight: float) -> Array:

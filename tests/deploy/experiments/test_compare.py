@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments import bootstrap, compared_methods
@@ -300,6 +301,14 @@ def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
             ("quadrotor",), (0,), methods=("ddpc",), conservatism=False, task_settings=wanted
         )._jobs("quadrotor")
         assert (job.td3.imitation > 0.0) == wanted
+
+
+def test_a_penalty_out_of_proportion_for_any_robot_is_refused_before_the_first_training(monkeypatch):
+    """The cell refused it, after it had built its model set: minutes later, or hours for the second robot."""
+    monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a training began"))
+    for robots, penalty in ((("ground",), 20_000.0), (("ground", "quadrotor"), 1_800.0)):
+        with pytest.raises(ValueError, match=f"out of proportion to the rewards of {robots[-1]}"):
+            CompareCommand(robots, (0,), methods=("none",), penalty=penalty, conservatism=False).run()
 
 
 def test_steps_to_learn_is_when_nine_of_ten_episodes_reach_the_goal():

@@ -1,7 +1,10 @@
 """When the certifier makes a new model set of a robot that has changed, from which driving, and when it refuses."""
 
+import os
+import threading
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -9,12 +12,13 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.certification import certify
-from brakeline.deploy.run import adaptation
+from brakeline.deploy.run import adaptation, adaptation_process
 from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
-from brakeline.deploy.run.adaptation_process import _follow
+from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
-from brakeline.errors import BadModel, BadStep, Untrusted
+from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.model.dataset import Dataset
@@ -23,8 +27,10 @@ from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelC
 from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
 from brakeline.safety.service.signature import ModelSigner, SignedModel, TrustedSigners, write_signer
+from tests.safety.joints import joints
 from tests.safety.test_turning_in_place import ROBOT, record, wandering
 from tests.safety.unicycle import Unicycle
+from tests.waiting import until
 
 ACCEPTED = 0.03
 MINUTE = 300  # periods
@@ -159,6 +165,40 @@ def test_a_change_of_one_robot_alone_makes_no_set_for_all(kind, monkeypatch):
     assert kind.attempt() is not None, "the other robot has been silent for minutes"
 
 
+@pytest.mark.parametrize("reply", [None, pb.Reply(error=pb.Error(type="NoModel"))])
+def test_a_robot_that_gets_no_decisions_is_no_robot_whose_sets_count(kind, reply):
+    """It held up the new set of the others, and its empty version was then the one to compare with."""
+    step = next(steps_of(driven(1, 3)))
+    for _ in range(REQUESTS):
+        kind.exchange(exchange_of(step, 8.0), 0.0)
+    lost = pb.Exchange(request=pb.Request(actor="actor-1"), reply=reply, failure="no answer")
+    kind.exchange(lost, 1.0)
+    assert kind.widening == 8.0 and kind._changed()
+
+
+def test_a_set_that_was_compared_with_one_no_longer_in_use_is_not_published(kind):
+    """A fit takes minutes, and the operator may publish a set meanwhile, with a lower number than the fit's."""
+    step = next(steps_of(driven(1, 3)))
+    kind.exchange(exchange_of(step, 8.0, "old"), 0.0)
+    attempt = Recertification("why", in_use(), replaces="old")
+    assert kind.confirmed(attempt) is attempt
+    kind.exchange(exchange_of(step, 1.0, "theirs"), 1.0)
+    confirmed = kind.confirmed(attempt)
+    assert confirmed.model is None and "theirs came into use during the fit" in confirmed.text
+
+
+def test_robots_that_are_gone_make_room_for_others(kind, monkeypatch):
+    monkeypatch.setattr(adaptation, "MOST_ROBOTS", 2)
+    step, later = next(steps_of(driven(1, 3))), adaptation.SILENT + 1.0
+    for name, heard in (("a", 0.0), ("b", later), ("c", later)):
+        step.actor = name
+        kind.exchange(exchange_of(step, 1.0), heard)
+    assert sorted(kind._robots) == ["b", "c"]
+    step.actor = "d"
+    with pytest.raises(Implausible, match="already 2 robots"):
+        kind.exchange(exchange_of(step, 1.0), later)
+
+
 def test_a_break_begins_the_change_anew(kind):
     trajectories = driven(2, 8, slip=-0.15)
     assert not drive(kind, trajectories[:4], widening=8.0)
@@ -236,13 +276,14 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     process = SimpleNamespace(bus=bus, notes={}, figures={}, announce=lambda: None)
     write_signer(tmp_path)
     signer, data = ModelSigner.load(tmp_path), Dataset(ROBOT, record(1, 6).trajectories)
-    attempts = [None, Recertification("why", in_use(), data), Recertification("no")]
+    kind.exchange(exchange_of(next(steps_of(driven(1, 3))), 1.0, "old"), 0.0)
+    attempts = [None, Recertification("why", in_use(), data, "old"), Recertification("no")]
     attempt = Mock(side_effect=[ZeroDivisionError("one of these"), *attempts])
     monkeypatch.setattr(kind, "attempt", attempt)
-    _follow(kind, signer, process)
+    _follow(kind, lambda: None, signer, process)
     assert "one of these" in process.notes[f"adaptation {ROBOT.name}"] and "no new model set" in caplog.text
     for _ in range(3):
-        _follow(kind, signer, process)
+        _follow(kind, lambda: None, signer, process)
     ((topic, message),) = published
     assert topic is MODEL
     signed = SignedModel(message.file, message.claim, message.signature)
@@ -251,11 +292,33 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
 
 
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_service_says_that_the_certifier_beside_it_has_ended(monkeypatch, caplog, leaves):
+    """It went on without a word, and no set was ever replaced. ^C ends both, and is nothing to report."""
+    sentinel, certifier = os.pipe()
+    process = SimpleNamespace(sentinel=sentinel, **dict.fromkeys(("start", "terminate", "kill"), lambda: None))
+    process.join = lambda timeout: None
+    monkeypatch.setattr(adaptation_process, "spawning", lambda: SimpleNamespace(Process=lambda **_: process))
+    if not leaves:
+        monkeypatch.setattr(adaptation_process, "TERMINATION_TIMEOUT", 0.05)
+    with certifier_beside(CertifierSettings(BusSettings(listen=("tls/127.0.0.1:1",)), (ROBOT.name,), Path())):
+        os.close(certifier)
+        if not leaves:
+            until(lambda: "the certifier has ended" in caplog.text)
+    for thread in threading.enumerate():
+        if thread.name == "certifier":
+            thread.join()
+    os.close(sentinel)
+    assert ("the certifier has ended" in caplog.text) != leaves
+
+
 def test_nothing_adapts_without_a_key_to_sign_or_with_a_set_of_mode_recursion(tmp_path):
     with pytest.raises(Untrusted, match="--adapt needs keys"):
         check_signer(None)
     with pytest.raises(Untrusted, match="no key to sign models with"):
         check_signer(tmp_path)
     check_adaptable(in_use())
+    with pytest.raises(ValueError, match="2-joints has none: certify it by hand"):
+        check_adaptable(SimpleNamespace(robot=joints(2)))
     with pytest.raises(ValueError, match="--mode one-step"):
         check_adaptable(replace(in_use(), model_config=ModelConfig(mode=RECURSION)))

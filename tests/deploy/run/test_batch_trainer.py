@@ -199,6 +199,19 @@ def test_all_robots_brake_while_the_filter_fails(monkeypatch: pytest.MonkeyPatch
     assert not any(step.fallback or step.collision for step in told.steps[-SIZE:])
 
 
+def test_a_state_that_is_not_finite_costs_its_robot_one_decision_and_one_step() -> None:
+    """It cost all robots their decisions, and ended the training."""
+    learner, told = Learner(GROUND, CONFIG), Told()
+    trainer = BatchTrainer(learner, SAFETY, SIZE, "learner", told)
+    for period in range(5):
+        if period == 3:
+            trainer._robots._filtered._infos["state"][2, 0] = trainer._robots.observations[2, 0] = np.nan
+        trainer.period()
+    trainer.close()
+    assert [i for i, step in enumerate(told.steps) if step.fallback] == [3 * SIZE + 2]
+    assert (learner.steps, learner.rejected) == (5 * SIZE - 1, 1)
+
+
 def test_the_backend_has_settings_of_its_own_which_options_change() -> None:
     config = TrainCommand.defaults(["ground", "--backend", "batch", "--experiment=debug"])
     assert (config.backend, config.robots_per_actor, config.experiment) == (BATCH, 32, "debug")

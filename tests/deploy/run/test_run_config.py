@@ -1,6 +1,7 @@
 """Test configurations: the saved one is loaded, and nothing unknown or impossible is accepted."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,11 @@ from brakeline.deploy.commands.train_command import TrainCommand
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import client_settings, metrics_address, process_specs, write_endpoint
 from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
+from brakeline.deploy.run.run_keys import make_run_keys
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.bus.identity import tls
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import robot_with_task
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.sim.ground_estimator import NoiseLevels
@@ -66,8 +70,9 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     for name in ("actors", "steps", "replicas", "robots_per_actor"):
         with pytest.raises(ValueError, match="1 or more"):
             RunConfig(**{name: 0})
-    with pytest.raises(ValueError, match="at most 64 robots, not 65: lower --robots-per-actor, and give more --actors"):
-        RunConfig(robots_per_actor=65)
+    for method in ("ddpc", "none"):  # the access list is the same with and without a filter
+        with pytest.raises(ValueError, match=r"at most 64 robots, not 65, with any .* give more --actors"):
+            RunConfig(robots_per_actor=65, method=method)
     assert RunConfig(robots_per_actor=64).robots_per_actor == 64
     for penalty in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="a penalty is finite and not negative"):
@@ -143,3 +148,14 @@ def test_processes_have_the_ports_after_that_of_their_launcher(launcher: str, th
     write_endpoint(tmp_path, BusSettings(listen=("tcp/127.0.0.1:7447",), metrics=launcher))
     assert metrics_address(tmp_path, 2) == third
     assert client_settings(tmp_path).metrics == "", "who looks on does not take a port"
+
+
+def test_the_processes_of_a_robot_with_a_dot_in_its_name_have_certificates(tmp_path: Path) -> None:
+    """`actor-rover.v2-0` looked for the certificate of `actor-rover`, and no run of two robots began."""
+    ground = (ROBOTS_FOLDER / "ground.toml").read_text()
+    (tmp_path / "rover.toml").write_text(ground.replace('name = "ground"', 'name = "rover.v2"'))
+    shutil.copy(ROBOTS_FOLDER / "ground.task.toml", tmp_path / "rover.task.toml")
+    config = RunConfig(robots=("ground", str(tmp_path / "rover.toml")), actors=1)
+    keys = make_run_keys(config, tmp_path)
+    for spec in process_specs(config):
+        assert tls(keys, spec.name, listens=False)

@@ -2,12 +2,20 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from brakeline.deploy.run import supervisor
 from brakeline.deploy.run.processes import HOPELESS, ProcessSpec
-from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, START_ALLOWANCE, SupervisedProcess
+from brakeline.deploy.run.supervisor import (
+    HEALTHY_AFTER,
+    MOST_FAILURES,
+    START_ALLOWANCE,
+    SupervisedProcess,
+    describe_end,
+    last_line,
+)
 from brakeline.errors import LaunchError
 
 
@@ -83,3 +91,18 @@ def test_a_process_that_a_restart_does_not_help_ends_the_run_at_once_with_its_ow
     child = Diverging(ProcessSpec("learner", "learner", "ground"), tmp_path)
     with pytest.raises(LaunchError, match=r"^learner: Diverged: lower the learning rates; see "):
         lives(child, clock, 0.5, 2.0)
+
+
+def test_the_output_of_a_process_may_be_larger_than_the_memory(tmp_path: Path) -> None:
+    """The launcher read all of it to find the last line, and ended with a MemoryError."""
+    with (tmp_path / "actor-0.log").open("wb") as file:
+        file.seek(2**38)
+        file.write(b"\nValueError: the reason\n\n")
+    assert last_line(tmp_path / "actor-0.log") == "ValueError: the reason"
+    (tmp_path / "short.log").write_text("a\nb\n")
+    assert last_line(tmp_path / "short.log") == "b" and last_line(tmp_path / "none.log") == ""
+
+
+def test_a_process_that_a_signal_without_a_name_has_killed_does_not_end_the_launcher() -> None:
+    assert describe_end(-9, 1.0) == "was killed by SIGKILL after 1.0 s"
+    assert describe_end(-40, 1.0) == "was killed by signal 40 after 1.0 s"
