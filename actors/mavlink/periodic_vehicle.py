@@ -50,10 +50,11 @@ class PeriodicVehicle:
             patience = 2.0 + self._robot.period * max(0, number - self.current_period.number)
             if not self._changed.wait_for(lambda: self.failed or self.current_period.number >= number, patience):
                 raise MavlinkError(f"period {number} does not begin")
-            self._check()
+            self.check()
             return self.current_period
 
-    def _check(self) -> None:
+    def check(self) -> None:
+        """Raise the error after which nobody flies the vehicle any more, if there is one."""
         if self._failure is not None:
             raise self._failure
 

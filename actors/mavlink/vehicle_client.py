@@ -141,7 +141,7 @@ class VehicleClient(PeriodicVehicle):
     def _await_flight(self, stop: Callable[[], bool]) -> None:
         with self._changed:
             while self._current is None:
-                self._check()
+                self.check()
                 if stop():
                     raise MavlinkError("asked to stop before the vehicle flew")
                 if time.monotonic() - self._received_at > HANDOVER_TIMEOUT:
@@ -157,7 +157,7 @@ class VehicleClient(PeriodicVehicle):
             self._socket.send(command)
             while True:
                 reply = self._replies.get(timeout=REPLY_TIMEOUT)
-                self._check()
+                self.check()
                 if reply is not None and reply.number == command.number:  # not a late reply to an older command
                     return reply
         except OSError as error:

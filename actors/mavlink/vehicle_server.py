@@ -157,10 +157,11 @@ class VehicleServer:
         Once the process has to end, the actor has `CLOSE_TIMEOUT` to close the flight.
 
         Raises:
-            MavlinkError: the vehicle's thread has died, or the actor did not close the flight in time.
+            MavlinkError: nobody flies the vehicle any more, or the actor did not close the flight in time.
         """
         stopped_at: float | None = None
-        while not self._vehicle.failed:
+        while True:
+            self._vehicle.check()
             if stopped_at is None and self._stop.is_set():
                 stopped_at = time.monotonic()
             if stopped_at is not None and time.monotonic() - stopped_at > CLOSE_TIMEOUT:
@@ -177,7 +178,6 @@ class VehicleServer:
             if command.WhichOneof("command") == "close":
                 return True
             self._outbox.put(pb.VehicleMessage(reply=self._reply(command)))
-        raise MavlinkError("the vehicle's thread has died")
 
     def brake(self) -> None:
         """Fly the committed plan to its end, and wait until the vehicle hovers. Raises MavlinkError."""
