@@ -232,7 +232,7 @@ def test_after_an_interruption_the_vehicle_brakes_and_nobody_flies_it_any_more(d
                 period = vehicle.wait(vehicle.current_period.number + 1)
                 assert not vehicle.commit(rows, period.number + 1) or not period.lost
         if not disarms:
-            assert setpoints(frames)[-4:] == [(0.6, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)][-4:]
+            assert setpoints(frames)[-3:] == [(0.6, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)]
         sent = len(setpoints(frames))
         autopilot.flight.armed = True
         time.sleep(0.5)

@@ -142,6 +142,20 @@ def test_a_vehicle_that_disarmed_is_given_up_and_the_actor_hears_why(flown: tupl
     assert not last.base_mode & 128, "the frames up to the end are recorded"
 
 
+def test_a_vehicle_that_disarmed_without_an_actor_is_not_taken_over_by_the_next_one(
+    flown: tuple[str, Autopilot],
+) -> None:
+    """The next actor would arm it and take off, while a person may have it in hand."""
+    url, autopilot = flown
+    with actor(url) as vehicle:
+        vehicle.leave()
+        autopilot.flight.disarm(True)
+        time.sleep(4.0)
+        with pytest.raises(CommandLost, match="it has disarmed"), actor(url):
+            pass
+        assert not autopilot.flight.armed
+
+
 def test_a_process_of_another_user_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         listening("udpin:test", os.getpid()) as listener,
