@@ -5,10 +5,11 @@ import sys
 
 import pytest
 
-from brakeline.deploy.run import supervisor
+from brakeline.deploy.run import run_process, supervisor
 from brakeline.deploy.run.processes import HOPELESS, ProcessSpec
 from brakeline.deploy.run.supervisor import HEALTHY_AFTER, MOST_FAILURES, START_ALLOWANCE, SupervisedProcess
-from brakeline.errors import LaunchError
+from brakeline.errors import CommandLost, LaunchError
+from brakeline.messaging.bus import BusSettings
 
 
 @pytest.fixture
@@ -83,3 +84,26 @@ def test_a_process_that_a_restart_does_not_help_ends_the_run_at_once_with_its_ow
     child = Diverging(ProcessSpec("learner", "learner", "ground"), tmp_path)
     with pytest.raises(LaunchError, match=r"^learner: Diverged: lower the learning rates; see "):
         lives(child, clock, 0.5, 2.0)
+
+
+def test_an_actor_whose_command_of_its_vehicle_ended_is_not_started_again(tmp_path, monkeypatch, capsys) -> None:
+    """It would arm a vehicle that a person may have in hand, and take off."""
+
+    def fly() -> bool:
+        raise CommandLost("our command of the vehicle has ended: it has disarmed")
+
+    spec = ProcessSpec("actor-0", "actor")
+    monkeypatch.setattr(run_process, "PROCESSES", {"actor": lambda *_: fly})
+    for name, result in (
+        ("load", None),
+        ("process_specs", [spec]),
+        ("client_settings", BusSettings()),
+        ("metrics_address", ""),
+        ("launcher_pid", 1),
+        ("end_with_parent", True),
+    ):
+        monkeypatch.setattr(run_process, name, lambda *_, result=result: result)
+    monkeypatch.setattr(run_process.signal, "signal", lambda *_: None)
+    monkeypatch.setattr("sys.argv", ["run_process", str(tmp_path), spec.name])
+    assert run_process.main() == HOPELESS
+    assert capsys.readouterr().err == "actor-0: CommandLost: our command of the vehicle has ended: it has disarmed\n"
