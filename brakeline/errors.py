@@ -248,6 +248,10 @@ class MavlinkError(BrakelineError, RuntimeError):
     """The autopilot does not carry out a command."""
 
 
+class CommandLost(MavlinkError):
+    """The vehicle disarmed or restarted, or its estimate jumped: the actor must not fly it any more."""
+
+
 class NoAutopilot(MavlinkError):
     """No heartbeat of PX4 or ArduPilot arrives."""
 
@@ -270,6 +274,10 @@ class BadMessage(BrakelineError, ValueError):
 
 class InputMissing(BrakelineError):
     """An input of a decision is missing or stale; the message says which."""
+
+
+class PoseJumped(InputMissing):
+    """A robot's odometry made a step that the robot can't: no plan from before counts as verified any more."""
 
 
 # --- Learning ---

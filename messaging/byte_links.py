@@ -5,8 +5,9 @@ udpout:HOST:PORT   send to this address
 tcp:HOST:PORT      connect
 tcpin:HOST:PORT    listen; any number of connections
 
-A link may lose bytes. `send` never waits, and a peer that is gone is no error. `receive` returns the bytes that arrived
-since the last call.
+A link may lose bytes. `send` never waits, and a peer that is gone is no error. With a peer's name (HOST:PORT), `send`
+sends to that peer only; `udpout` and `tcp` have only one. `receive` returns the bytes that arrived since the last call,
+and `receive_by_peer` returns them in pieces, each with the name of its sender.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from brakeline.errors import BadLink
 
 FORGET = 10.0  # time after which a silent UDP peer gets nothing more [s]
 LARGEST = 65536  # largest number of bytes in one read
+
+Pieces = list[tuple[str, bytes]]
 
 
 class Udp:
@@ -36,24 +39,28 @@ class Udp:
         """The link's own port."""
         return int(self._socket.getsockname()[1])
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes, peer: str = "") -> None:
         now = time.monotonic()
-        peers = [self._fixed] if self._fixed else [peer for peer, heard in self._peers.items() if now - heard < FORGET]
-        for peer in peers:
-            with contextlib.suppress(OSError):
-                self._socket.sendto(data, peer)
+        recent = [address for address, heard in self._peers.items() if now - heard < FORGET]
+        for address in [self._fixed] if self._fixed else recent:
+            if self._fixed or peer in ("", _name(address)):
+                with contextlib.suppress(OSError):
+                    self._socket.sendto(data, address)
 
     def receive(self) -> bytes:
-        parts: list[bytes] = []
+        return _joined(self.receive_by_peer())
+
+    def receive_by_peer(self) -> Pieces:
+        pieces: Pieces = []
         while True:
             try:
-                data, peer = self._socket.recvfrom(LARGEST)
+                data, address = self._socket.recvfrom(LARGEST)
             except BlockingIOError:
-                return b"".join(parts)
+                return pieces
             except OSError:  # the peer's port was closed at an earlier send
                 continue
-            self._peers[peer] = time.monotonic()
-            parts.append(data)
+            self._peers[address] = time.monotonic()
+            pieces.append((_name(address), data))
 
     def close(self) -> None:
         self._socket.close()
@@ -67,13 +74,21 @@ class Tcp:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
         self.open = True
+        try:
+            self.peer = _name(connection.getpeername())
+        except OSError:  # it has hung up already
+            self.peer = "a peer that is gone"
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes, peer: str = "") -> None:
         try:
             if self.open and self._socket.send(data) < len(data):
                 self.open = False  # the peer does not read; a part of a frame would be useless
         except OSError:
             self.open = False
+
+    def receive_by_peer(self) -> Pieces:
+        data = self.receive()
+        return [(self.peer, data)] if data else []
 
     def receive(self) -> bytes:
         parts: list[bytes] = []
@@ -106,18 +121,22 @@ class TcpServer:
         """The link's own port."""
         return int(self._socket.getsockname()[1])
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes, peer: str = "") -> None:
         for client in self._clients:
-            client.send(data)
+            if peer in ("", client.peer):
+                client.send(data)
 
     def receive(self) -> bytes:
+        return _joined(self.receive_by_peer())
+
+    def receive_by_peer(self) -> Pieces:
         with contextlib.suppress(BlockingIOError):
             self._clients.append(Tcp(self._socket.accept()[0]))
-        data = b"".join(client.receive() for client in self._clients)
+        pieces = [piece for client in self._clients for piece in client.receive_by_peer()]
         for client in [client for client in self._clients if not client.open]:
             client.close()
             self._clients.remove(client)
-        return data
+        return pieces
 
     def close(self) -> None:
         for client in self._clients:
@@ -126,6 +145,14 @@ class TcpServer:
 
 
 Link = Udp | Tcp | TcpServer
+
+
+def _name(address: tuple[str, int]) -> str:
+    return f"{address[0]}:{address[1]}"
+
+
+def _joined(pieces: Pieces) -> bytes:
+    return b"".join(data for _, data in pieces)
 
 
 def open_link(url: str) -> Link:

@@ -43,25 +43,29 @@ class ClockOffset:
     """Our clock minus the autopilot's [s], from the messages with the least delay.
 
     The value falls at once, and rises only by the drift between two clocks: on a busy machine messages arrive
-    milliseconds late, and at 7 m/s each millisecond is 7 mm. The autopilot's clock has jumped if every message of one
-    second arrives later by `JUMP`, as when a simulator stalls.
+    milliseconds late, and at 7 m/s each millisecond is 7 mm. Messages that all arrive later do not tell a clock that
+    has jumped, as when a simulator stalls, from a link that has become slower. A TIMESYNC reply does: the autopilot
+    read its clock after our request was sent, so no delay makes the offset larger than that.
     """
 
     DRIFT = 1e-4  # s per second, the largest between two clocks
-    JUMP = 0.05  # s
+    JUMP = 0.05  # s, by which the clock must have jumped: autopilots read their clock some milliseconds early
 
     def __init__(self) -> None:
         self.value = math.inf  # before the first message
         self._noted_at = -math.inf  # s, arrival of the last message
-        self._second_began = -math.inf  # s
-        self._least = math.inf  # s, the least offset in this second
 
     def note(self, now: float, theirs: float) -> None:
         """Take in a message that arrives at `now` [s, our clock] and was sent at `theirs` [s, the autopilot's]."""
-        if now - self._second_began > 1.0:
-            if self._least > self.value + self.JUMP:
-                self.value = self._least
-            self._second_began, self._least = now, math.inf
-        offset = now - theirs
         drifted = self.value + self.DRIFT * (now - self._noted_at) if math.isfinite(self.value) else math.inf
-        self.value, self._noted_at, self._least = min(drifted, offset), now, min(self._least, offset)
+        self.value, self._noted_at = min(drifted, now - theirs), now
+
+    def answer(self, asked: float, theirs: float, round_trip: float) -> None:
+        """Take in a TIMESYNC reply: follow the autopilot's clock if it has jumped further than any delay explains.
+
+        asked: s, our clock at the request; theirs: s, the autopilot's at its reply; round_trip: s, the fastest so far.
+        A reply to a request that was itself delayed proves less of a jump; the next fast one proves all of it.
+        """
+        proved = asked - theirs + round_trip
+        if proved > self.value + self.JUMP:
+            self.value = proved

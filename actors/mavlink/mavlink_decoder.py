@@ -17,14 +17,30 @@ import numpy as np
 from brakeline.actors.mavlink import telemetry
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.frame_log import CapturedFrame, FrameTap
-from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, SOURCES, TRUTH, Array, GeoPosition
+from brakeline.actors.mavlink.telemetry import (
+    ATTITUDE,
+    FORCE,
+    LANDED,
+    MOTION,
+    SOURCES,
+    TRUTH,
+    Array,
+    GeoPosition,
+    MotionSample,
+)
+from brakeline.errors import BadMessage
 from brakeline.sim.flight_estimator import Quaternion, Vector
 
 STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we are
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 FULL = 100.0  # %
+ARMED = int(mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 MOST_TEXTS, MOST_PARAMETERS = 50, 4000  # that are kept: ArduPilot has 1,400 parameters
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
+RESTARTED = 1.0  # s: a position that is older than the last one by more comes from an autopilot that has restarted
+# m, m/s²: two positions that differ by more from their mean velocity times the time between them are no motion. With an
+# acceleration up to a, the way differs from the one at the mean of the first and the last velocity by up to a t² / 4.
+STEP, STEP_ACCELERATION = 0.5, 10.0
 SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 
@@ -48,6 +64,10 @@ class MavlinkDecoder:
         self.armed = False
         self.custom_mode = 0
         self.emergency = False
+        # why its map or our command of it no longer holds: the first reason since the caller emptied this text
+        self.interruption = ""
+        self.source: str | None = None  # the address of the autopilot; None before its first message
+        self.second_source = ""  # another address whose messages have its system id; empty: none yet
         self.airborne: bool | None = None  # None: unknown
         self.message_counts: Counter[str] = Counter()  # by their quantity, a key of SOURCES; heartbeats are "mode"
         self.time = 0.0  # s since its boot, of the latest position
@@ -68,6 +88,7 @@ class MavlinkDecoder:
         self._acks: dict[int, int] = {}
         self._parameters: dict[str, float] = {}
         self._types: dict[str, int] = {}  # MAV_PARAM_TYPE of each of them
+        self._resets: int | None = None  # of the estimate, by ODOMETRY
         self._tap, self._say = tap, say
         self._mav = mavlink.MAVLink(_Pipe(send), srcSystem=STATION, srcComponent=COMPONENT)
         self._mav.robust_parsing = True
@@ -97,11 +118,15 @@ class MavlinkDecoder:
         """The name of its mode, by its last heartbeat."""
         return "no mode yet" if self.kind is None else telemetry.mode_name(self.kind, self.custom_mode)
 
-    def feed(self, data: bytes) -> None:
-        """Decode bytes from the link, in pieces of any size."""
+    def feed(self, data: bytes, source: str = "") -> None:
+        """Decode bytes from the link, in pieces of any size.
+
+        source: the address that they come from. Raises BadMessage: a second vehicle there has the autopilot's id.
+        """
         for message in self._mav.parse_buffer(data) or ():
             if message.get_srcSystem() != self.system or message.get_srcComponent() != AUTOPILOT:
                 continue
+            self._check_source(source)
             if self._tap is not None:
                 self._tap(CapturedFrame(False, bytes(message.get_msgbuf()), message))
             for what, place in SENDERS.get(message.get_type(), ()):
@@ -123,6 +148,8 @@ class MavlinkDecoder:
         value = telemetry.read_source(source, message)
         if value is None:
             return
+        if what == MOTION and not self._newer(value):
+            return
         self._best[what] = place
         self.message_counts[what] += 1
         if what == MOTION:
@@ -141,8 +168,10 @@ class MavlinkDecoder:
         """Take in a message about the autopilot itself."""
         match message.get_type():
             case "HEARTBEAT" if message.autopilot in KINDS:
-                self.kind = KINDS[message.autopilot]
-                self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+                self.kind, armed = KINDS[message.autopilot], bool(message.base_mode & ARMED)
+                if self.armed and not armed:
+                    self._interrupt("it has disarmed")
+                self.armed = armed
                 self.emergency = (
                     message.system_status >= mavlink.MAV_STATE_CRITICAL
                 )  # also: ends its flight, powers off
@@ -154,6 +183,10 @@ class MavlinkDecoder:
                 if self._say is not None and self.texts[-1:] != [message.text]:
                     self._say(message.text)
                 self.texts = [*self.texts[1 - MOST_TEXTS :], message.text]
+            case "ODOMETRY" if message.frame_id in telemetry.LOCAL:
+                if self._resets not in (None, message.reset_counter):
+                    self._interrupt("its estimator has reset its position, velocity or attitude")
+                self._resets = message.reset_counter
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS":
                 self.estimator = message.flags
             case "SYS_STATUS" if 0 <= message.battery_remaining <= FULL:
@@ -168,6 +201,43 @@ class MavlinkDecoder:
                 self._note_parameter(message.param_id, float(value), message.param_type)
             case "TIMESYNC" if message.tc1 != 0:  # 0: the autopilot asks for our clock
                 self.answers.append((message.ts1, message.tc1))
+
+    def _check_source(self, source: str) -> None:
+        """Remember the autopilot's address. Raises BadMessage: this is another one."""
+        if self.source is None:
+            self.source = source
+        if source != self.source:
+            self.second_source = source
+            raise BadMessage(self.two_sources)
+
+    @property
+    def two_sources(self) -> str:
+        """Say that two vehicles have one system id, and what to do."""
+        return (
+            f"vehicle {self.system} is at {self.source}, and messages with its system id also come from "
+            f"{self.second_source}: they don't count. Give each vehicle on a link a system id of its own"
+        )
+
+    def _newer(self, sample: MotionSample) -> bool:
+        """Return whether a position is newer than the last one, and note a restart, or a step that is no motion."""
+        if self.position is None:
+            return True
+        duration = sample.time - self.time
+        if -RESTARTED <= duration <= 0.0:
+            return False
+        if duration < 0.0:
+            self._interrupt(
+                f"it has restarted: its time since boot went from {self.time:.1f} s back to {sample.time:.1f} s"
+            )
+            return True
+        moved = 0.5 * duration * (self.velocity + sample.velocity)
+        step = float(np.linalg.norm(sample.position - self.position - moved))
+        if not step <= STEP + 0.25 * STEP_ACCELERATION * duration**2:
+            self._interrupt(f"its position jumped by {step:.2f} m within {duration:.2f} s")
+        return True
+
+    def _interrupt(self, why: str) -> None:
+        self.interruption = self.interruption or why
 
     def _note_parameter(self, name: str, value: float, type: int) -> None:
         """Store a parameter, and forget the oldest one if there are too many."""

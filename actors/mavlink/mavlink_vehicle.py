@@ -12,13 +12,14 @@ import numpy as np
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.autopilot_commands import HEARTBEAT_INTERVAL, AutopilotClient
-from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
+from brakeline.actors.mavlink.flight_timing import FlightTiming
+from brakeline.actors.mavlink.flight_watch import POLL, STALE, FlightWatch
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth, UdpGroundTruth
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVehicle
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
-from brakeline.actors.mavlink.telemetry import IN_FLIGHT, TRUTH, Array, missing, resampled
-from brakeline.errors import MavlinkError, TelemetryMissing
+from brakeline.actors.mavlink.telemetry import TRUTH, Array, resampled
+from brakeline.errors import CommandLost, MavlinkError, TelemetryMissing
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
@@ -27,11 +28,8 @@ from brakeline.sim.vehicle import Period
 
 log = logging.getLogger("brakeline.flight")
 
-POLL = 0.005  # s between two reads of the link
 RESEND = 0.05  # s between two transmissions of the same setpoint
-STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
-SILENT = 3.0  # s without a heartbeat after which the mode counts as unknown
-SYNC_INTERVAL = 1.0  # s between two requests for the autopilot's clock
+SYNC_INTERVAL = 0.2  # s between two requests for the autopilot's clock
 LOW_BATTERY = 20.0  # %, below which the log says so
 LATE = 0.02  # s after its time at which a period's start counts as late
 
@@ -45,7 +43,10 @@ class MavlinkVehicle(PeriodicVehicle):
 
     If the process dies, the autopilot's own timeout brakes the vehicle. An actor therefore runs the vehicle in a second
     process, which outlives the actor (`brakeline.actors.mavlink.vehicle_client`). If the vehicle leaves offboard or
-    guided mode (pilot, failsafe, battery, fence), we do not take it back; periods are `lost` until it returns.
+    guided mode (pilot, failsafe, battery, fence), we do not take it back; periods are `lost` until it returns. If the
+    vehicle disarms or restarts, or its estimate jumps, our command of it has ended: the vehicle brakes along the
+    committed plan (a disarmed one does not), and then nobody flies it. Nothing else could tell that the vehicle is
+    where our map says, or that a person has not taken it in hand.
 
     Collisions and clearance come from the ground truth of a simulator, if there is one.
     """
@@ -78,16 +79,14 @@ class MavlinkVehicle(PeriodicVehicle):
         self.timing = FlightTiming()
         self._plan: list[Array] = []  # the inputs after the one in force
         self._sent_at = self._heartbeat_at = self._synced_at = -math.inf
-        self._counted: dict[str, int] = {}  # messages by their quantity
-        self._received_at: dict[str, float] = {}  # s, arrival of the latest of them
         self._logged_loss, self._logged_battery = "", False
         self._velocity: Array | None = None  # the setpoint that is repeated
-        self._offsets = ClockOffset()
         self._ended = threading.Event()
         self._link = open_link(flight.url)
         self._truth: UdpGroundTruth | None = None
         self._mavlink_truth = None if flight.truth else mavlink_truth
-        self._client = AutopilotClient(self._link.send, flight.system, tap, lambda text: log.info("it says: %s", text))
+        self._client = AutopilotClient(self._send, flight.system, tap, lambda text: log.info("it says: %s", text))
+        self._watch = FlightWatch(self._client, self.timing)
         self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold)
         self.notes = self._takeoff.notes
         try:
@@ -97,6 +96,7 @@ class MavlinkVehicle(PeriodicVehicle):
         except BaseException:
             self._disconnect()
             raise
+        self._client.interruption = ""  # the map and our command hold from here on
         self._collisions = 0 if self._truth is None else self._truth.collisions
         if self._mavlink_truth is not None:
             self._request_truth()
@@ -111,14 +111,14 @@ class MavlinkVehicle(PeriodicVehicle):
         """Carry out a plan (K, 3) [m/s], clipped to bounds and slew, from period `number` on, and then zero.
 
         Returns:
-            False if that period has begun already; the plan committed before stays in force.
+            False if that period has begun already, or our command has ended; the plan committed before stays in force.
 
         Raises:
             BadInput: an input is not three finite numbers.
         """
         rows = [self._robot.clip_input(row, row) for row in np.asarray(plan, float)]
         with self._changed:
-            in_time = self.current_period.number < number
+            in_time = self.current_period.number < number and not self._client.interruption
             if in_time:
                 before = number - self.current_period.number - 1
                 unchanged = [*self._plan, *[np.zeros(self._robot.action_dim)] * before][:before]
@@ -150,7 +150,7 @@ class MavlinkVehicle(PeriodicVehicle):
     @property
     def silence(self) -> float:
         """Seconds since the last message of the autopilot."""
-        return time.monotonic() - max(self._received_at.values(), default=-math.inf)
+        return self._watch.silence(time.monotonic())
 
     def judged(self) -> dict[str, float]:
         """Figures for Health from the ground truth of the autopilot's simulator; empty without one."""
@@ -171,6 +171,10 @@ class MavlinkVehicle(PeriodicVehicle):
         """Stop sending. Unless the vehicle has landed, the autopilot's timeout brakes it."""
         self._stop()
         self._disconnect()
+
+    def _send(self, data: bytes) -> None:
+        """Send to the autopilot's address; to all peers of the link until it is known."""
+        self._link.send(data, self._client.source or "")
 
     def _disconnect(self) -> None:
         self._link.close()
@@ -193,9 +197,20 @@ class MavlinkVehicle(PeriodicVehicle):
                     if now >= self._due:
                         self._begin_next(now)
                     self._exchange(now)
+                    self._end_command()
+        except CommandLost as error:
+            log.error("no more setpoints are sent: %s", error)
+            self._fail(error)
         except Exception as error:  # any error: without setpoints the autopilot brakes
             log.exception("no more setpoints are sent")
             self._fail(MavlinkError(f"nobody flies any more: {type(error).__name__}: {error}"))
+
+    def _end_command(self) -> None:
+        """Raise CommandLost once our command has ended and the vehicle has braked along its plan, or has disarmed."""
+        if self._client.interruption and (self.idle or not self._client.armed):
+            raise CommandLost(
+                f"our command of the vehicle has ended: {self._client.interruption}. Check where it is, and start again"
+            )
 
     def _begin_next(self, now: float) -> None:
         """Begin a period: send its input first, then report on the period before."""
@@ -206,7 +221,7 @@ class MavlinkVehicle(PeriodicVehicle):
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.current_period.report.measured[:3], self._state(now)
-        report, lost = self._report(state, self._path(now, state) - start), self._lost(now)
+        report, lost = self._report(state, self._path(now, state) - start), self._watch.lost(now)
         self._begin(ControlPeriod(self.current_period.number + 1, self._velocity, report, lost))
         self._log_loss(lost)
         self._client.path = self._client.path[-1:]
@@ -219,24 +234,6 @@ class MavlinkVehicle(PeriodicVehicle):
         slipped = lateness > self._robot.period
         timing.slips += slipped
         self._due += self._robot.period + (lateness if slipped else 0.0)
-
-    def _lost(self, now: float) -> str:
-        """Return why the measurement or our control does not count; empty if both count."""
-        client = self._client
-        for what in IN_FLIGHT:
-            silent = now - self._received_at.get(what, -math.inf)
-            if silent > STALE:
-                return f"no telemetry of {what} for {silent:.2f} s"
-        if now - self._received_at.get("mode", -math.inf) > SILENT:
-            return f"no heartbeat for more than {SILENT:.0f} s"
-        if not (client.offboard and client.armed):
-            state = client.mode if client.armed else "it is disarmed"
-            return f"the autopilot does not follow our setpoints ({state})"
-        if client.estimator is not None and (unknown := missing(client.estimator)):
-            return f"its estimator does not know {', '.join(unknown)}"
-        if client.outside:
-            return f"the autopilot says that it is outside of its geofence ({client.outside})"
-        return "the autopilot says that it is in an emergency" if client.emergency else ""
 
     def _log_loss(self, why: str) -> None:
         """Log a loss when it begins, when its reason changes, and when it ends."""
@@ -254,25 +251,15 @@ class MavlinkVehicle(PeriodicVehicle):
             self._logged_battery = True
             log.warning("its battery is at %.0f %%", battery)
 
-    @property
-    def _offset(self) -> float:
-        """Our clock minus the autopilot's, s.
-
-        The estimate comes from the messages with the least delay, minus half of the fastest TIMESYNC round trip. The
-        part of a round trip that our own polling explains does not count.
-        """
-        way = 0.5 * self.timing.round_trip - POLL
-        return self._offsets.value - (way if 0.0 < way < STALE else 0.0)
-
     def _state(self, now: float) -> Array:
         """Return the state (9,) at time `now`: the latest telemetry, extrapolated by its velocity and acceleration."""
-        ahead = min(max(now - self._offset - self._client.time, 0.0), STALE)
+        ahead = min(max(self._watch.age(now), 0.0), STALE)
         return self._client.state(self._origin, ahead)
 
     def _path(self, now: float, state: Array) -> Array:
         """Return S positions (S, 3) [m] at even times of the period that ends now in `state` (9,)."""
         path, period = self._client.path, self._robot.period
-        times = [t + self._offset for t, _ in path] + [now]
+        times = [t + self._watch.offset for t, _ in path] + [now]
         positions = np.array([p + self._origin for _, p in path] + [state[:3]])
         return resampled(times, positions, now - period + period / SAMPLES * np.arange(1, SAMPLES + 1))
 
@@ -286,23 +273,17 @@ class MavlinkVehicle(PeriodicVehicle):
     def _exchange(self, now: float) -> None:
         """Read all messages that have arrived, and send all that is due."""
         client = self._client
-        before = len(client.path), client.time
-        with self._rejected.skip_on_error("mavlink"):
-            client.feed(self._link.receive())
-        for what, count in client.message_counts.items():
-            if self._counted.get(what) != count:
-                self._counted[what], self._received_at[what] = count, now
+        for peer, data in self._link.receive_by_peer():
+            with self._rejected.skip_on_error("mavlink"):
+                client.feed(data, peer)
+        self._watch.note(now)
         if self._mavlink_truth is not None and client.truth is not None and client.position is not None:
             self._mavlink_truth.take(client.truth, client.position + self._origin, client.velocity)
             client.truth = None
-        if (len(client.path), client.time) != before:
-            self._offsets.note(now, client.time)
-        for asked, _ in client.answers:
-            self.timing.round_trip = min(self.timing.round_trip, 1e-9 * (time.monotonic_ns() - asked))
-        client.answers.clear()
         if now - self._synced_at >= SYNC_INTERVAL:
             self._synced_at = now
-            client.ask_time(time.monotonic_ns())
+            self._watch.asked(asked := time.monotonic_ns())
+            client.ask_time(asked)
         if self._truth is not None:
             self._truth.poll()
         if now - self._heartbeat_at >= HEARTBEAT_INTERVAL:

@@ -27,7 +27,7 @@ class PeriodicVehicle:
     def __init__(self, robot: Robot) -> None:
         self._robot, self._changed = robot, threading.Condition()
         self._current: ControlPeriod | None = None
-        self._failure: Exception | None = None
+        self.failure: Exception | None = None  # after which nobody flies the vehicle any more
 
     @property
     def current_period(self) -> ControlPeriod:
@@ -38,7 +38,7 @@ class PeriodicVehicle:
     @property
     def failed(self) -> bool:
         """Whether nobody flies the vehicle any more."""
-        return self._failure is not None
+        return self.failure is not None
 
     def wait(self, number: int) -> ControlPeriod:
         """Wait until period `number` has begun, and return the current period.
@@ -50,12 +50,13 @@ class PeriodicVehicle:
             patience = 2.0 + self._robot.period * max(0, number - self.current_period.number)
             if not self._changed.wait_for(lambda: self.failed or self.current_period.number >= number, patience):
                 raise MavlinkError(f"period {number} does not begin")
-            self._check()
+            self.check()
             return self.current_period
 
-    def _check(self) -> None:
-        if self._failure is not None:
-            raise self._failure
+    def check(self) -> None:
+        """Raise the error after which nobody flies the vehicle any more, if there is one."""
+        if self.failure is not None:
+            raise self.failure
 
     def _begin(self, period: ControlPeriod) -> None:
         with self._changed:
@@ -64,5 +65,5 @@ class PeriodicVehicle:
 
     def _fail(self, error: Exception) -> None:
         with self._changed:
-            self._failure = self._failure or error
+            self.failure = self.failure or error
             self._changed.notify_all()

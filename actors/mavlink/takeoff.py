@@ -75,6 +75,8 @@ class Takeoff:
         if self._flight.lead:
             client.lead(wait)
             self.note("it gets positions: if setpoints stop, it stops at the last one")
+        if client.second_source:
+            raise MavlinkError(client.two_sources)
         self._hold(np.zeros(3))
         client.follow_setpoints(wait)
         if not client.armed:

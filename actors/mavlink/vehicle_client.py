@@ -109,7 +109,7 @@ class VehicleClient(PeriodicVehicle):
     def _connect(self, request: FlightRequest, stop: Callable[[], bool]) -> None:
         """Connect to the vehicle's server, start one if there is none, and send the flight request."""
         self._current: ControlPeriod | None = None
-        self._failure: Exception | None = None
+        self.failure: Exception | None = None
         self.figures: dict[str, float] = {}  # for Health: lateness, and the ground truth of a simulated flight
         self._replies: SimpleQueue[pb.CommitReply | None] = SimpleQueue()
         self._received, self._received_at = False, time.monotonic()
@@ -141,7 +141,7 @@ class VehicleClient(PeriodicVehicle):
     def _await_flight(self, stop: Callable[[], bool]) -> None:
         with self._changed:
             while self._current is None:
-                self._check()
+                self.check()
                 if stop():
                     raise MavlinkError("asked to stop before the vehicle flew")
                 if time.monotonic() - self._received_at > HANDOVER_TIMEOUT:
@@ -157,11 +157,11 @@ class VehicleClient(PeriodicVehicle):
             self._socket.send(command)
             while True:
                 reply = self._replies.get(timeout=REPLY_TIMEOUT)
-                self._check()
+                self.check()
                 if reply is not None and reply.number == command.number:  # not a late reply to an older command
                     return reply
         except OSError as error:
-            raise self._failure or MavlinkError(ENDED) from error
+            raise self.failure or MavlinkError(ENDED) from error
         except Empty:
             return None  # `wait` finds out whether the vehicle still flies
 

@@ -16,7 +16,7 @@ import numpy as np
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.telemetry import Array
-from brakeline.errors import BadInput, BadLink, BadMessage, HandoverRefused, MavlinkError
+from brakeline.errors import BadInput, BadLink, BadMessage, CommandLost, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
@@ -31,7 +31,10 @@ LONGEST_TEXT = 8000  # characters of a log line or an error
 MOST_PORTS, MOST_SYSTEMS = 65535, 255
 
 # The errors that keep their type on the way to the actor; another one arrives as a MavlinkError. Subclasses come first.
-ERRORS: tuple[type[Exception], ...] = (HandoverRefused, MavlinkError, BadInput, BadLink, BadMessage, OSError)
+ERRORS: tuple[type[Exception], ...] = (
+    *(CommandLost, HandoverRefused, MavlinkError),
+    *(BadInput, BadLink, BadMessage, OSError),
+)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from brakeline.actors.mavlink.vehicle_messages import (
     text_of,
 )
 from brakeline.actors.mavlink.vehicle_socket import MessageSocket, listening, same_user
-from brakeline.errors import BadInput, BadMessage, HandoverRefused, MavlinkError
+from brakeline.errors import BadInput, BadMessage, CommandLost, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -157,10 +157,11 @@ class VehicleServer:
         Once the process has to end, the actor has `CLOSE_TIMEOUT` to close the flight.
 
         Raises:
-            MavlinkError: the vehicle's thread has died, or the actor did not close the flight in time.
+            MavlinkError: nobody flies the vehicle any more, or the actor did not close the flight in time.
         """
         stopped_at: float | None = None
-        while not self._vehicle.failed:
+        while True:
+            self._vehicle.check()
             if stopped_at is None and self._stop.is_set():
                 stopped_at = time.monotonic()
             if stopped_at is not None and time.monotonic() - stopped_at > CLOSE_TIMEOUT:
@@ -177,7 +178,6 @@ class VehicleServer:
             if command.WhichOneof("command") == "close":
                 return True
             self._outbox.put(pb.VehicleMessage(reply=self._reply(command)))
-        raise MavlinkError("the vehicle's thread has died")
 
     def brake(self) -> None:
         """Fly the committed plan to its end, and wait until the vehicle hovers. Raises MavlinkError."""
@@ -194,11 +194,20 @@ class VehicleServer:
         """Whether the vehicle's thread has died, or the vehicle is silent."""
         return self._vehicle.failed or self._vehicle.silence > SILENCE
 
-    def refusal(self, request: FlightRequest) -> str:
-        """Return why the vehicle can't be handed over for this request; empty: it can."""
+    @property
+    def command_lost(self) -> CommandLost | None:
+        """Why our command of the vehicle has ended, if it has; the next actor must not take the vehicle over anew."""
+        failure = self._vehicle.failure
+        return failure if isinstance(failure, CommandLost) else None
+
+    def refusal(self, request: FlightRequest) -> Exception | None:
+        """Return why the vehicle can't be handed over for this request; None: it can."""
+        if self.command_lost is not None:
+            return self.command_lost
         if request != self.request:
-            return "it was flown with other settings until now"
-        return self._vehicle.current_period.lost
+            return HandoverRefused("it was flown with other settings until now")
+        lost = self._vehicle.current_period.lost
+        return HandoverRefused(lost) if lost else None
 
     def close(self) -> None:
         """Brake unless the vehicle hovers, give it up, and send the last update."""
@@ -255,7 +264,9 @@ def _speed(period: ControlPeriod) -> float:
 def next_actor(listener: socket.socket, stop: threading.Event, server: VehicleServer | None) -> MessageSocket | None:
     """Wait for the next actor of this user; None: `stop` is set, none came, or the vehicle is gone."""
     deadline = time.monotonic() + HANDOVER_TIMEOUT
-    while not stop.is_set() and time.monotonic() < deadline and not (server and server.gone):
+    while not stop.is_set() and time.monotonic() < deadline:
+        if server is not None and server.gone and server.command_lost is None:
+            return None
         if not select.select([listener], [], [], POLL)[0]:
             continue
         connection, _ = listener.accept()
@@ -320,8 +331,8 @@ def _serve_actors(listener: socket.socket, url: str, system: int, outbox: ActorO
             except (EOFError, OSError):  # it is gone
                 outbox.dismiss(actor)
                 continue
-            if server is not None and (why := server.refusal(request)):
-                outbox.dismiss(actor, HandoverRefused(why))
+            if server is not None and (refusal := server.refusal(request)):
+                outbox.dismiss(actor, refusal)
                 return 2
             outbox.actor = actor
             if server is None:
@@ -332,7 +343,8 @@ def _serve_actors(listener: socket.socket, url: str, system: int, outbox: ActorO
                 return 0
             outbox.actor = None
             outbox.dismiss(actor)
-            server.brake()
+            with contextlib.suppress(CommandLost):  # the next actor hears why
+                server.brake()
         return 2
     finally:
         if server is not None:

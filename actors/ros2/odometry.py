@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.messaging.robot import Array
+from brakeline.messaging.robot import Array, Robot
 from brakeline.sim.ground_estimator import wrap
 
 HISTORY = 2.0  # s
@@ -15,16 +16,46 @@ EXTRAPOLATION = 0.1  # s after the newest odometry, for which the last speeds ar
 LONGEST_GAP = 0.15  # s between two odometries, between which states are interpolated
 SAME_TIME = 1e-4  # s: odometry that is not newer by more is dropped
 SPEED_WINDOW = 0.1  # s over which speeds are computed from poses without speeds
+FASTER = 2.0  # than its inputs allow, a robot may move between two odometries, as downhill or with a late stamp
+LARGER_ERRORS = 4.0  # than one measurement's, the errors of two odometries may be together
 TIME, X, Y, HEADING = range(4)  # columns of a row; speed [m/s] and turn rate [rad/s] follow
 
 
-class OdometryHistory:
-    """Odometry by its own time stamps: rows of time [s], x, y [m], heading [rad], speed [m/s], turn rate [rad/s]."""
+@dataclass(frozen=True)
+class StepLimits:
+    """The largest step between two odometries: rates in m/s and rad/s, plus an allowance in m and rad for errors."""
 
-    def __init__(self, gap: float = LONGEST_GAP) -> None:
-        """gap: s, the longest between two odometries."""
+    speed: float
+    turn_rate: float
+    position: float
+    heading: float
+
+    @staticmethod
+    def of(robot: Robot) -> StepLimits:
+        """Return the limits of a robot that drives in the plane by speed and turn rate."""
+        speed, turn_rate = (FASTER * float(most) for most in np.maximum(np.abs(robot.low()), np.abs(robot.high())))
+        x, y, heading = (LARGER_ERRORS * robot.measurement_bound[i] for i in range(3))
+        return StepLimits(speed, turn_rate, math.hypot(x, y), heading)
+
+    def allow(self, duration: float, distance: float, turn: float) -> bool:
+        """Return whether a robot can move so far [m], and turn so far [rad], in a time [s]."""
+        far = distance > self.position + self.speed * duration
+        return not (far or turn > self.heading + self.turn_rate * duration)
+
+
+class OdometryHistory:
+    """Odometry by its own time stamps: rows of time [s], x, y [m], heading [rad], speed [m/s], turn rate [rad/s].
+
+    Attributes:
+        jump: why the history began anew, since the caller emptied this text. A pose that jumps while its time goes on
+            is in another frame, as after a localisation that was set anew: nothing connects it with the poses before.
+    """
+
+    def __init__(self, limits: StepLimits, gap: float = LONGEST_GAP) -> None:
+        """limits: the largest step between two odometries. gap: s, the longest time between them."""
         self._rows: deque[tuple[float, ...]] = deque()
-        self._gap = gap
+        self._limits, self._gap = limits, gap
+        self.jump = ""
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -37,19 +68,27 @@ class OdometryHistory:
     def add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
         """Add an odometry. Return False if it is dropped: a number is not finite, or it is not newer than the last one.
 
-        An odometry that is older by more than `HISTORY` begins a new history: its sender has restarted.
+        An odometry that is older by more than `HISTORY`, or whose pose the robot can't have reached, begins a new
+        history: its sender has restarted, or was set.
         """
-        return all(map(math.isfinite, (speed, turn_rate))) and self._add(time, x, y, heading, speed, turn_rate)
+        if not all(map(math.isfinite, (speed, turn_rate))) or not self._admit(time, x, y, heading):
+            return False
+        self._append(time, x, y, heading, speed, turn_rate)
+        return True
 
     def add_pose(self, time: float, x: float, y: float, heading: float) -> bool:
         """Add a pose without speeds, see `add`. The speeds come from the poses of the last `SPEED_WINDOW` seconds."""
+        if not self._admit(time, x, y, heading):
+            return False
         past = next((row for row in reversed(self._rows) if row[TIME] <= time - SPEED_WINDOW), None)
-        if past is None or time < self.newest or time - past[TIME] > SPEED_WINDOW + self._gap:
-            return self._add(time, x, y, heading, math.nan, math.nan)
+        if past is None or time - past[TIME] > SPEED_WINDOW + self._gap:
+            self._append(time, x, y, heading, math.nan, math.nan)
+            return True
         duration, turn = time - past[TIME], wrap(heading - past[HEADING])
         middle = past[HEADING] + 0.5 * turn
         distance = math.cos(middle) * (x - past[X]) + math.sin(middle) * (y - past[Y])
-        return self.add(time, x, y, heading, distance / duration, turn / duration)
+        self._append(time, x, y, heading, distance / duration, turn / duration)
+        return True
 
     def at(self, times: Array) -> Array | None:
         """Return the states (n, 5) at some times (n,) [s]; None if one of them is not covered, or in a gap."""
@@ -78,18 +117,33 @@ class OdometryHistory:
         state[2] = wrap(state[2])
         return state
 
-    def _add(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> bool:
-        """Add an odometry whose speeds may be NaN: unknown."""
+    def _admit(self, time: float, x: float, y: float, heading: float) -> bool:
+        """Return whether a pose counts, and begin a new history if it is not connected with the last one."""
         if not all(map(math.isfinite, (time, x, y, heading))):
             return False
         if time < self.newest - HISTORY:
-            self._rows.clear()
+            self._begin_anew(f"the time of the odometry went back by {self.newest - time:.2f} s")
         if time <= self.newest + SAME_TIME:
             return False
+        if self._rows:
+            last, duration = self._rows[-1], time - self.newest
+            distance, turn = math.hypot(x - last[X], y - last[Y]), abs(wrap(heading - last[HEADING]))
+            if not self._limits.allow(duration, distance, turn):
+                self._begin_anew(
+                    f"the pose jumped by {distance:.2f} m and {turn:.2f} rad within {duration:.2f} s, "
+                    "which this robot can't do"
+                )
+        return True
+
+    def _begin_anew(self, why: str) -> None:
+        self._rows.clear()
+        self.jump = self.jump or why
+
+    def _append(self, time: float, x: float, y: float, heading: float, speed: float, turn_rate: float) -> None:
+        """Append an odometry whose speeds may be NaN: unknown."""
         if self._rows:  # interpolation needs headings without jumps
             before = self._rows[-1][HEADING]
             heading = before + wrap(heading - before)
         self._rows.append((time, x, y, heading, speed, turn_rate))
         while self._rows[0][TIME] < time - HISTORY:
             self._rows.popleft()
-        return True

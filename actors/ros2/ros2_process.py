@@ -21,7 +21,7 @@ from brakeline.actors.ros2.command_gate import CommandGate
 from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
-from brakeline.errors import InputMissing, Mismatch
+from brakeline.errors import InputMissing, Mismatch, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.ros2 import ALL_LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
@@ -165,6 +165,7 @@ class FilterNode:
         if jump := clock.jumped():
             log.warning("the clock was set by %.2f s", jump)
             self.inputs.forget()
+            gate.backup_plan.distrust()  # a simulation that began anew placed the robot elsewhere
             self._missing = "the clock was set"
         if jump or clock.now() > due + period:  # the decision was for another time
             if not jump:
@@ -192,6 +193,8 @@ class FilterNode:
             around: tuple[Obstacle, ...] = self.inputs.obstacles(state[:2], now)
             self.gate.decide(state, around, self.inputs.command(now), began, number)
         except InputMissing as error:
+            if isinstance(error, PoseJumped):
+                self.gate.backup_plan.distrust()
             self._missing = str(error)
             return
         except Exception as error:  # whatever a message holds: without a decision the robot brakes along its plan

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
-from brakeline.actors.ros2.odometry import OdometryHistory
-from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree, frame_name, pose_of
-from brakeline.errors import BadScan, InputMissing
+from brakeline.actors.ros2.odometry import OdometryHistory, StepLimits
+from brakeline.actors.ros2.sensor_frames import MOST_LEAN, MOST_TILT, PlanarPose, TransformTree, frame_name, pose_of
+from brakeline.errors import BadScan, InputMissing, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Array, Robot
@@ -64,7 +64,8 @@ class RosInputs:
         self.frame = settings.odometry_frame  # of the state
         self._errors = HitErrors.of(robot, settings.range_error)
         self._lock = threading.Lock()
-        self._odometry, self._transforms = OdometryHistory(limits.odometry), TransformTree()
+        self._odometry, self._transforms = self._no_odometry(), TransformTree()
+        self._bad_odometry = ""
         self._base = settings.base_frame
         self._scan: tuple[LaserBeams, str] | None = None
         self._bad_scan = ""
@@ -72,10 +73,15 @@ class RosInputs:
         self._commands = 0
 
     def on_odometry(self, message: Odometry) -> None:
-        """Handle odometry."""
+        """Handle odometry; in another frame it counts as missing until the next one in the right frame."""
         pose, twist = message.pose.pose, message.twist.twist
+        frame = headline(message.header.frame_id, LONGEST_FRAME)
+        if frame_name(frame) != frame_name(self.frame):
+            with self._lock:
+                self._bad_odometry = f"the odometry is in frame {frame!r}, not in {self.frame!r} (see --odometry-frame)"
+            return
         with self._lock:
-            self.frame = headline(message.header.frame_id, LONGEST_FRAME) or self.frame
+            self._bad_odometry = ""
             self._base = headline(message.child_frame_id, LONGEST_FRAME) or self._base
             self._odometry.add(
                 seconds(message.header.stamp),
@@ -88,7 +94,8 @@ class RosInputs:
         wanted = frame_name(self.settings.odometry_frame), frame_name(self.settings.base_frame)
         for stamped in message.transforms:
             frames = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
-            if frames == wanted and (pose := pose_of(stamped.transform)) is not None:
+            pose = pose_of(stamped.transform) if frames == wanted else None
+            if pose is not None and pose.tilt <= MOST_LEAN:
                 with self._lock:
                     self._odometry.add_pose(seconds(stamped.header.stamp), pose.x, pose.y, pose.yaw)
 
@@ -118,11 +125,14 @@ class RosInputs:
     def forget(self) -> None:
         """Drop everything with a time stamp, since the clock was set."""
         with self._lock:
-            self._odometry, self._scan, self._command = OdometryHistory(self.limits.odometry), None, None
+            self._odometry, self._scan, self._command = self._no_odometry(), None, None
 
     def state(self, at: float, now: float) -> Array:
-        """Return the measured state (5,) at a time [s]. Raises InputMissing."""
+        """Return the measured state (5,) at a time [s]. Raises InputMissing; PoseJumped: once for each jump."""
         with self._lock:
+            self._check_jump()
+            if self._bad_odometry:
+                raise InputMissing(self._bad_odometry)
             newest, state = self._odometry.newest, self._odometry.state(at)
         if newest == -math.inf:
             raise InputMissing("no odometry yet")
@@ -132,8 +142,9 @@ class RosInputs:
         return state
 
     def obstacles(self, around: Array, now: float) -> tuple[Obstacle, ...]:
-        """Return the last scan's obstacles near a position (2,) [m], in the odometry's frame. Raises InputMissing."""
+        """Return the last scan's obstacles near a position (2,) [m], in the odometry's frame. Raises as `state`."""
         with self._lock:
+            self._check_jump()
             if self._bad_scan:
                 raise InputMissing(f"no valid scan: {self._bad_scan}")
             if self._scan is None:
@@ -147,8 +158,13 @@ class RosInputs:
         if poses is None:
             raise InputMissing("no odometry of when the scan was made")
         if mount is None:
-            why = f"no level transform from {base!r} to {frame!r}" if base else "the odometry names no child frame"
+            why = f"no transform from {base!r} to {frame!r}" if base else "the odometry names no child frame"
             raise InputMissing(f"{why}: give the lidar's place")
+        if mount.tilt > MOST_TILT:
+            raise InputMissing(
+                f"{frame!r} is tilted by {math.degrees(mount.tilt):.1f}° against {base!r}: a lidar may be tilted by at "
+                f"most {math.degrees(MOST_TILT):.0f}°"
+            )
         return obstacles(beams, poses, mount, self.robot, self._errors, around)
 
     def command(self, now: float) -> RawCommand | None:
@@ -158,6 +174,14 @@ class RosInputs:
         if command is None or not now - command.at <= self.limits.command:  # a limit of NaN accepts nothing
             return None
         return command
+
+    def _no_odometry(self) -> OdometryHistory:
+        return OdometryHistory(StepLimits.of(self.robot), self.limits.odometry)
+
+    def _check_jump(self) -> None:
+        if why := self._odometry.jump:
+            self._odometry.jump = ""
+            raise PoseJumped(why)
 
     def _check_age(self, what: str, stamp: float, now: float, limit: float) -> None:
         age = now - stamp

@@ -1,4 +1,11 @@
-"""Poses of sensors on a robot, from the transforms that its nodes publish; all of them in the plane."""
+"""Poses of sensors on a robot, from the transforms that its nodes publish; all of them in the plane.
+
+A scan counts as one in the plane, at the height of its sensor. With a tilt t, the end of a beam of length r is up to
+r sin t above or below that plane, and its distance in the plane is shorter than r by up to r (1 - cos t). With
+`MOST_TILT` (3°), these errors are 5 cm and 1.4 mm for each metre. The range stays within the error that a lidar has
+anyway (2 cm, up to 14 m), and a lidar 0.2 m above the floor does not see the floor nearer than 3.8 m. With 18°, the
+errors are 31 cm and 5 cm for each metre: the scan misses what stands in the plane, and shows what does not.
+"""
 
 from __future__ import annotations
 
@@ -7,39 +14,37 @@ from dataclasses import dataclass
 
 from brakeline.messaging.ros2.cdr_messages import Transform, TransformStamped, yaw_of
 
-MOST_TILT = 0.05  # 1 minus the vertical part of a transform's z axis
+MOST_TILT = math.radians(3.0)  # of a lidar against the robot
+MOST_LEAN = math.radians(18.0)  # of a robot against the frame of its odometry, as on a ramp
 LONGEST_CHAIN = 32  # transforms from one frame to another
 
 
 @dataclass(frozen=True)
 class PlanarPose:
-    """A pose in the plane: x, y [m], yaw [rad]."""
+    """A pose in the plane: x, y [m], yaw [rad], and by how much it may be tilted out of the plane [rad]."""
 
     x: float = 0.0
     y: float = 0.0
     yaw: float = 0.0
+    tilt: float = 0.0
 
     def compose(self, other: PlanarPose) -> PlanarPose:
-        """Return `other`, a pose in this pose's frame, in the frame of this pose."""
+        """Return `other`, a pose in this pose's frame, in the frame of this pose. Tilts add up, at most."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return PlanarPose(
-            self.x + cos * other.x - sin * other.y, self.y + sin * other.x + cos * other.y, self.yaw + other.yaw
-        )
+        x, y = self.x + cos * other.x - sin * other.y, self.y + sin * other.x + cos * other.y
+        return PlanarPose(x, y, self.yaw + other.yaw, self.tilt + other.tilt)
 
     def inverse(self) -> PlanarPose:
         """Return the inverse transform."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return PlanarPose(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.yaw)
+        return PlanarPose(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.yaw, self.tilt)
 
 
 def pose_of(transform: Transform) -> PlanarPose | None:
-    """Return a transform as a pose in the plane; None: it tilts, is upside down, or has numbers that are not finite."""
+    """Return a transform as a pose in the plane; None: it has numbers that are not finite."""
     q, t = transform.rotation, transform.translation
-    yaw = yaw_of(q)
-    upright = 1.0 - 2.0 * (q.x * q.x + q.y * q.y)
-    if not all(map(math.isfinite, (yaw, t.x, t.y))) or upright < 1.0 - MOST_TILT:
-        return None
-    return PlanarPose(t.x, t.y, yaw)
+    yaw, tilt = yaw_of(q), 2.0 * math.atan2(math.hypot(q.x, q.y), math.hypot(q.z, q.w))
+    return PlanarPose(t.x, t.y, yaw, tilt) if all(map(math.isfinite, (yaw, tilt, t.x, t.y))) else None
 
 
 class TransformTree:
@@ -54,7 +59,7 @@ class TransformTree:
         self._parents[child] = parent, pose_of(stamped.transform)
 
     def pose(self, frame: str, base: str) -> PlanarPose | None:
-        """Return the pose of a frame in the frame `base`; None: it is unknown or not level."""
+        """Return the pose of a frame in the frame `base`; None: it is unknown."""
         above_frame, above_base = self._ancestors(frame_name(frame)), self._ancestors(frame_name(base))
         for name, pose in above_frame.items():
             if pose is not None and (base_pose := above_base.get(name)) is not None:

@@ -19,7 +19,7 @@ from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.excitation import limit_slew, random_target
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
-from brakeline.errors import BadData, FlightEnded, Unsupported
+from brakeline.errors import BadData, CommandLost, FlightEnded, Unsupported
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
@@ -131,7 +131,7 @@ class FirstFlight:
                     )
                     break
                 reached = level
-        except FlightEnded as error:
+        except (CommandLost, FlightEnded) as error:
             missing.append(str(error))
         self._cut()
         data = self._dataset(about)

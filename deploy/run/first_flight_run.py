@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from brakeline.errors import CommandLost
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
 
@@ -69,11 +71,12 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
             metadata = {"autopilot": "; ".join(vehicle.notes), "url": url}
             flight = FirstFlight(vehicle, robot, box, seed, stop.is_set).fly(settings.minutes, metadata)
-            vehicle.wait(vehicle.current_period.number + robot.horizon)
-            vehicle.land()
-            deadline = time.monotonic() + LANDING_TIMEOUT
-            while vehicle.armed and time.monotonic() < deadline:
-                vehicle.listen(1.0)
+            with contextlib.suppress(CommandLost):  # it is not ours to land then; the result says so
+                vehicle.wait(vehicle.current_period.number + robot.horizon)
+                vehicle.land()
+                deadline = time.monotonic() + LANDING_TIMEOUT
+                while vehicle.armed and time.monotonic() < deadline:
+                    vehicle.listen(1.0)
         finally:
             vehicle.close()
     return flight

@@ -18,7 +18,7 @@ CONFIG, ENDPOINT, LOG = "config.json", "endpoint", "run.mcap"
 CERTIFIER = "certify.adapt"  # name of the process that certifies anew; its certificate is that of `certify`
 HELD = "held"  # word on the command line of a process that begins when its standard input ends
 UNFINISHED = 75  # exit status of a process that was asked to end before its work was done
-HOPELESS = 76  # exit status of a process that would fail again after a restart: the run ends
+HOPELESS = 76  # exit status of a process that must not, or cannot, go on after a restart: the run ends
 
 
 @dataclass(frozen=True)

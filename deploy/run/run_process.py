@@ -31,7 +31,7 @@ from brakeline.deploy.run.processes import (
     process_specs,
 )
 from brakeline.deploy.run.run_config import BATCH, RunConfig, load
-from brakeline.errors import BusError, Diverged
+from brakeline.errors import BusError, CommandLost, Diverged
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.task import robot_maybe_with_task, robot_with_task
 
@@ -175,9 +175,9 @@ def main() -> int:
         if held:
             sys.stdin.read()
         done = work()
-    except (BusError, Diverged) as error:
+    except (BusError, CommandLost, Diverged) as error:
         print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
-        return HOPELESS if isinstance(error, Diverged) else 1
+        return 1 if isinstance(error, BusError) else HOPELESS
     return 0 if done else UNFINISHED
 
 

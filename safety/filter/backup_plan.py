@@ -166,6 +166,12 @@ class BackupPlan:
         outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
         return self.model != UNVERIFIED and not outside
 
+    def distrust(self) -> None:
+        """Stop counting the plan as verified, since the pose has jumped: the robot brakes along it all the same."""
+        self.model, self.predicted, self.reservation = UNVERIFIED, None, None
+        self._plan_tokens, self._compare = (), False
+        self.widening.interrupt()
+
     def fallback(self) -> Array:
         """Return the next input of the committed plan, since no decision came.
 

@@ -234,10 +234,12 @@ class Autopilot:
 
     def _set_interval(self, kind: float, microseconds: float, *_: float) -> int:
         """Set the interval of a message [µs]: 0 for the default rate, -1 to stop."""
-        kind, rates = round(kind), self.rules.rates
+        kind, rates = _whole(kind), self.rules.rates
         if not self.can_send(kind):
             self.send_text(f"message {kind} is not known")
             return int(mavlink.MAV_RESULT_FAILED)
+        if not math.isfinite(microseconds):
+            return DENIED
         interval = 1e-6 * microseconds
         if microseconds == 0.0:
             interval = 1.0 / rates[kind] if kind in rates else 0.0
@@ -247,7 +249,7 @@ class Autopilot:
         return ACCEPTED
 
     def _get_interval(self, kind: float, *_: float) -> int:
-        kind = round(kind)
+        kind = _whole(kind)
         if not self.can_send(kind):
             return DENIED
         interval = self.schedule.interval(kind)
@@ -255,11 +257,16 @@ class Autopilot:
         return ACCEPTED
 
     def _request_message(self, kind: float, *_: float) -> int:
-        kind = round(kind)
+        kind = _whole(kind)
         if kind == HEARTBEAT or not self.can_send(kind):
             return UNSUPPORTED
         self.mav.send(self.telemetry.build(kind))
         return ACCEPTED
+
+
+def _whole(number: float) -> int:
+    """Return a number in a command as an integer; -1, which is no message, if it is not finite."""
+    return round(number) if math.isfinite(number) else -1
 
 
 ACTIONS: dict[int, Callable[..., int]] = {

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from brakeline.actors.actor_settings import FlightSettings
-from brakeline.actors.mavlink.flight_timing import ClockOffset
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
 from brakeline.actors.mavlink.telemetry import ATTITUDE
-from brakeline.errors import BadInput
+from brakeline.errors import BadInput, CommandLost
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.autopilot import autopilot_server
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
@@ -216,16 +215,25 @@ def test_a_pilot_may_take_over_and_keeps_control(flying: Flying) -> None:
     assert recovers(vehicle), "the pilot gives the vehicle back"
 
 
-def test_the_clock_offset_ignores_late_messages_and_follows_jumps() -> None:
-    offset = ClockOffset()
-    for k in range(1000):
-        offset.note(0.02 * k + 0.001 * (k % 7), 0.02 * k)
-    assert offset.value == pytest.approx(0.0, abs=1e-4)
-    for k in range(1000, 1040):
-        offset.note(0.02 * k + 0.03, 0.02 * k)  # all are late for a while
-    assert offset.value == pytest.approx(0.0, abs=1e-3)
-    for k in range(1040, 1240):
-        offset.note(0.02 * k, 0.02 * k - 0.5)  # the autopilot's clock jumped
-    assert offset.value == pytest.approx(0.5, abs=1e-3)
-    offset.note(25.0, 24.9)
-    assert offset.value == pytest.approx(0.1)
+@pytest.mark.parametrize("disarms", [True, False])
+def test_after_an_interruption_the_vehicle_brakes_and_nobody_flies_it_any_more(disarms: bool) -> None:
+    """A disarmed vehicle may be in somebody's hands: the rest of the plan must not follow when it is armed again."""
+    with flight_of("px4") as (vehicle, autopilot, frames):
+        rows = np.outer((0.6, 0.6, 0.3, 0.0), (1.0, 0.0, 0.0))
+        begins = vehicle.current_period.number + 2
+        assert vehicle.commit(rows, begins)
+        vehicle.wait(begins)
+        if disarms:
+            autopilot.flight.disarm(True)
+        else:
+            vehicle._client.interruption = "its position jumped by 3.00 m within 0.02 s"
+        with pytest.raises(CommandLost, match="disarmed" if disarms else "jumped by 3"):
+            for _ in range(25):
+                period = vehicle.wait(vehicle.current_period.number + 1)
+                assert not vehicle.commit(rows, period.number + 1) or not period.lost
+        if not disarms:
+            assert setpoints(frames)[-3:] == [(0.6, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)]
+        sent = len(setpoints(frames))
+        autopilot.flight.armed = True
+        time.sleep(0.5)
+        assert len(setpoints(frames)) == sent

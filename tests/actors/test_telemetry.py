@@ -14,10 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.ardupilot_dialect import mavlink
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, message_id
 from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, demand, limits_below_demand
 from brakeline.actors.mavlink.position_lookahead import LATENCY, PARAMETERS, AxisLookahead, PositionLookahead
+from brakeline.actors.mavlink.takeoff import Takeoff
 from brakeline.actors.mavlink.telemetry import (
     ATTITUDE,
     ESTIMATED,
@@ -66,6 +68,18 @@ MESSAGES: dict[str, Any] = {
     ),
     "EXTENDED_SYS_STATE": mavlink.MAVLink_extended_sys_state_message(0, mavlink.MAV_LANDED_STATE_IN_AIR),
 }
+
+
+POSITIONS: dict[str, Callable[[float], Any]] = {
+    "LOCAL_POSITION_NED": lambda now: mavlink.MAVLink_local_position_ned_message(
+        round(1e3 * now), 1.0, 2.0, 3.0, 0, 0, 0
+    )
+}  # with a time, since a position counts only if it is newer than the last one
+
+
+def position_at(now: float) -> Any:
+    """Return a position with a time [s], since one that is not newer than the last one does not count."""
+    return mavlink.MAVLink_local_position_ned_message(round(1e3 * now), 1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("what", "name"), [(what, s.message) for what in SOURCES for s in SOURCES[what]])
@@ -141,7 +155,7 @@ class ScriptedAutopilot:
             for name, since in self._asked.items():
                 rate = self.grants[name]
                 if rate and int((self.now - since) * rate) > int((self.now - 0.01 - since) * rate):
-                    self._mav.send(MESSAGES[name])
+                    self._mav.send(position_at(self.now) if name == "LOCAL_POSITION_NED" else MESSAGES[name])
 
 
 def test_a_breach_of_the_geofence_is_decoded() -> None:
@@ -186,6 +200,17 @@ def test_a_refused_message_is_replaced_as_arducopter_needs_it() -> None:
     lines = [autopilot.client.choose(what, 0.02, autopilot.wait) for what in (ATTITUDE, FORCE, LANDED, MOTION)]
     assert list(autopilot.client.chosen.values()) == list(grants), lines
     assert autopilot.client.airborne and autopilot.client.position == pytest.approx([2.0, 1.0, -3.0])
+
+
+def test_a_vehicle_does_not_take_off_if_a_second_one_has_its_id() -> None:
+    grants = ("ATTITUDE", "RAW_IMU", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED")
+    autopilot = ScriptedAutopilot("ardupilot", dict.fromkeys(grants, 50.0))
+    autopilot.client.second_source = "10.0.0.2:14550"
+    setpoints: list[object] = []
+    takeoff = Takeoff(autopilot.client, QUADROTOR, FlightSettings(""), autopilot.wait, setpoints.append)
+    with pytest.raises(MavlinkError, match=r"vehicle 1 is at .*also come from 10\.0\.0\.2:14550"):
+        takeoff.fly()
+    assert not setpoints and not autopilot.client.armed
 
 
 def test_raw_imu_is_used_only_for_ardupilot() -> None:

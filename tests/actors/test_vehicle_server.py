@@ -40,7 +40,7 @@ from brakeline.actors.mavlink.vehicle_messages import (
 )
 from brakeline.actors.mavlink.vehicle_server import FRAMES_PER_UPDATE, MOST_QUEUED, ActorOutbox, next_actor
 from brakeline.actors.mavlink.vehicle_socket import LARGEST, MessageSocket, address, connect, listening, same_user
-from brakeline.errors import BadInput, BadLink, BadMessage, CommandRefused, HandoverRefused, MavlinkError
+from brakeline.errors import BadInput, BadLink, BadMessage, CommandLost, CommandRefused, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.obstacle_motion import Motion
@@ -126,6 +126,34 @@ def test_a_vehicle_that_a_pilot_took_or_that_is_wanted_elsewhere_is_taken_over_a
             next_vehicle.leave()
             with actor(url, height=3.0) as other:
                 assert other.current_period.number < next_vehicle.current_period.number
+
+
+def test_a_vehicle_that_disarmed_is_given_up_and_the_actor_hears_why(flown: tuple[str, Autopilot]) -> None:
+    url, autopilot = flown
+    frames: list[pb.MavlinkFrame] = []
+    with actor(url, frames) as vehicle:
+        autopilot.flight.disarm(True)
+        with pytest.raises(CommandLost, match="it has disarmed"):
+            for _ in range(25):
+                vehicle.wait(vehicle.current_period.number + 1)
+        until(lambda: connect(url, 1) is None, "its server ends", 10.0)
+    sent = [decode_frame(frame.raw, False) for frame in frames if not frame.outgoing]
+    last = [f.message for f in sent if f is not None and f.message.get_type() == "HEARTBEAT"][-1]
+    assert not last.base_mode & 128, "the frames up to the end are recorded"
+
+
+def test_a_vehicle_that_disarmed_without_an_actor_is_not_taken_over_by_the_next_one(
+    flown: tuple[str, Autopilot],
+) -> None:
+    """The next actor would arm it and take off, while a person may have it in hand."""
+    url, autopilot = flown
+    with actor(url) as vehicle:
+        vehicle.leave()
+        autopilot.flight.disarm(True)
+        time.sleep(4.0)
+        with pytest.raises(CommandLost, match="it has disarmed"), actor(url):
+            pass
+        assert not autopilot.flight.armed
 
 
 def test_a_process_of_another_user_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -381,6 +409,7 @@ def test_arbitrary_bytes_are_read_or_refused(data):
     [
         (HandoverRefused("a"), HandoverRefused),
         (CommandRefused("a"), MavlinkError),
+        (CommandLost("a"), CommandLost),
         (BadInput("a"), BadInput),
         (BadLink("a"), BadLink),
         (BadMessage("a"), BadMessage),

@@ -27,6 +27,22 @@ def test_bytes_go_both_ways(listening: str, calling: str) -> None:
     server.close()
 
 
+@pytest.mark.parametrize(("listening", "calling"), [("udpin", "udpout"), ("tcpin", "tcp")])
+def test_pieces_name_their_senders_and_one_of_them_can_be_answered(listening: str, calling: str) -> None:
+    server = open_link(f"{listening}:127.0.0.1:0")
+    assert isinstance(server, Udp | TcpServer)
+    first, second = (open_link(f"{calling}:127.0.0.1:{server.port}") for _ in range(2))
+    pieces: dict[bytes, str] = {}
+    for end, word in ((first, b"first"), (second, b"second")):
+        end.send(word)
+    until(lambda: pieces.update((data, peer) for peer, data in server.receive_by_peer()) or len(pieces) == 2)
+    assert pieces[b"first"] != pieces[b"second"] and pieces[b"first"].startswith("127.0.0.1:")
+    server.send(b"only you", pieces[b"second"])
+    assert arrives(second, b"only you") and first.receive() == b""
+    for end in (first, second, server):
+        end.close()
+
+
 def test_a_peer_that_is_gone_is_no_error() -> None:
     server = open_link("tcpin:127.0.0.1:0")
     assert isinstance(server, TcpServer)

@@ -98,6 +98,21 @@ def test_px4_needs_setpoints_before_offboard() -> None:
     assert station.flight.mode is Mode.OFFBOARD
 
 
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 3e38])
+def test_a_command_about_a_message_without_a_number_is_refused(station: Station, number: float) -> None:
+    """Such a command once ended the process of the autopilot."""
+    about = mavlink.MAVLINK_MSG_ID_ATTITUDE
+    for command in (
+        (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e5),
+        (mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, number),
+        (mavlink.MAV_CMD_REQUEST_MESSAGE, number),
+    ):
+        assert station.command(*command) in (DENIED, FAILED, UNSUPPORTED)
+    if abs(number) != 3e38:
+        assert station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, about, number) == DENIED
+    assert station.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, about) == ACCEPTED
+
+
 def test_px4_takes_off_on_arming_after_a_takeoff_command() -> None:
     station = Station("px4")
     station.wait(2.0)

@@ -20,6 +20,7 @@ from brakeline.actors.mavlink.autopilot_commands import message_id
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_decoder import OFFBOARD
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.errors import CommandLost
 from tests.accepting import WORDS
 from tests.real import KINDS, autopilot, autopilots
 from tests.robots import QUADROTOR
@@ -87,7 +88,9 @@ def test_it_is_found_out_flown_and_given_back(kind: str, tmp_path: Path, caplog:
             vehicle.wait(vehicle.current_period.number + 10)
             assert client.custom_mode != OFFBOARD[kind][1], "who took it keeps it"
             assert any("braking" in record.message and "LAND" in record.message for record in caplog.records)
-            until(lambda: "disarmed" in vehicle.current_period.lost)
+            until(lambda: vehicle.failed)
+            with pytest.raises(CommandLost, match="it has disarmed"):
+                vehicle.check()
         finally:
             vehicle.close()
     waited = any("waiting for the position estimate" in record.message for record in caplog.records)
@@ -105,7 +108,8 @@ def test_an_ardupilot_that_is_led_stays_where_it_was_led_to_when_nothing_more_co
             client, link = vehicle._client, vehicle._link
             end = time.monotonic() + 6.0
             while time.monotonic() < end:
-                client.feed(link.receive())
+                for peer, data in link.receive_by_peer():
+                    client.feed(data, peer)
                 time.sleep(0.01)
             assert client.position is not None
             assert float(np.linalg.norm(client.position - flown[:3])) < 5.0

@@ -14,12 +14,14 @@ from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER, SCAN_DIFF
 from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings, driven
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RawCommand, SensorSettings
 from brakeline.actors.ros2.ros_views import diagnostics, markers
+from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.free_ports import free_endpoint
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.ros2 import LATCHED, SENSOR, RosNode, RosSettings
 from brakeline.messaging.ros2 import cdr_messages as cdr
+from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.request import NOT_FINITE
 from brakeline.safety.service.wire import decision_of
 from tests.actors.conftest import no_answer
@@ -325,6 +327,40 @@ def test_a_clock_that_stands_still_or_goes_back_stops_the_robot():
         robot._time = 3.0
         until(lambda: any("the clock was set" in reason for reason in robot.reasons), "the clock was set", 30.0)
         robot.drives()
+
+
+def test_after_a_jump_of_the_pose_the_plan_from_before_does_not_count_as_verified():
+    """The robot brakes along it all the same, says why, and goes on."""
+    stop, requests = threading.Event(), []
+
+    def ask(asked):
+        requests.extend(asked)
+        return allow(asked)
+
+    settings = Ros2Settings(ros=RosSettings(listen=(free_endpoint(),)), sensors=SensorSettings(mount=PlanarPose()))
+    node_under_test = FilterNode(settings, ask, stop)
+    try:
+        gate, clock, inputs = node_under_test.gate, Stalling(), node_under_test.inputs
+        node_under_test.clock = clock
+
+        def drive(x):
+            for i in range(1, 12):
+                at = clock.time + 0.02 * i
+                inputs.on_odometry(odometry(at, x, 0.0))
+            inputs.on_scan(scan_of(np.full(BEAMS, math.inf), header=cdr.header(clock.time + 0.15, "base_scan")))
+            inputs.on_command(cdr.twist(0.2, 0.0), clock.time + 0.15)
+
+        due, kinds = 100.2, []
+        for x in (0.0, 0.0, 0.0, 2.0, 2.0, 2.0):
+            drive(x)
+            due = node_under_test._period(due, stop)
+            kinds.append((gate.kind, gate.reason))
+        assert "the pose jumped by 2.00 m" in kinds[4][1] and kinds[4][0] == BLIND
+        models = [request.model for request in requests]
+        assert models[2] == "m" and models[3] == UNVERIFIED and not requests[3].plan_token
+        assert gate.kind == "allowed"
+    finally:
+        node_under_test.close()
 
 
 class Stalling:

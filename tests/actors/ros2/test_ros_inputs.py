@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
-from brakeline.actors.ros2.odometry import HISTORY, OdometryHistory
+from brakeline.actors.ros2.odometry import HISTORY, OdometryHistory, StepLimits
 from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
 from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
-from brakeline.actors.ros2.sensor_frames import PlanarPose, TransformTree
-from brakeline.errors import BadScan, InputMissing
+from brakeline.actors.ros2.sensor_frames import MOST_TILT, PlanarPose, TransformTree
+from brakeline.errors import BadScan, InputMissing, PoseJumped
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.messaging.ros2 import cdr_messages as cdr
@@ -170,14 +170,15 @@ def test_an_invalid_scan_is_refused(wrong):
 
 
 ROBOT = GROUND.in_real_time()
+LIMITS = StepLimits.of(ROBOT)  # 0.25 m/s and 0.5 rad/s
 
 
-def odometry(at, x=0.0, speed=0.0):
+def odometry(at, x=0.0, speed=0.0, heading=0.0, frame="odom"):
     none = np.zeros(36)
     return cdr.Odometry(
-        header=cdr.header(at, "odom"),
+        header=cdr.header(at, frame),
         child_frame_id="base_footprint",
-        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, 0.0, 0.0), covariance=none),
+        pose=cdr.PoseWithCovariance(pose=cdr.pose(x, 0.0, heading), covariance=none),
         twist=cdr.TwistWithCovariance(twist=cdr.twist(speed, 0.0), covariance=none),
     )
 
@@ -188,7 +189,7 @@ def transform(parent, child, x=0.0, y=0.0, rotation=None, at=0.0):
 
 
 def test_states_are_interpolated_and_extrapolated_a_little():
-    history = OdometryHistory()
+    history = OdometryHistory(LIMITS)
     for i in range(11):
         assert history.add(0.1 * i, 0.02 * i, 0.0, 0.0, 0.2, 0.0)
     assert history.state(0.55) == pytest.approx([0.11, 0.0, 0.0, 0.2, 0.0])
@@ -197,7 +198,7 @@ def test_states_are_interpolated_and_extrapolated_a_little():
 
 
 def test_extrapolation_follows_the_arc_and_headings_pass_through_pi():
-    history = OdometryHistory()
+    history = OdometryHistory(LIMITS)
     history.add(0.0, 0.0, 0.0, 3.1, 0.2, 0.5)
     history.add(0.1, 0.0, 0.0, -3.13, 0.2, 0.5)
     assert history.state(0.05)[2] == pytest.approx(-3.1566 + 2.0 * math.pi, abs=1e-3)
@@ -205,7 +206,7 @@ def test_extrapolation_follows_the_arc_and_headings_pass_through_pi():
 
 
 def test_the_history_is_bounded_and_restarts_when_time_goes_back():
-    history = OdometryHistory()
+    history = OdometryHistory(LIMITS)
     for i in range(1000):
         history.add(0.01 * i, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert len(history) <= HISTORY / 0.01 + 2
@@ -214,7 +215,7 @@ def test_the_history_is_bounded_and_restarts_when_time_goes_back():
 
 
 def test_speeds_are_computed_from_poses_without_speeds():
-    history = OdometryHistory()
+    history = OdometryHistory(LIMITS)
     for i in range(50):
         angle = 0.4 * 0.02 * i
         history.add_pose(0.02 * i, 0.5 * math.sin(angle), 0.5 * (1.0 - math.cos(angle)), angle)
@@ -222,12 +223,12 @@ def test_speeds_are_computed_from_poses_without_speeds():
 
 
 def test_no_state_is_interpolated_in_a_long_gap():
-    history = OdometryHistory(gap=0.15)
+    history = OdometryHistory(LIMITS, gap=0.15)
     for at in (0.0, 0.1, 1.1, 1.2):
         history.add(at, 0.2 * at, 0.0, 0.0, 0.2, 0.0)
     assert history.state(0.05) is not None and history.state(1.15) is not None
     assert history.state(0.6) is None and history.at(np.array([0.05, 0.6])) is None
-    poses = OdometryHistory(gap=0.15)
+    poses = OdometryHistory(LIMITS, gap=0.15)
     for at in (0.0, 0.05, 0.1, 0.15, 1.15, 1.2, 1.25, 1.3):
         poses.add_pose(at, 0.2 * at, 0.0, 0.0)
     assert poses.state(0.05) is None, "one pose gives no speed"
@@ -246,13 +247,94 @@ def test_transforms_are_composed_up_and_down_the_tree():
     assert frames.pose("camera", "base_footprint") is None
 
 
-def test_an_inverted_sensor_or_a_loop_of_frames_has_no_pose():
+def tilted(degrees):
+    """Return a rotation that is turned by 90° and then tilted."""
+    half, level = 0.5 * math.radians(degrees), math.sqrt(0.5)
+    x, y, z, w = (level * part for part in (math.sin(half), math.sin(half), math.cos(half), math.cos(half)))
+    return cdr.Quaternion(x=x, y=y, z=z, w=w)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 2.9, 3.1, 17.0, 90.0, 180.0])
+def test_a_scan_of_a_lidar_that_is_tilted_by_more_than_3_degrees_is_refused_by_name(degrees):
+    """Up to 18 degrees once counted as level: at 1 m, such a beam ends 31 cm above or below the plane."""
+    inputs = RosInputs(ROBOT, SensorSettings(), AgeLimits())
+    inputs.on_odometry(odometry(10.0))
+    inputs.on_scan(scan_of(np.full(BEAMS, math.inf)))
+    inputs.on_fixed_transforms(
+        cdr.TFMessage(transforms=[transform("base_footprint", "base_scan", rotation=tilted(degrees))])
+    )
+    if degrees < 3.0:
+        assert inputs.obstacles(np.zeros(2), 10.0) == ()
+        return
+    named = rf"'base_scan' is tilted by {degrees:.1f}° against 'base_footprint': .* at most 3°"
+    with pytest.raises(InputMissing, match=named):
+        inputs.obstacles(np.zeros(2), 10.0)
+
+
+def test_the_tilts_of_a_chain_of_frames_add_up():
     frames = TransformTree()
-    frames.add(transform("base", "scan", rotation=cdr.Quaternion(x=1.0, y=0.0, z=0.0, w=0.0)))
-    assert frames.pose("scan", "base") is None
+    frames.add(transform("base", "plate", rotation=tilted(2.0)))
+    frames.add(transform("plate", "scan", rotation=tilted(2.0)))
+    assert frames.pose("scan", "base").tilt == pytest.approx(math.radians(4.0)) and math.radians(4.0) > MOST_TILT
+
+
+def test_a_loop_of_frames_has_no_pose():
+    frames = TransformTree()
     frames.add(transform("a", "b"))
     frames.add(transform("b", "a"))
     assert frames.pose("a", "base") is None
+
+
+@pytest.mark.parametrize(("x", "heading"), [(0.5, 0.0), (0.0, 1.0), (0.0, -math.pi)])
+@pytest.mark.parametrize("transforms", [False, True])
+def test_a_step_that_the_robot_cannot_do_is_said_once_and_begins_a_new_history(x, heading, transforms):
+    """As after a localisation that was set anew. The scan from before is in another frame then."""
+    settings = SensorSettings(mount=PlanarPose(), base_frame="base_footprint" if transforms else "")
+    inputs = RosInputs(ROBOT, settings, AgeLimits())
+
+    def drive(first, last, x, heading):
+        for i in range(first, last):
+            at, ahead = 9.0 + 0.02 * i, x + 0.004 * i
+            if transforms:
+                moved = transform("odom", "base_footprint", ahead, rotation=cdr.quaternion(heading), at=at)
+                inputs.on_transforms(cdr.TFMessage(transforms=[moved]))
+            else:
+                inputs.on_odometry(odometry(at, ahead, 0.2, heading))
+
+    drive(0, 51, 0.0, 0.0)
+    inputs.on_scan(scan_of(np.full(BEAMS, math.inf)))
+    assert inputs.state(9.9, 10.0) is not None and inputs.obstacles(np.zeros(2), 10.0) == ()
+    drive(51, 61, x, heading)
+    with pytest.raises(PoseJumped, match=r"the pose jumped by 0\.[05]0 m and [013]\.\d\d rad within 0\.02 s"):
+        inputs.state(10.15, 10.2)
+    with pytest.raises(InputMissing, match="no odometry of when the scan was made"):
+        inputs.obstacles(np.zeros(2), 10.2)
+    drive(61, 80, x, heading)
+    if heading == 0.0:
+        assert inputs.state(10.5, 10.58) == pytest.approx([x + 0.3, 0.0, 0.0, 0.2, 0.0], abs=1e-6)
+    inputs.on_scan(scan_of(np.full(BEAMS, math.inf), header=cdr.header(10.5, "base_scan")))
+    assert inputs.obstacles(np.zeros(2), 10.58) == ()
+
+
+def test_what_a_robot_can_do_is_no_jump():
+    """Neither are a gap, a late stamp, and errors of the measurement."""
+    history = OdometryHistory(LIMITS)
+    for time, x, heading in ((0.0, 0.0, 3.1), (0.02, 0.02, -3.12), (0.021, 0.005, 3.1), (4.0, 1.5, 0.5)):
+        assert history.add(time, x, 0.0, heading, 0.2, 0.0) and history.jump == ""
+    assert history.add(1.0, 1.5, 0.0, 0.5, 0.2, 0.0)
+    assert history.jump == "the time of the odometry went back by 3.00 s"
+
+
+def test_odometry_in_another_frame_is_refused_and_both_are_named():
+    inputs = RosInputs(ROBOT, SensorSettings(mount=PlanarPose(), odometry_frame="/odom"), AgeLimits())
+    for frame in ("map", ""):
+        inputs.on_odometry(odometry(10.0, frame="odom"))
+        assert inputs.state(10.0, 10.0) is not None
+        inputs.on_odometry(odometry(10.01, frame=frame))
+        with pytest.raises(InputMissing, match=rf"in frame '{frame}', not in '/odom' \(see --odometry-frame\)"):
+            inputs.state(10.0, 10.02)
+        inputs.on_odometry(odometry(10.02, frame="odom"))
+        assert inputs.state(10.0, 10.02) is not None and inputs.frame == "/odom"
 
 
 @pytest.fixture

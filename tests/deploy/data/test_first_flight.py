@@ -9,6 +9,7 @@ import pytest
 
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, draw_manoeuvre, mirror_inwards
+from brakeline.errors import CommandLost
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP
 from brakeline.safety.model.windows import PLAN, windows
@@ -23,7 +24,10 @@ BOX = Box(np.array([1.0, -2.0, 30.0]), np.array([40.0, 40.0, 20.0]))
 class Sluggish:
     """A vehicle that comes to its setpoint by a time constant; a turn passes whenever somebody waits for it."""
 
-    def __init__(self, constant: float = 0.4, drift: float = 0.0, fickle: bool = False) -> None:
+    def __init__(
+        self, constant: float = 0.4, drift: float = 0.0, fickle: bool = False, disarms: float = np.inf
+    ) -> None:
+        self.disarms = disarms  # after this period
         self.fickle = fickle  # follows its setpoint or the opposite of it
         self.constant, self.drift, self.rng = constant, drift, np.random.default_rng(0)
         self.position, self.velocity, self.acceleration = BOX.middle.copy(), np.zeros(3), np.zeros(3)
@@ -38,6 +42,8 @@ class Sluggish:
     def wait(self, number: int) -> ControlPeriod:
         while self.current_period.number < number:
             self._pass()
+        if number > self.disarms:
+            raise CommandLost("our command of the vehicle has ended: it has disarmed")
         return self.current_period
 
     def _pass(self) -> None:
@@ -90,13 +96,15 @@ def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
         ({"fickle": True}, 2.0, "no model predicts the vehicle at 20% of its speed, so it was not flown faster"),
         ({"drift": 0.3}, 2.0, "the position of its own estimate is 0."),
         ({"drift": 2.0}, 4.0, "it left its box"),
+        ({"disarms": 400}, 4.0, "it has disarmed"),
     ],
 )
 def test_what_ends_a_flight_or_makes_its_sets_wide_is_named(fault, minutes, line) -> None:
     vehicle = Sluggish(**fault)
     recording = FirstFlight(vehicle, LATE, BOX, 0).fly(minutes, {})
     assert any(line in text for text in recording.missing)
-    assert recording.seconds < 120.0 or "box" not in line
+    assert recording.seconds < 120.0 or ("box" not in line and "disarmed" not in line)
+    assert len(recording.data.trajectories) > 0, "what was recorded stays"
     assert (recording.level == 0.0 and vehicle.fastest < 1.5) or "fickle" not in fault
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brakeline.deploy.run import supervisor
+from brakeline.deploy.run import run_process, supervisor
 from brakeline.deploy.run.processes import HOPELESS, ProcessSpec
 from brakeline.deploy.run.supervisor import (
     HEALTHY_AFTER,
@@ -16,7 +16,8 @@ from brakeline.deploy.run.supervisor import (
     describe_end,
     last_line,
 )
-from brakeline.errors import LaunchError
+from brakeline.errors import CommandLost, LaunchError
+from brakeline.messaging.bus import BusSettings
 
 
 @pytest.fixture
@@ -106,3 +107,26 @@ def test_the_output_of_a_process_may_be_larger_than_the_memory(tmp_path: Path) -
 def test_a_process_that_a_signal_without_a_name_has_killed_does_not_end_the_launcher() -> None:
     assert describe_end(-9, 1.0) == "was killed by SIGKILL after 1.0 s"
     assert describe_end(-40, 1.0) == "was killed by signal 40 after 1.0 s"
+
+
+def test_an_actor_whose_command_of_its_vehicle_ended_is_not_started_again(tmp_path, monkeypatch, capsys) -> None:
+    """It would arm a vehicle that a person may have in hand, and take off."""
+
+    def fly() -> bool:
+        raise CommandLost("our command of the vehicle has ended: it has disarmed")
+
+    spec = ProcessSpec("actor-0", "actor")
+    monkeypatch.setattr(run_process, "PROCESSES", {"actor": lambda *_: fly})
+    for name, result in (
+        ("load", None),
+        ("process_specs", [spec]),
+        ("client_settings", BusSettings()),
+        ("metrics_address", ""),
+        ("launcher_pid", 1),
+        ("end_with_parent", True),
+    ):
+        monkeypatch.setattr(run_process, name, lambda *_, result=result: result)
+    monkeypatch.setattr(run_process.signal, "signal", lambda *_: None)
+    monkeypatch.setattr("sys.argv", ["run_process", str(tmp_path), spec.name])
+    assert run_process.main() == HOPELESS
+    assert capsys.readouterr().err == "actor-0: CommandLost: our command of the vehicle has ended: it has disarmed\n"

@@ -1,0 +1,84 @@
+"""Decide whether the measurement of a flight counts, and whether the autopilot still follows our setpoints."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
+from brakeline.actors.mavlink.mavlink_decoder import MavlinkDecoder
+from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, missing
+
+POLL = 0.005  # s between two reads of the link
+STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
+SILENT = 3.0  # s without a heartbeat after which the mode counts as unknown
+MOST_REQUESTS = 10  # for the autopilot's clock, to which a reply still counts
+
+
+class FlightWatch:
+    """When the latest messages of an autopilot arrived, and how old they were then."""
+
+    def __init__(self, client: MavlinkDecoder, timing: FlightTiming) -> None:
+        self._client, self._timing = client, timing
+        self._counted: dict[str, int] = {}  # messages by their quantity
+        self._received_at: dict[str, float] = {}  # s, arrival of the latest of them
+        self._asked: deque[int] = deque(maxlen=MOST_REQUESTS)  # ns, our clock at our requests for the autopilot's
+        self._offsets = ClockOffset()
+
+    def note(self, now: float) -> None:
+        """Take in what the client has received up to `now` [s]."""
+        client, timing = self._client, self._timing
+        for what, count in client.message_counts.items():
+            if self._counted.get(what) != count:
+                self._counted[what], self._received_at[what] = count, now
+                if what == MOTION:
+                    self._offsets.note(now, client.time)
+        for asked, theirs in client.answers:
+            if asked in self._asked:  # other stations ask, too
+                timing.round_trip = min(timing.round_trip, now - 1e-9 * asked)
+                self._offsets.answer(1e-9 * asked, 1e-9 * theirs, timing.round_trip)
+        client.answers.clear()
+
+    def asked(self, nanoseconds: int) -> None:
+        """Note a request for the autopilot's clock at this time of ours [ns]."""
+        self._asked.append(nanoseconds)
+
+    @property
+    def offset(self) -> float:
+        """Our clock minus the autopilot's, s.
+
+        The estimate comes from the messages with the least delay, minus half of the fastest TIMESYNC round trip. The
+        part of a round trip that our own polling explains does not count.
+        """
+        way = 0.5 * self._timing.round_trip - POLL
+        return self._offsets.value - (way if 0.0 < way < math.inf else 0.0)
+
+    def age(self, now: float) -> float:
+        """Return the age of the latest position at `now`, s."""
+        return now - self.offset - self._client.time
+
+    def silence(self, now: float) -> float:
+        """Return the seconds since the last message of the autopilot."""
+        return now - max(self._received_at.values(), default=-math.inf)
+
+    def lost(self, now: float) -> str:
+        """Return why the measurement or our control does not count; empty if both count."""
+        client = self._client
+        if client.interruption:
+            return f"our command of the vehicle has ended: {client.interruption}"
+        for what in IN_FLIGHT:
+            silent = now - self._received_at.get(what, -math.inf)
+            if silent > STALE:
+                return f"no telemetry of {what} for {silent:.2f} s"
+        if (age := self.age(now)) > STALE:
+            return f"telemetry arrives too late: no newer position for {age:.2f} s"
+        if now - self._received_at.get("mode", -math.inf) > SILENT:
+            return f"no heartbeat for more than {SILENT:.0f} s"
+        if not (client.offboard and client.armed):
+            state = client.mode if client.armed else "it is disarmed"
+            return f"the autopilot does not follow our setpoints ({state})"
+        if client.estimator is not None and (unknown := missing(client.estimator)):
+            return f"its estimator does not know {', '.join(unknown)}"
+        if client.outside:
+            return f"the autopilot says that it is outside of its geofence ({client.outside})"
+        return "the autopilot says that it is in an emergency" if client.emergency else ""
