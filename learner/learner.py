@@ -119,7 +119,7 @@ class Learner:
         self._limiter.insert()
         self._weigh_penalties()
         if self._multiplier is not None and (step.terminated or step.truncated):
-            self._multiplier.end_episode(step.collision)
+            self._multiplier.end_episode(move.collision)
             self._td3.cost_weight = self._multiplier.value
         self._episode_ended = step.terminated or step.truncated
         self._ages.append(self._version - step.weights_version)
