@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,13 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
         with suppress(BadWeights):  # the weights may be of a training in lockstep
             return MLP.load(path, robot.in_lockstep())
     return MLP.load(path, robot)
+
+
+def policy_hash(name: str, robot: RobotWithTask) -> str:
+    """Return a hash of the file of the policy with this name; empty if none is read (see `policy_named`)."""
+    path = _stored(robot).get(name, Path(name))
+    scripted_or_new = name in robot.task.policies or name == UNTRAINED
+    return "" if scripted_or_new else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _stored(robot: RobotWithTask) -> dict[str, Path]:

@@ -21,7 +21,7 @@ from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner_config import LearnerConfig
-from brakeline.learner.n_step import NStepWindows
+from brakeline.learner.n_step import ActorStep, NStepWindows
 from brakeline.learner.rate_limiter import RateLimiter
 from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.learner.step_ledger import StepLedger
@@ -97,14 +97,8 @@ class Learner:
             BadStep: a size or value is wrong, or the actor may not publish this step. The step is only counted.
         """
         try:
-            move = self._intake.move(step)
-            place = self._ledger.places.get(step.actor)
-            if place is None:
-                raise BadStep("actor", f"{step.actor} never joined")
-            if logged and step.actor in self._present:
-                raise BadStep("actor", f"a feeder publishes for {step.actor}, which has joined by itself")
-            if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
-                raise BadStep("index", f"{step.index}, but {step.actor} is at {place.last_index}")
+            self._check_sender(step, logged)
+            move = self._read(step)
         except BadStep:
             self.rejected += 1
             raise
@@ -119,11 +113,29 @@ class Learner:
         self._limiter.insert()
         self._weigh_penalties()
         if self._multiplier is not None and (step.terminated or step.truncated):
-            self._multiplier.end_episode(step.collision)
+            self._multiplier.end_episode(move.collision)
             self._td3.cost_weight = self._multiplier.value
         self._episode_ended = step.terminated or step.truncated
         self._ages.append(self._version - step.weights_version)
         return True
+
+    def _check_sender(self, step: pb.Step, logged: bool) -> None:
+        """Raise BadStep if the actor, or a feeder for it, may not publish a step with this index."""
+        place = self._ledger.places.get(step.actor)
+        if place is None:
+            raise BadStep("actor", f"{step.actor} never joined")
+        if logged and step.actor in self._present:
+            raise BadStep("actor", f"a feeder publishes for {step.actor}, which has joined by itself")
+        if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
+            raise BadStep("index", f"{step.index}, but {step.actor} is at {place.last_index}")
+
+    def _read(self, step: pb.Step) -> ActorStep:
+        """Return the step in a message. A wrong one has arrived, too: its actor gets permission for the next ones."""
+        try:
+            return self._intake.move(step)
+        except BadStep:
+            self._ledger.refuse(step.actor, step.index)
+            raise
 
     def _weigh_penalties(self) -> None:
         self._td3.penalty_factor = self.config.td3.penalty_factor(self.steps / self.config.steps)

@@ -42,7 +42,7 @@ class ActorStep(NamedTuple):
     terminated: bool
     truncated: bool
     cut: bool = False  # the episode ends for the learner; reward − penalty is the lowest possible
-    collision: bool = False
+    collision: bool = False  # also with what moves, by the robot's own fault
 
 
 class NStepWindows:

@@ -72,7 +72,7 @@ class StepLedger:
         return True
 
     def refuse(self, actor: str, index: int) -> None:
-        """Note a step that arrived after the last one of the run, so that it does not count as lost."""
+        """Note a step that arrived, but does not count, so that it does not count as lost."""
         self.places[actor].last_index = max(self.places[actor].last_index, index)
 
     def join(self, actor: str, index: int, episode: int) -> int:

@@ -45,7 +45,8 @@ class StepReader:
         observation = self._observed("observation", step.observation)
         after = self._observed("next_observation", step.next_observation)
         values = action, proposed, step.reward, step.penalty
-        ends = step.terminated, step.truncated, step.cut, step.collision
+        touched = step.collision or step.contact_moving or step.contact_robot
+        ends = step.terminated, step.truncated, step.cut, touched
         return ActorStep(step.episode, step.step, observation, *values, after, *ends)
 
     def _normalised(self, name: str, values: Any, most: float) -> Vector:

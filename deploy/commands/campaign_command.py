@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -15,6 +15,10 @@ from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.logs.stacking_table import plain_table
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.campaign import CampaignPart
+    from brakeline.messaging.task import RobotWithTask
 
 COLLIDED = 3  # exit status
 
@@ -65,7 +69,7 @@ class CampaignCommand:
     def _campaign(self, name: str) -> dict[str, Any]:
         """Drive the episodes of a robot, write its table, and return its figures."""
         from brakeline.deploy.experiments import campaign
-        from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cells_of, parts_of_cell
+        from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
         from brakeline.deploy.experiments.experiment_jobs import complete
         from brakeline.messaging.task import address, robot_with_task
 
@@ -77,14 +81,15 @@ class CampaignCommand:
                 self.arenas, self.policies, self.model_sets, self._perturbations(robot.position_dim)
             )
         ]
-        for cell in cells:  # a mistyped name ends the campaign before it begins; models are made once
-            self._prepare(robot, cell)
+        # A mistyped name ends the campaign before it begins; models are made once.
+        cells = [self._prepared(robot, cell) for cell in cells]
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
         results = complete(parts, self.runs, self.runs, self.engine, self.again, say)
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
-        searches = [CampaignSearch(cell, self.search) for cell in searched.values()]
-        found = complete(searches, self.runs, self.runs, self.engine, self.again, say)
-        driven = cells_of(parts, results)
+        searches = [search_of(cell, self.search) for cell in searched.values()]
+        worst = complete(searches, self.runs, self.runs, self.engine, self.again, say)
+        found = [one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)]
+        driven = cells_of(parts, results, self.runs)
         own = robot.task.name  # additional tasks of a robot have tables of their own
         table = {"robot": own, "cells": driven, "searches": found}
         self.results.mkdir(parents=True, exist_ok=True)
@@ -107,14 +112,19 @@ class CampaignCommand:
                 raise ValueError(f"no perturbation is called {name!r}; there are: {', '.join(every)}")
         return [name for name in self.perturbations if name in mine]
 
-    def _prepare(self, robot: Any, cell: Any) -> None:
-        """Check the names of a cell, and make the model set that it needs."""
+    def _prepared(self, robot: RobotWithTask, cell: CampaignPart) -> CampaignPart:
+        """Check the names of a cell, make the model set that it needs, and note the versions of both."""
         from brakeline.deploy.data.model_store import method_for
-        from brakeline.deploy.policy_loading import policy_named
+        from brakeline.deploy.policy_loading import policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
 
         arena_kind(robot, cell.arena)
+        if cell.policy.endswith(".csv"):
+            raise ValueError(
+                f"{cell.policy}: written inputs are one sequence, but a campaign's episodes are independent"
+            )
         policy_named(cell.policy, robot, 0)
-        what = cell.evaluation()
+        what, model = cell.evaluation(), ""
         if what.method != "none":
-            method_for(robot, what.method, what.model_config, what.accept_bound)
+            model = method_for(robot, what.method, what.model_config, what.accept_bound).version
+        return replace(cell, model=model, weights=policy_hash(cell.policy, robot))

@@ -1,8 +1,8 @@
 """`brakeline campaign`: a table over robots, arenas, policies, model sets and perturbations; a search for the worst.
 
-runs/campaign/<robot>/<cell>-<first>.json        a part of a cell: one row per episode; a campaign goes on after them
-runs/campaign/<robot>/near/<cell>/<episode>.mcap the log of an episode that came too near to something
-results/campaign/<robot>.md, <robot>.json        the table
+runs/campaign/<robot>/<part>.json            a part of a cell: one row per episode; a campaign goes on after them
+runs/campaign/<robot>/<part>/<episode>.mcap  the log of an episode that came too near to something
+results/campaign/<robot>.md, <robot>.json    the table
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.commands.common_options import PhysicsOptions
 from brakeline.deploy.experiments.comparison_table import markdown_table
+from brakeline.deploy.experiments.task_engine import folder_of
 from brakeline.deploy.progress import errors_only
 from brakeline.errors import ResultError
 from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson
@@ -70,6 +71,7 @@ class CampaignPart:
         perturbation: see `perturbations`.
         near: distance [m] below which an episode's log is kept.
         first, episodes: number of the first episode, and how many there are.
+        model, weights: version of the model set, and hash of the policy's file. Empty: none, or an older result.
     """
 
     robot: str
@@ -81,6 +83,8 @@ class CampaignPart:
     first: int
     episodes: int
     accept_bound: float | None = None
+    model: str = ""
+    weights: str = ""
 
     @property
     def cell(self) -> str:
@@ -113,9 +117,15 @@ class CampaignPart:
         """Drive the episodes, and keep the logs of those that came too near to something."""
         from brakeline.deploy.experiments.campaign_episodes import CampaignDriver, too_near
         from brakeline.deploy.experiments.experiment_jobs import configuration
+        from brakeline.deploy.policy_loading import policy_hash
         from brakeline.messaging.task import robot_with_task
 
-        driver, ended = CampaignDriver.of(robot_with_task(self.robot), self.evaluation()), 0
+        robot, ended = robot_with_task(self.robot), 0
+        driver = CampaignDriver.of(robot, self.evaluation())
+        if self.model and (driver.model is None or driver.model.version != self.model):
+            raise ResultError(f"the model set of {self.cell} is no longer {self.model}: run the campaign again")
+        if self.weights and policy_hash(self.policy, robot) != self.weights:
+            raise ResultError(f"{self.policy} has changed since the campaign began: run it again")
 
         def each() -> None:
             nonlocal ended
@@ -127,12 +137,11 @@ class CampaignPart:
         near = []
         for number, row in enumerate(rows, self.first):
             if driver.model is not None and too_near(row, self.near):
-                path = folder.parent / "near" / self.cell / f"{number}.mcap"
-                again = driver.record(number, path)
-                near.append({"episode": number, "closest": row["closest"], "again": again["closest"], "log": str(path)})
+                log = f"{number}.mcap"
+                again = driver.record(number, folder / log)
+                near.append({"episode": number, "closest": row["closest"], "again": again["closest"], "log": log})
         columns = {name: [row[name] for row in rows] for name in rows[0]}
-        version = "none" if driver.model is None else driver.model.version
-        return {"study": configuration(self), "model": version, "episodes": columns, "near": near}
+        return {"study": configuration(self), "episodes": columns, "near": near}
 
 
 @dataclass(frozen=True)
@@ -164,10 +173,20 @@ class CampaignSearch:
         from brakeline.deploy.experiments.worst_case_search import search
         from brakeline.messaging.task import robot_with_task
 
-        path = folder.parent / "near" / f"{self.name}.mcap"
-        found = search(robot_with_task(self.robot), self.cell.evaluation(), self.episodes, path, say)
+        log = "worst.mcap"
+        found = search(robot_with_task(self.robot), self.cell.evaluation(), self.episodes, folder / log, say)
         about = {"arena": self.cell.arena, "model_set": self.cell.model_set, "perturbation": self.cell.perturbation}
-        return {"study": configuration(self), **about, **found}
+        return {"study": configuration(self), **about, **found, "log": log}
+
+
+def search_of(cell: CampaignPart, episodes: int) -> CampaignSearch:
+    """Return the search for the worst episode of a cell. It is the same whatever the cell's policy."""
+    return CampaignSearch(replace(cell, policy="", weights="", near=0.0), episodes)
+
+
+def log_path(runs: Path, job: CampaignPart | CampaignSearch, log: str) -> str:
+    """Return the path of a log of a job. Older results have the whole path."""
+    return log if "/" in log else str(folder_of(runs, job) / log)
 
 
 def parts_of_cell(cell: CampaignPart, episodes: int) -> list[CampaignPart]:
@@ -175,26 +194,17 @@ def parts_of_cell(cell: CampaignPart, episodes: int) -> list[CampaignPart]:
     return [replace(cell, first=first, episodes=min(PART, episodes - first)) for first in range(0, episodes, PART)]
 
 
-def cells_of(parts: Sequence[CampaignPart], results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the figures of each cell, in the order of the parts.
-
-    Raises:
-        ResultError: the parts of a cell have several model sets.
-    """
+def cells_of(parts: Sequence[CampaignPart], results: Sequence[dict[str, Any]], runs: Path) -> list[dict[str, Any]]:
+    """Return the figures of each cell, in the order of the parts. runs: folder of the parts' logs."""
     cells: dict[str, tuple[CampaignPart, list[dict[str, Any]]]] = {}
     for part, result in zip(parts, results, strict=True):
-        cells.setdefault(part.cell, (part, []))[1].append(result)
+        near = [one | {"log": log_path(runs, part, one["log"])} for one in result["near"]]
+        cells.setdefault(part.cell, (part, []))[1].append(result | {"near": near})
     return [_figures(part, own) for part, own in cells.values()]
 
 
 def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures of a cell over all its parts, with 95 % intervals (`logs/proportion_intervals.py`)."""
-    models = sorted({result["model"] for result in results})
-    if len(models) > 1:
-        raise ResultError(
-            f"parts of {cell.cell} have other model sets ({', '.join(models)}): "
-            "run the campaign again with --again, or give it another --runs folder"
-        )
     columns = {
         name: [value for result in results for value in result["episodes"][name]] for name in results[0]["episodes"]
     }
@@ -202,13 +212,13 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
     count = {name: int(sum(values)) for name, values in columns.items()}
     for hits, steps in zip(columns["interventions"], columns["steps"], strict=True):
         interventions.add(hits, steps)
-    touched = count["collision"] + count["contact_moving"]
+    touched = sum(map(any, zip(columns["collision"], columns["contact_moving"], strict=True)))
     return {
         "arena": cell.arena,
         "policy": Path(cell.policy).stem,
         "model_set": cell.model_set,
         "perturbation": cell.perturbation,
-        "model": models[0],
+        "model": cell.model or "none",
         "episodes": episodes,
         "steps": count["steps"],
         "goals": count["goal"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
@@ -93,9 +94,12 @@ def complete(
         say: called with a job's name and its progress.
 
     Raises:
-        ResultError: a result was made with other settings; raised before any job runs.
+        ResultError: a result was made with other settings, or two jobs have one name; raised before any job runs.
         Any exception of a job, after the jobs that already run have ended.
     """
+    paths = Counter(result_path(results, job) for job in jobs)
+    if twice := [path for path, count in paths.items() if count > 1]:
+        raise ResultError(f"{twice[0]} would hold two results: give each setting once, and files different names")
     if again:
         for job in jobs:
             result_path(results, job).unlink(missing_ok=True)

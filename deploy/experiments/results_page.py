@@ -211,7 +211,10 @@ def _methods(found: RobotResults) -> str:
         if model is not None and int(model["collisions"]):
             samples += f", with {int(model['collisions']):,} collisions"
         learner = method.learner + (" with a multiplier" if "cost_limit" in method.td3 else "")
-        rows.append([method.label, str(len(cells)), learner, method.obstacles, method.model, samples, method.source])
+        knows, versions = method.model, {cell["model"]["version"] for cell in cells if cell["model"]}
+        if len(versions) > 1:
+            knows += f"; made {len(versions)} times: {', '.join(sorted(versions))}"
+        rows.append([method.label, str(len(cells)), learner, method.obstacles, knows, samples, method.source])
     return "\n".join([*markdown_table(heads, rows), ""])
 
 

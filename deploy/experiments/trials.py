@@ -188,7 +188,7 @@ def take_step(
         RuntimeError: there is no decision. In one process this is a defect, never the network.
     """
     before = time.perf_counter_ns()
-    proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
+    proposal = driver.slow_down.proposal(np.asarray(policy(driver.observation, driver.info), dtype=float))
     spent_ms = (time.perf_counter_ns() - before) * 1e-6
     outcome = driver.decide(proposal, question)
     if outcome is not None and outcome.answer is None:

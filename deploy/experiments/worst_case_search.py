@@ -82,8 +82,8 @@ def search(
     what: gives arena, method, model set, conditions and seed.
 
     Returns:
-        `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, `history` (the
-        distance of the worst candidate so far, after each episode), and the log's path.
+        `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, and `history`
+        (the distance of the worst candidate so far, after each episode).
 
     Raises:
         NoArena: in no drawn arena does a candidate begin with room around the robot.
@@ -146,7 +146,6 @@ def search(
         "number": None if worst is None else worst.number,
         "values": [] if worst is None else worst.values.round(6).tolist(),
         "history": found.history,
-        "log": str(path),
     }
 
 

@@ -22,8 +22,10 @@ HEAD = (
 
 def main(*paths: str) -> None:
     print(row(HEAD), row(["---"] * len(HEAD)), sep="\n")
-    for (disturbed, policy, name), episodes in groups_of(paths, ("disturbed", "policy", "filter")):
-        print(row(["yes" if disturbed else "no", policy, name, *cells(episodes, name)]))
+    groups = groups_of(paths, ("disturbed", "policy", "amplitude", "filter"))
+    for (disturbed, policy, amplitude, name), episodes in groups:
+        wanted = policy if amplitude == 1.0 else f"{policy}, {amplitude:g} m"
+        print(row(["yes" if disturbed else "no", wanted, name, *cells(episodes, name)]))
 
 
 def cells(episodes: list[dict[str, Any]], name: str) -> list[object]:

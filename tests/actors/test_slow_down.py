@@ -12,6 +12,7 @@ from brakeline.actors.slow_down import SLOW, SlowDown, at_least
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.experiments.evaluate import Evaluation, in_process, prepare_evaluation
+from brakeline.deploy.experiments.trials import take_step
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.widening import PLANS, Widening
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig
@@ -106,6 +107,19 @@ def test_a_robot_that_changes_drives_slower_until_its_sets_hold_again():
     assert 900 <= began < 1000
     assert True not in active[:900] and not active[-1]
     assert active[began:].index(False) >= PLANS, "until the plans that left are no longer among the last ones"
+
+
+@pytest.mark.parametrize("loop", ["run_episode", "take_step"])
+def test_every_loop_limits_the_proposals_of_a_slow_robot_before_it_asks(loop):
+    runner, _, _ = prepare_evaluation(GROUND, Evaluation("random", "none"))
+    runner.slow_down.update([True] * PLANS, BOUND)
+    fast = lambda observation, info: np.asarray(GROUND.high())  # noqa: E731
+    if loop == "take_step":
+        runner.begin(0)
+        step = take_step(runner, fast, None)
+    else:
+        (step,) = next(run_episode(RobotGroup([runner]), [fast], None, 0))
+    assert list(step.proposed) == pytest.approx([SLOW * GROUND.high()[0], GROUND.high()[1]])
 
 
 def driving(policy, steps, seed, payload=()):

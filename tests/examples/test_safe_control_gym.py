@@ -55,16 +55,19 @@ def test_no_velocity_balances_the_pole_and_stops_the_cart_within_a_plan():
 
 def test_the_table_counts_each_seed_once_and_states_exact_intervals(tmp_path, capsys):
     def line(seed, violations, **changes):
-        about = {"disturbed": False, "policy": "ppo", "filter": "brakeline", "seed": seed, "steps": 150}
+        about = {"disturbed": False, "policy": "ppo", "filter": "brakeline", "amplitude": 1.0, "seed": seed}
+        about["steps"] = 150
         figures = {"violations": violations, "fell": False, "corrected": 15, "error": 0.2, "return": 140.0}
         return about | figures | {"outside": 0, "cpu_ms": 1.0, "kinds": {"allowed": 150}} | changes
 
     lines = [line(seed, 0) for seed in range(100)] + [line(0, 0), line(0, 30, filter="none", kinds={}, fell=True)]
+    lines.append(line(0, 0, amplitude=2.3))  # another task, which is no repetition of seed 0
     path = tmp_path / "lines.jsonl"
     path.write_text("".join(json.dumps(one) + "\n" for one in lines))
     table.main(str(path))
-    behind, without = (one.split(" | ") for one in capsys.readouterr().out.splitlines()[2:])
+    behind, without, far = (one.split(" | ") for one in capsys.readouterr().out.splitlines()[2:])
     assert behind[1:8] == ["ppo", "brakeline", "100", "0 (0.0 to 5.2 %)", "0 of 15000", "0", "10.0%"]
+    assert far[1:4] == ["ppo, 2.3 m", "brakeline", "1"]
     assert without[3:8] == ["1", "1 (0.5 to 100.0 %)", "30 of 150", "1", "–"]
 
 

@@ -288,6 +288,14 @@ def test_the_multiplier_rises_with_collisions_and_falls_to_zero_without():
     assert free._td3.cost_weight == 0.0
 
 
+@pytest.mark.parametrize("touched", ["collision", "contact_moving", "contact_robot"])
+def test_what_the_robot_runs_into_is_a_cost_also_if_it_moves(touched):
+    learner, _ = started(LIMITED)
+    learner.insert(step(1, terminated=True, **{touched: True}))
+    assert learner._td3.cost_weight == pytest.approx(3.6)
+    assert learner._replay.state().tensor("cost", (1, 1), "float32") == 1.0
+
+
 def test_a_resumed_run_keeps_the_multiplier(tmp_path):
     learner, _ = started(LIMITED)
     learner.insert(step(1, terminated=True, collision=True))

@@ -8,7 +8,7 @@ import pytest
 from brakeline.errors import BadStep
 from brakeline.learner.learner import AHEAD, MOST_ACTORS, MOST_ACTORS_OF_ONE, Learner
 from brakeline.learner.transition_reader import LATEST, MOST_OBSERVED, StepReader
-from tests.learner.test_core import joining, step
+from tests.learner.test_core import joining, started, step
 from tests.learner.toy import CONFIG, TOY
 
 
@@ -52,6 +52,19 @@ def test_a_step_that_is_wrong_names_its_field_and_changes_nothing(learner: Learn
     assert refused.value.field == field
     assert learner.rejected == 1 and learner.steps == 0
     assert learner.insert(step(1)) and learner.metrics().missing == 0
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_an_actor_whose_steps_are_wrong_need_not_join_again_and_no_step_counts_as_lost(lockstep: bool) -> None:
+    """Such as those of a sensor that fails for some seconds: more steps than the actor may be ahead of the learner."""
+    learner, _ = started(replace(CONFIG, lockstep=lockstep))
+    for index in range(1, 3 * CONFIG.window):
+        assert learner.flow().limit["actor-0"] >= index, "it waits, and joins again"
+        with pytest.raises(BadStep, match="not finite"):
+            learner.insert(step(index, observation=[float("nan")] * 2))
+    assert learner.insert(step(3 * CONFIG.window))
+    metrics = learner.metrics()
+    assert (metrics.steps, metrics.refused, metrics.missing) == (1, 3 * CONFIG.window - 1, 0)
 
 
 def test_proposals_out_of_bounds_are_clipped_as_ever(learner: Learner) -> None:

@@ -14,7 +14,7 @@ from brakeline.sim.batch.normal_streams import NormalStreams
 from brakeline.sim.ground_estimator import cut_normal
 from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.scripted_policies import scripted
-from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, QuadrotorNoise, Wind
+from brakeline.sim.sim_conditions import Conditions, NoiseLevels, Perception, ProcessNoise, QuadrotorNoise, Wind
 from tests.robots import GROUND, QUADROTOR
 
 COMPARED = (
@@ -37,6 +37,7 @@ def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
         (GROUND, "default", "greedy", 25, Conditions()),
         (GROUND, "dense", "adversary", 60, Conditions(NoiseLevels(scale=0.5), payload_kg=0.4, floor_friction=0.7)),
         (GROUND, "open", "random", 25, Conditions(NoiseLevels(scale=0.0))),
+        (GROUND, "default", "random", 25, Conditions(weak_motor=0.7, process_noise=ProcessNoise(scale=2.0))),
         (QUADROTOR, "default", "astar", 25, Conditions(flight_noise=QuadrotorNoise(scale=0.5))),
         (QUADROTOR, "dense", "adversary", 40, Conditions()),
     ],

@@ -2,15 +2,18 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from scipy.stats import binomtest
 
 from brakeline.deploy.commands.campaign_command import COLLIDED, CampaignCommand
-from brakeline.deploy.experiments import campaign, experiment_jobs
-from brakeline.deploy.experiments.campaign import CampaignPart, CampaignSearch, cell_table, cells_of, parts_of_cell
+from brakeline.deploy.experiments import campaign, campaign_episodes, experiment_jobs
+from brakeline.deploy.experiments.campaign import CampaignPart, cell_table, cells_of, parts_of_cell, search_of
 from brakeline.deploy.experiments.campaign_episodes import CampaignDriver
 from brakeline.deploy.experiments.experiment_jobs import complete
+from brakeline.deploy.experiments.ray_tasks import _run_remotely
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS
 from brakeline.deploy.run.replay_run import replay
 from brakeline.errors import ResultError
@@ -19,6 +22,7 @@ from tests.robots import GROUND
 
 NEAR = 0.1  # m, so that a few of these episodes are near misses
 CELL = CampaignPart("ground", "dense", "trained", "residual", "as-recorded", NEAR, 0, 1)
+ROW = dict.fromkeys(campaign_episodes.ROWS, 0) | {"steps": 1, "closest": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +38,7 @@ def driven(data_folder, tmp_path_factory):
 def test_the_parts_of_a_cell_add_up(driven):
     parts, results, _ = driven
     assert [(part.first, part.episodes) for part in parts] == [(0, 4), (4, 2)]
-    (cell,) = cells_of(parts, results)
+    (cell,) = cells_of(parts, results, Path("runs"))
     rows = [result["episodes"] for result in results]
     assert cell["episodes"] == 6 and cell["steps"] == sum(sum(row["steps"]) for row in rows)
     assert cell["goals"] + cell["collisions"] + cell["timeouts"] == 6 and cell["collisions"] == 0
@@ -49,13 +53,52 @@ def test_a_campaign_goes_on_after_the_episodes_that_it_has_and_adds_up_one_model
     parts, results, folder = driven
     monkeypatch.setattr(CampaignPart, "run", lambda *_: pytest.fail("driven again"))
     assert complete(parts, folder, folder) == results
-    with pytest.raises(ResultError, match="other model sets"):
-        cells_of(parts, [results[0], results[1] | {"model": "another"}])
+    for changed in ({"model": "another"}, {"weights": "another"}):
+        with pytest.raises(ResultError, match=f"made with another {next(iter(changed))}"):
+            complete([replace(part, **changed) for part in parts], folder, folder)
+
+
+def test_a_policy_or_a_model_set_that_changes_while_a_campaign_runs_ends_it(data_folder, tmp_path):
+    for changed, said in (({"model": "older"}, "no longer older"), ({"weights": "older"}, "trained has changed")):
+        with pytest.raises(ResultError, match=said):
+            replace(CELL, **changed).run(tmp_path, lambda text: None)
+
+
+def test_a_result_names_its_policy_and_its_model_set(data_folder, tmp_path):
+    command = CampaignCommand(runs=tmp_path, results=tmp_path)
+    network, scripted = (command._prepared(GROUND, replace(CELL, policy=name)) for name in ("trained", "random"))
+    assert len(network.weights) == 16 and scripted.weights == "" and network.model == scripted.model != ""
+    assert command._prepared(GROUND, replace(CELL, model_set="none")).model == ""
+
+
+def test_a_search_is_the_same_whatever_the_policies_of_the_campaign():
+    assert search_of(CELL, 5) == search_of(replace(CELL, policy="random", near=0.3, weights="a"), 5)
+    assert search_of(CELL, 5) != search_of(replace(CELL, model="another"), 5)
+
+
+def test_another_machine_returns_the_logs_of_near_misses(tmp_path, monkeypatch):
+    """A worker of Ray returns the files of its task's folder, and no others."""
+
+    def record(driver, number, path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"log of {number}")
+        return {"closest": 0.0}
+
+    monkeypatch.setattr(CampaignDriver, "of", lambda robot, what: CampaignDriver(robot, what, "a model", None, None))
+    monkeypatch.setattr(CampaignDriver, "drive", lambda driver, first, episodes, each: [ROW] * episodes)
+    monkeypatch.setattr(CampaignDriver, "record", record)
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    part = replace(CELL, first=4, episodes=2)
+    result, files = _run_remotely(part, {}, SimpleNamespace(add=SimpleNamespace(remote=lambda name, text: None)))
+    assert files == {"4.mcap": b"log of 4", "5.mcap": b"log of 5"}
+    (cell,) = cells_of([part], [result], Path("runs"))
+    assert [one["log"] for one in cell["near"]] == [f"runs/ground/{part.name}/{number}.mcap" for number in (4, 5)]
 
 
 def test_near_misses_are_kept_and_replay_bit_by_bit(driven):
-    _, results, _ = driven
-    near = [row for result in results for row in result["near"]]
+    parts, results, folder = driven
+    (cell,) = cells_of(parts, results, folder)
+    near = cell["near"]
     closest = [value for result in results for value in result["episodes"]["closest"]]
     assert {row["episode"] for row in near} == {i for i, value in enumerate(closest) if value < NEAR} != set()
     worst = min(near, key=lambda row: row["closest"])
@@ -76,9 +119,10 @@ def test_episodes_in_a_batch_are_those_one_after_the_other(driven, monkeypatch):
 
 def test_a_search_hits_something_without_the_filter_and_nothing_with_it(data_folder, tmp_path):
     bare, filtered = (
-        CampaignSearch(replace(CELL, model_set=model_set), 10).run(tmp_path / "ground" / model_set, lambda text: None)
+        search_of(replace(CELL, model_set=model_set), 10).run(tmp_path / model_set, lambda text: None)
         for model_set in ("none", "residual")
     )
+    bare["log"], filtered["log"] = tmp_path / "none" / bare["log"], tmp_path / "residual" / filtered["log"]
     assert bare["collisions"] > 0 and bare["closest"] <= 0.0
     assert filtered["collisions"] == 0 and filtered["closest"] > 0.0
     for search in (bare, filtered):
@@ -116,13 +160,19 @@ def test_each_task_and_each_robot_of_ones_own_has_a_table_of_its_own(driven, mon
     assert experiment_jobs.result_path(tmp_path / "runs", own) == tmp_path / "runs" / "my" / f"{own.name}.json"
 
 
+def test_an_episode_that_touches_a_wall_and_a_walker_is_one_collision():
+    both = {name: [value] for name, value in (ROW | {"collision": 1, "contact_moving": 1}).items()}
+    (cell,) = cells_of([CELL], [{"episodes": both, "near": []}], Path("runs"))
+    assert (cell["episodes"], cell["collisions"]) == (1, 1)
+
+
 def test_walkers_that_run_into_a_standing_robot_are_no_collisions_and_have_a_column_where_there_are_any(driven):
     parts, results, _ = driven
-    heads, _ = cell_table(cells_of(parts, results))
+    heads, _ = cell_table(cells_of(parts, results, Path("runs")))
     assert "run into, standing" not in heads
     touched = json.loads(json.dumps(results))
     touched[0]["episodes"]["contact_standing"][:2] = [2, 1]
-    heads, (row,) = cell_table(cells_of(parts, touched))
+    heads, (row,) = cell_table(cells_of(parts, touched, Path("runs")))
     assert row[heads.index("run into, standing")] == "3"
     assert row[heads.index("collisions")].startswith("0: ")
 
@@ -150,7 +200,8 @@ def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path
 @pytest.mark.parametrize(
     ("change", "said"),
     [({"perturbations": ("earthquake",)}, "no perturbation"), ({"model_sets": ("hope",)}, "no model set"),
-     ({"arenas": ("moon",)}, "moon"), ({"policies": ("nobody",)}, "nobody")],
+     ({"arenas": ("moon",)}, "moon"), ({"policies": ("nobody",)}, "nobody"),
+     ({"policies": ("inputs.csv",)}, "written inputs"), ({"policies": ("random", "random")}, "would hold two results")],
 )  # fmt: skip
 def test_a_mistyped_name_ends_it_before_it_begins(data_folder, tmp_path, change, said):
     with pytest.raises(ValueError, match=said):

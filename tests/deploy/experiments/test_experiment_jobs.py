@@ -122,3 +122,11 @@ def test_a_result_of_other_settings_is_refused_unless_it_shall_be_run_again(tmp_
     assert not (tmp_path / "other").exists(), "nothing is run before everything was looked at"
     complete([Errand(1, setting=5)], tmp_path / "results", tmp_path / "again", engine=Engine(1), again=True)
     assert read(tmp_path / "results", Errand(1, setting=5)) is not None
+
+
+def test_two_jobs_of_one_name_are_refused_before_any_runs(tmp_path):
+    """Else a result would count twice, or the last job would overwrite the result of the others."""
+    for jobs in ([Errand(1), Errand(1)], [Errand(1, setting=5), Errand(2), Errand(1)]):
+        with pytest.raises(ResultError, match=r"errand-1\.json would hold two results"):
+            complete(jobs, tmp_path / "results", tmp_path / "runs")
+    assert not list(tmp_path.iterdir())

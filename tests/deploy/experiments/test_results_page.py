@@ -103,6 +103,13 @@ def test_cells_of_two_simulators_and_of_two_settings_of_a_rival_are_not_mixed(re
         stored_cells(results, "ground")
 
 
+def test_the_page_says_which_filters_were_made_several_times(results):
+    """Cells of one configuration may still be of several model sets: those of another recording, or of other code."""
+    assert "| sets from recorded driving |" in page(results, ["ground"])
+    change(results / "ground" / "ddpc-s1.json", lambda cell: cell["model"].update(version="2"))
+    assert "| sets from recorded driving; made 2 times: 1, 2 |" in page(results, ["ground"])
+
+
 def test_cells_of_two_learners_are_not_mixed_and_the_page_names_their_settings(results):
     grown = {"penalty_growth": 4.0, "imitation": 1.0}
     for path in (results / "ground").glob("ddpc-s*.json"):
