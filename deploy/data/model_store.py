@@ -126,8 +126,8 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
         if not automatic:
             raise
         raise BadData(
-            f"no model set of {robot.name} is in use, and mode direct cannot be fitted: {error}. For mode one-step, run "
-            "`brakeline certify DESCRIPTION --use`"
+            f"no model set of {robot.name} is in use, and mode direct cannot be fitted: {error}. "
+            "For mode one-step, run `brakeline certify DESCRIPTION --use`"
         ) from error
     console.print(
         f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "

@@ -70,6 +70,7 @@ STATED = {
         (f"analyse {FILE}", "is not an MCAP file"),
         (f"certify --data {FILE}", "`brakeline import` reads CSV"),
         ("import", "there is no log to import"),
+        ("compare ground --table --results {folder}/none", "none: there are no results of ground"),
         ("robot new {folder}/none/my.toml", "none/my.toml': make the folder"),
         ("certify --data {folder}/none.mcap", "no log at"),
         ("certify --data nothere.safetensors", "no data set at nothere.safetensors"),  # it is not recorded anew

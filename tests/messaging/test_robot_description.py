@@ -229,6 +229,8 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
+        ("progress = 20.0", "progres = 20.0", r"reward\.progres: unknown: check its spelling"),
+        ("half_width = 2.5", "", r"arenas\.default\.half_width: missing"),
         ("progress = 20.0", "progress = nan", r"reward: progress = nan is not finite"),
         ("progress = 20.0", "collision = 100.0", r"reward: collision = 100\.0 is not 0 or less"),
         ("step_limit = 300", "step_limit = 0", r"arenas\.default: step_limit = 0 is not 1 or more"),
