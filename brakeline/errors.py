@@ -113,7 +113,7 @@ class BadDescription(UnknownRobot):
     """
 
     def __init__(self, source: str, problems: Sequence[tuple[str, str]]) -> None:
-        lines = "".join(f"\n  {field}: {text}" for field, text in problems)
+        lines = "".join(f"\n  {field}: {text}" if field else f"\n  {text}" for field, text in problems)
         super().__init__(f"{source} is no robot's description:{lines}")
         self.problems = problems
 

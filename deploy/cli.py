@@ -16,6 +16,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import fields, is_dataclass, make_dataclass, replace
 from importlib.metadata import version
+from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
@@ -230,12 +231,17 @@ def parse(name: str, arguments: list[str]) -> Any:
 
 
 def reason(error: Exception) -> str:
-    """Return the message of an error; for a place that may not be written to, also what to do."""
+    """Return the message of an error; for a place that may not be written to or does not exist, also what to do."""
     if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        reading = "" if error.errno == errno.EROFS else "To read it, you need the permission to read. To write: "
         return (
-            f"{error}. Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for data sets "
-            "and model sets, --out for a run or a file"
+            f"{error}. {reading}Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for "
+            "data sets and model sets, --out for a run or a file"
         )
+    if isinstance(error, FileNotFoundError) and isinstance(error.filename, str):
+        folder = Path(error.filename).absolute().parent
+        if not folder.is_dir():
+            return f"{error}: make the folder {folder} first, or correct the path"
     return str(error)
 
 

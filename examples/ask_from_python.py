@@ -1,6 +1,6 @@
 """Ask a running safety service about every action of your own policy.
 
-brakeline safety ground --listen tcp/127.0.0.1:7447      # in another terminal; records data and certifies first
+brakeline safety ground --listen tcp/127.0.0.1:7447      # in another terminal; wait until it prints `ready`
 python examples/ask_from_python.py tcp/127.0.0.1:7447
 """
 

@@ -193,7 +193,9 @@ class Log:
                     elif isinstance(item, Attachment):
                         self.attachments[item.name] = item.data
         except NotMcap as error:
-            raise LogError(f"{path} is not an MCAP file: {error}") from error
+            raise LogError(
+                f"{path} is not an MCAP file: {error}. Logs of runs are; `brakeline import` reads CSV and other logs"
+            ) from error
 
     @staticmethod
     def _channel(key: str, schema: str | None) -> LogChannel:

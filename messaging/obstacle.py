@@ -63,6 +63,9 @@ class Obstacle:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise BadShape("kind", f"no obstacle is called {self.kind!r}; there are: {', '.join(KINDS)}")
+        for name, values in (("position", self.position), ("size", self.size)):
+            if not hasattr(values, "__len__"):
+                raise BadShape(name, f"an obstacle's {name} is a tuple of numbers, such as (0.1,), not {values!r:.80}")
         dim = len(self.position)
         if dim not in (2, 3):
             raise BadShape("position", f"an obstacle's position has 2 or 3 coordinates, not {dim}")

@@ -27,6 +27,7 @@ MAX_NAME_LENGTH = 64
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s2", "rad/s2", "N", "N m", "V", "A", "Pa", "K", "1")
 UNIT_OF_ROLE = {"position": "m", "heading": "rad"}
 INPUT_ROUNDING = 1e-12
+STOP_RULES = "'ramp', 'hold', fractions such as [0.5, 0.2, 0.0], or gains such as { speed = -4.0 }"
 Problem = tuple[str, str]  # a field, and its mistake with the allowed values
 
 
@@ -174,9 +175,12 @@ def robot_from_description(values: Any, source: str = "this") -> Robot:
     try:
         model = DescriptionModel.model_validate(values)
     except ValidationError as error:
-        raise BadDescription(source, [_problem(detail) for detail in error.errors()]) from error
-    if problems := list(_inconsistencies(model)):
-        raise BadDescription(source, problems)
+        problems: dict[str, str] = {}
+        for detail in error.errors():
+            problems.setdefault(*_problem(detail))
+        raise BadDescription(source, list(problems.items())) from error
+    if inconsistencies := list(_inconsistencies(model)):
+        raise BadDescription(source, inconsistencies)
     return _robot(model)
 
 
@@ -285,6 +289,8 @@ def _problem(detail: Any) -> Problem:
         similar = difflib.get_close_matches(path[-1], allowed, 1)
         hint = f"; did you mean {similar[0]!r}?" if similar else ""
         text = f"unknown{hint} (allowed here: {', '.join(allowed)})"
+    elif path[:1] + path[2:3] == ["input", "stop"]:  # pydantic has an error for each type that a rule may have
+        path, text = path[:3], f"{STOP_RULES}, not {detail['input']!r:.80}"
     else:
         text = f"{text[:1].lower()}{text[1:]}, not {detail['input']!r:.80}"
     return ".".join(path), text

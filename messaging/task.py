@@ -393,6 +393,9 @@ def address_in_real_time(name: str) -> str:
     return address(name.removesuffix(REAL_TIME_SUFFIX)) + REAL_TIME_SUFFIX
 
 
+PLAIN = {"missing": "missing", "unexpected_keyword_argument": "unknown: check its spelling"}  # for pydantic's words
+
+
 def read_task(path: Path) -> Task:
     """Read the task in a file. Raises UnknownTask: the file has mistakes; the message lists all of them."""
     try:
@@ -402,7 +405,10 @@ def read_task(path: Path) -> Task:
         place = {"folder": path.parent, "name": path.name.removesuffix(TASK_SUFFIX)}
         return TypeAdapter(Task).validate_python(values | place)
     except ValidationError as error:
-        problems = [(".".join(map(str, e["loc"])), e["msg"].removeprefix("Value error, ")) for e in error.errors()]
+        problems = [
+            (".".join(map(str, e["loc"])), PLAIN.get(e["type"], e["msg"].removeprefix("Value error, ")))
+            for e in error.errors()
+        ]
         lines = "".join(f"\n  {place}: {what}" if place else f"\n  {what}" for place, what in problems)
         raise UnknownTask(f"{path} is no task:{lines}") from error
     except RecursionError as error:

@@ -107,6 +107,8 @@ class CertifyCommand:
         else:
             self._print(models, notes, data)
             console.print(f"{path}: {note}", markup=False)
+            for row in (row for modes in results.values() for row in modes.values() if "in_use" in row):
+                console.print(f"{row['in_use']}: in use from now on", markup=False)
             if self.verbose:
                 console.print(conditions_table(data.about))
         if self.publish and models and not self._refusal(models[0][0], data):
@@ -124,16 +126,14 @@ class CertifyCommand:
         return list(product(self.certificates or KINDS, (mode,) if mode else MODES))
 
     def _put_to_use(self, model: ModelSet, data: Dataset) -> dict[str, str]:
-        """Save the model set if you give --use, or return and print the reason why it may not be used."""
+        """Save the model set if you give --use, and return its path; or return and print why it may not be used."""
         if not (self.use or self.publish):
             return {}
         if refused := self._refusal(model, data):
             config = model.model_config
             errors.print(f"[red]{config.certificate}, {config.mode}: not put to use:[/] {escape(refused)}")
             return {"not_used": refused}
-        if self.use:
-            self._save(model, data)
-        return {}
+        return {"in_use": str(self._save(model, data))} if self.use else {}
 
     def _refusal(self, model: ModelSet, data: Dataset) -> str:
         return refusal(data.robot, model.about, self.accept_bound)
@@ -152,8 +152,8 @@ class CertifyCommand:
         for line in lines:
             console.print(line, markup=False)
 
-    def _save(self, model: ModelSet, data: Dataset) -> None:
-        """Write a model set to where the other commands load it from; signed, if there is a key to sign with."""
+    def _save(self, model: ModelSet, data: Dataset) -> Path:
+        """Write a model set to the path, which is returned, where other commands load it; signed, if there is a key."""
         from brakeline.safety.service.signature import KEY, ModelSigner, seal_of
 
         path, keys = model_path(model.robot, model.model_config), self.endpoints.keys or options.default_keys()
@@ -163,6 +163,7 @@ class CertifyCommand:
         else:
             model.save(path)
         note_mode(model.robot, model.model_config)
+        return path
 
     def _load(self) -> tuple[Path, Dataset, str]:
         """Return the source, its data and a note. Raises ValueError if a named data set does not exist."""

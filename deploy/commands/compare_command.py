@@ -99,7 +99,9 @@ class CompareCommand:
         jobs_of = {} if self.table or self.tune else {robot: self._jobs(robot) for robot in robots}
         for robot in robots:
             if self.table:
-                tables[robot] = self._write(stored_cells(results, robot), [], robot_folder(results, robot))
+                if not (stored := stored_cells(results, robot)):
+                    raise ValueError(f"{results}: there are no results of {robot}; `brakeline compare` makes them")
+                tables[robot] = self._write(stored, [], robot_folder(results, robot))
                 continue
             if self.tune:
                 trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]

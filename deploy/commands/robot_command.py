@@ -76,7 +76,8 @@ class RobotCommand:
                 errors.print(str(error), markup=False)
             return 1
         remarks = summary(robot)["remarks"]
-        collect = f", or `brakeline collect {self.file}`" if robot.position_dim else ""
+        simulated = isinstance(robot_maybe_with_task(self.file), RobotWithTask)
+        collect = f", or `brakeline collect {self.file}`" if simulated else ""
         print_result(
             self.json,
             {"file": self.file, "problems": [], "remarks": remarks},

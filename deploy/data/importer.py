@@ -110,9 +110,11 @@ def import_sources(
         hold: time in s for which an input is valid after its last message.
 
     Raises:
-        BadData: a source cannot be used; the message names the source and the reason.
+        BadData: there is no source, or one cannot be used; the message names the source and the reason.
         LogError: a Brakeline log cannot be read.
     """
+    if not paths:
+        raise NoSource("there is no log to import: name one or more files or folders")
     parts = [_import_one(path, robot, options, delay, hold) for path in paths]
     reports = [part.report for part in parts]
     samples = {report.samples for report in reports}

@@ -116,10 +116,19 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
         console.print(f"[yellow]recording again:[/] {error}")
         load_or_record(robot.in_lockstep(), again=True)
         data = data_for(robot)
-    if model_config.mode == AUTO:
+    automatic = model_config.mode == AUTO
+    if automatic:
         model_config = replace(model_config, mode=DIRECT)  # the simulated robots' own; `path` is of this mode too
-    with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
-        model, report = certify(data, model_config)
+    try:
+        with under_way(f"certifying {robot.name}: {model_config.certificate}, {model_config.mode}"):
+            model, report = certify(data, model_config)
+    except BadData as error:
+        if not automatic:
+            raise
+        raise BadData(
+            f"no model set of {robot.name} is in use, and mode direct cannot be fitted: {error}. "
+            "For mode one-step, run `brakeline certify DESCRIPTION --use`"
+        ) from error
     console.print(
         f"{robot.name}: {model_config.certificate} ({model_config.mode}) {model.version}: "
         f"{report.violations} of {report.windows} held-out plans left their sets; at most "

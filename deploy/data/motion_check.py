@@ -1,7 +1,8 @@
 """Compare the columns of a log with its motion: the differences of the positions show direction, speed and turn rate.
 
 A heading follows the direction of the motion, and a speed is the length of the way over its time. A column that does
-so only in another unit (degrees, km/h) has that unit.
+so only in another unit (degrees, km/h) has that unit. A column that does so only without the conversion that the user
+asked for was in SI units already.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from brakeline.deploy.data.aligned_log import AlignedLog, align
 from brakeline.deploy.data.sources.quantity_names import Places
 from brakeline.deploy.data.sources.source_table import Array
 from brakeline.deploy.data.stamps import FACTORS, TIME
-from brakeline.deploy.data.unit_table import COMPASS, UNITS, in_si
+from brakeline.deploy.data.unit_table import COMPASS, UNITS, factor, from_si, in_si
 from brakeline.errors import NoSource
 
 SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
@@ -27,6 +28,7 @@ MAX_LAG = 1.0  # s
 FEWEST_SPANS = 20  # fewer spans give no result
 LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h and ft/s differ by 10 %
 HEADING_UNITS = ("rad", "deg", COMPASS)
+UNCONVERTED = "unconverted"  # the reading of a heading without the conversion by --unit
 WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
 
 
@@ -39,27 +41,35 @@ class SpeedFit(NamedTuple):
 
 
 def refuse_contradictions(
-    places: Places, positions: list[str], inputs: list[str], heading: str, units: Mapping[str, str]
+    places: Places,
+    positions: list[str],
+    inputs: list[str],
+    heading: str,
+    units: Mapping[str, str],
+    given: Mapping[str, str],
 ) -> None:
     """Raise NoSource with what to do if the motion contradicts the unit of a column."""
     try:
         log = align(places, positions, inputs, {})
     except NoSource:
         return  # too few rows to compare; `resample` says so
-    if problems := contradictions(log, heading, units):
+    if problems := contradictions(log, heading, units, given):
         raise NoSource("\n".join(problems))
 
 
-def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str]) -> list[str]:
+def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
     """Return what the motion contradicts, in sentences that say what to do.
 
     Args:
         log: its heading is not unwrapped, and not set.
         heading: name of the heading; empty for none.
         units: SI unit that each column should have.
+        given: units from which columns were converted, as `--unit` says.
     """
     if heading:
-        unit, score = heading_unit(log, heading)
+        unit, score = heading_unit(log, heading, given.get(heading, ""))
+        if unit == UNCONVERTED:
+            return [needless_conversion(heading, given[heading], "rad")]
         if unit != "rad":
             return [heading_contradiction(heading, unit, score)]
     speeds = speeds_of_motion(log, heading)
@@ -69,7 +79,17 @@ def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str]) -> l
             fit = speed_fit(log, name, [s for s in speeds if s[0] == unit], name in log.inputs)
             if fit is not None:
                 gains[name] = fit
-    return _explained(log, gains)
+    needless = [
+        needless_conversion(name, given[name], fit.unit)
+        for name, fit in gains.items()
+        if name in given and not same_gain(fit.gain) and same_gain(fit.gain / (factor(given[name], fit.unit) or 1.0))
+    ]
+    return needless or _explained(log, gains)
+
+
+def needless_conversion(name: str, given: str, si: str) -> str:
+    """Return the sentence for a column that agrees with the motion only without its conversion."""
+    return f"{name} is in {si} already: only without --unit {name}={given} does the motion agree with it. Leave it out"
 
 
 def heading_contradiction(name: str, unit: str, score: float) -> str:
@@ -80,18 +100,19 @@ def heading_contradiction(name: str, unit: str, score: float) -> str:
     )
 
 
-def heading_unit(log: AlignedLog, name: str) -> tuple[str, float]:
+def heading_unit(log: AlignedLog, name: str, given: str = "") -> tuple[str, float]:
     """Return the unit in which a column agrees best with the direction of motion, and how well, in [0, 1]."""
-    scores = heading_scores(log, name)
+    scores = heading_scores(log, name, given)
     best = max(scores, key=lambda unit: scores[unit])
     clear = scores[best] > SAME_CORRELATION and scores[best] > scores["rad"] + 0.1
     return (best, scores[best]) if clear else ("rad", scores["rad"])
 
 
-def heading_scores(log: AlignedLog, name: str) -> dict[str, float]:
+def heading_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, float]:
     """Return for each unit how well a column agrees with the direction of motion: the mean of |cos(direction - angle)|.
 
-    On a straight path, a constant agrees as well as the heading does: 0 if the angle does not change.
+    On a straight path, a constant agrees as well as the heading does: 0 if the angle does not change. If the column was
+    converted from the unit `given`, `UNCONVERTED` is the score without the conversion.
     """
     i, j = log.spans(SPAN)
     x, y = (log.change(p, i, j) for p in log.positions[:2])
@@ -100,8 +121,10 @@ def heading_scores(log: AlignedLog, name: str) -> dict[str, float]:
     if len(far) < FEWEST_SPANS:
         return dict.fromkeys(HEADING_UNITS, 0.0)
     direction, middle, scores = np.arctan2(y[far], x[far]), ((i + j) // 2)[far], {}
-    for unit in HEADING_UNITS:
-        angles = in_si(log.columns[name], unit, "rad")
+    readings = {unit: in_si(log.columns[name], unit, "rad") for unit in HEADING_UNITS}
+    if given:
+        readings[UNCONVERTED] = from_si(log.columns[name], given, "rad")
+    for unit, angles in readings.items():
         assert angles is not None
         turned = np.ptp(angles) > 0.5
         scores[unit] = float(np.abs(np.cos(direction - angles[middle])).mean()) if turned else 0.0

@@ -75,7 +75,7 @@ def resample(
     chosen = choice_notes(tables, places)
     places, glitches = without_glitches(places, positions, heading, inputs)
     if robot.position_dim:
-        refuse_contradictions(places, positions, inputs, heading, column_units(robot))
+        refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)
     notes = [*notes_of(tables), *chosen, *glitches, *cuts]
     if not recordings:

@@ -36,6 +36,7 @@ NAMES = {
     **{"metre": "m", "metres": "m", "minutes": "min", "mins": "min", "hours": "h", "hour": "h", "hrs": "h"},
 }
 COMPASS = "compass"  # a heading in degrees, clockwise from north
+AS_IT_IS = "1"  # a column that is not converted
 WITH_UNIT = re.compile(r"(.+?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]")
 
 
@@ -56,6 +57,17 @@ def in_si(values: NDArray[np.float64], unit: str, si: str) -> NDArray[np.float64
         return np.asarray(np.radians(90.0 - values))
     scale = factor(unit, si)
     return None if scale is None else values * scale
+
+
+def from_si(values: NDArray[np.float64], unit: str, si: str) -> NDArray[np.float64]:
+    """Return values in the SI unit `si` in another unit of the same quantity: the inverse of `in_si`.
+
+    >>> from_si(np.array([0.0]), "compass", "rad")
+    array([90.])
+    """
+    if unit == COMPASS:
+        return np.asarray(90.0 - np.degrees(values))
+    return values / (factor(unit, si) or 1.0)
 
 
 def si_of(unit: str) -> str:
@@ -87,7 +99,7 @@ def chosen_units(words: Iterable[str]) -> dict[str, str]:
     chosen: dict[str, str] = {}
     for word in words:
         name, _, unit = word.rpartition("=")
-        if not name or (factor(unit) is None and unit not in ("1", COMPASS)):
+        if not name or (factor(unit) is None and unit not in (AS_IT_IS, COMPASS)):
             units = ", ".join((*(one for kind in UNITS.values() for one in kind), COMPASS))
             raise NoSource(f"--unit {word!r} must be NAME=UNIT, where UNIT is one of {units}")
         chosen[name] = NAMES.get(unit.lower(), unit)

@@ -210,7 +210,7 @@ class ModelSet:
             one_step = OneStep.of_tensors(tensors) if model_config.mode == ONE_STEP else None
             stands = int(about.get("stands", 0))
         except Exception as error:  # whatever a hostile file makes a parser raise
-            raise BadModel(f"no model set: {error!r}") from error
+            raise BadModel(f"no model set: {type(error).__name__}: {error}") from error
         if not robot.accepts_layout(about.get("layout")):
             raise BadModel(f"the model set is for another layout of {robot.name}: make it again from data")
         layout = "" if about["layout"] == robot.layout() else str(about["layout"])
@@ -249,6 +249,11 @@ class ModelSet:
         ModelSet('ground', residual, direct, version 'ade8bf47fe17', at most 0.43 % of plans outside)
         """
         path = Path(source)
+        if path.suffix == ".toml":
+            raise BadModel(
+                f"{path} is a description: give the model set that `brakeline certify {path} --use` wrote, "
+                "such as data/NAME/residual-one-step.safetensors"
+            )
         if isinstance(source, str) and not path.suffix and not path.exists():
             path = SHIPPED / f"{source}.model.safetensors"
             if not path.is_file():

@@ -11,7 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -19,12 +19,15 @@ from rich.console import Console
 
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
-from brakeline.deploy.cli import COMMANDS, command_class, main
+from brakeline.deploy.cli import COMMANDS, command_class, main, reason
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
+from brakeline.deploy.commands.pretrain_command import PretrainCommand
 from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
+from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.errors import BadScan
 from brakeline.logs.figure_tables import analyse
+from brakeline.logs.run_groups import METHOD_COLORS
 from brakeline.logs.segment import open_segment
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.range_image import RangeImage
@@ -64,6 +67,11 @@ STATED = {
         ("evaluate ground --arena ballroom", "there are: crossing, default, dense"),
         ("evaluate ground --policy [bold]", "no policy is called '[bold]' and no such file exists; there are: trained"),
         ("analyse {folder}/none", "no log at"),
+        (f"analyse {FILE}", "is not an MCAP file"),
+        (f"certify --data {FILE}", "`brakeline import` reads CSV"),
+        ("import", "there is no log to import"),
+        ("compare ground --table --results {folder}/none", "none: there are no results of ground"),
+        ("robot new {folder}/none/my.toml", "none/my.toml': make the folder"),
         ("certify --data {folder}/none.mcap", "no log at"),
         ("certify --data nothere.safetensors", "no data set at nothere.safetensors"),  # it is not recorded anew
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
@@ -125,6 +133,11 @@ def test_a_read_only_folder_is_an_error_that_says_where_to_write(command, monkey
     status, out, err = command(*words.format(log=log, robot=FILE).split())
     assert status == 1 and "Read-only file system" in err, out + err
     assert "folder in which you may write" in err and "BRAKELINE_DATA" in err and not [*folder.iterdir()]
+
+
+def test_a_file_without_permission_is_an_error_for_reading_and_for_writing():
+    text = reason(PermissionError(errno.EACCES, os.strerror(errno.EACCES), "secret.mcap"))
+    assert "Permission denied: 'secret.mcap'. To read it" in text and "folder in which you may write" in text
 
 
 @pytest.mark.parametrize("words", ["train --method prayer", "evaluate --certificate hope", "certify --mode loud"])
@@ -303,6 +316,8 @@ def test_a_scan_is_loaded_from_a_file(tmp_path):
 def test_every_method_of_the_service_can_be_chosen_and_named_in_a_configuration():
     assert get_args(Method) == (*methods.METHODS, "none")
     assert model_config.METHODS == methods.METHODS
+    rivals = get_type_hints(PretrainCommand)["method"]
+    assert get_args(rivals) == tuple(methods.RIVALS) and METHODS.keys() <= METHOD_COLORS.keys()
 
 
 # --- help and typing errors --------------------------------------------------------------------------------------
@@ -381,7 +396,8 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
     status, out, _ = command("robot", "new", path)
     assert status == 0 and f"robot check {path}" in out.replace("\n", "") and 'name = "rover"' in path.read_text()
     status, out, _ = command("robot", "check", path)
-    assert status == 0 and "no mistake" in out
+    assert status == 0 and "no mistake" in out and "collect" not in out, "nothing simulates it"
+    assert "brakeline collect ground" in command("robot", "check", "ground")[1]
     status, _, err = command("robot", "new", path)
     assert status == 1 and "exists" in err
     new = path.read_text()

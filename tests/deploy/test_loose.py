@@ -59,6 +59,7 @@ def test_certify_use_refuses_a_loose_model_set_and_writes_nothing(few, command):
 
 def test_certify_use_writes_a_model_set_with_an_accepted_bound(certified, few):
     assert ModelSet.load(model_of(few)).about["bound_plan"] == f"{certified['residual']['bound_plan']:.6g}"
+    assert certified["residual"]["in_use"] == str(model_of(few)), "the path that a program loads"
 
 
 def test_certify_makes_a_model_set_in_real_time_of_a_file_and_lets_more_plans_leave_it(

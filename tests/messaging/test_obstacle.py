@@ -150,6 +150,8 @@ NAN, INF = float("nan"), float("inf")
         ("size", (BOX, (0, 0), (1,))),
         ("size", (CYLINDER, (0, 0, 0), (1,))),
         ("size", (WALL, (0, 0), (1,))),
+        ("size", (CYLINDER, (0, 0), 0.1)),
+        ("position", (CYLINDER, 1.0, (0.1,))),
     ],
 )
 def test_what_is_no_obstacle_in_the_plane_is_refused_by_its_field(field, arguments):

@@ -139,6 +139,19 @@ def test_all_mistakes_are_told_at_once():
     assert {"period", "state.x.unit", "plan"} <= {field for field, _ in caught.value.problems}
 
 
+@pytest.mark.parametrize("rule", ["rmap", 3, [0.5, "x", 0.0], {"speed": "x"}])
+def test_a_wrong_stop_rule_is_one_mistake_in_words_of_the_file(rule):
+    with pytest.raises(BadDescription) as caught:
+        robot_from_description(changed("input", "speed", "stop", rule))
+    ((field, text),) = caught.value.problems
+    assert field == "input.speed.stop" and "'ramp', 'hold', fractions" in text and repr(rule) in text
+
+
+def test_a_description_that_is_no_table_is_refused():
+    with pytest.raises(BadDescription, match="dictionary"):
+        robot_from_description([])
+
+
 VALUES = (
     st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5) | st.lists(st.floats(), max_size=3)
 )
@@ -187,7 +200,7 @@ def test_a_file_is_found_by_its_path_and_never_by_its_name(tmp_path):
     with pytest.raises(UnknownRobot, match=r"nowhere\.toml"):
         robot_named(str(tmp_path / "nowhere.toml"))
     (tmp_path / "broken.toml").write_text("name = ")
-    with pytest.raises(BadDescription, match="not TOML"):
+    with pytest.raises(BadDescription, match=r"description:\n  not TOML"):
         robot_named(str(tmp_path / "broken.toml"))
 
 
@@ -216,6 +229,8 @@ def test_a_task_says_what_is_wrong_in_it(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
+        ("progress = 20.0", "progres = 20.0", r"reward\.progres: unknown: check its spelling"),
+        ("half_width = 2.5", "", r"arenas\.default\.half_width: missing"),
         ("progress = 20.0", "progress = nan", r"reward: progress = nan is not finite"),
         ("progress = 20.0", "collision = 100.0", r"reward: collision = 100\.0 is not 0 or less"),
         ("step_limit = 300", "step_limit = 0", r"arenas\.default: step_limit = 0 is not 1 or more"),

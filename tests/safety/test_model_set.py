@@ -125,6 +125,8 @@ def test_a_model_set_is_read_from_the_file_that_it_was_saved_in_and_garbage_is_r
     for bad in (b"", b"garbage", whole[:-8], whole[: len(whole) // 2], b"\xff" * 100):
         with pytest.raises(BadModel, match="no model set"):
             ModelSet.decode(bad)
+    with pytest.raises(BadModel, match=r"my\.toml is a description: give the model set that `brakeline certify"):
+        ModelSet.load("my.toml")
     path = tmp_path / "model.safetensors"
     with pytest.raises(BadModel, match=str(path)):
         ModelSet.load(path)

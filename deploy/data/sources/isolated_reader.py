@@ -167,6 +167,8 @@ def read_here(reader: str, path: Path) -> list[Table]:
         tables: list[Table] = getattr(importlib.import_module(f"{__package__}.{module}"), name)(path)
     except (NoSource, MemoryError, ModuleNotFoundError):
         raise
+    except PermissionError as error:
+        raise NoSource(f"{path}: you may not read it ({error}). Give yourself the permission, or copy it") from error
     except Exception as error:  # parsers raise many types
         raise NoSource(
             f"{path}: its reader stopped with {type(error).__name__}: {error}. The file is damaged: check it with the "

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
-from brakeline.deploy.data.unit_table import in_si, unknown_unit
+from brakeline.deploy.data.unit_table import AS_IT_IS, in_si, unknown_unit
 from brakeline.errors import NoSource
 from brakeline.messaging.robot import Robot
 
@@ -117,7 +117,7 @@ def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Place
     if problems:
         available = "; ".join(f"{t.name or 'columns'}: {', '.join(t.columns)}" for t in tables) or "nothing"
         raise NoSource(
-            "the source does not contain every column of the robot's description:\n  "
+            f"the source does not contain every column of the description of {robot.name}:\n  "
             + "\n  ".join(problems)
             + f"\nThe source contains: {available}. Name a field with --map NAME=TABLE/FIELD."
             + "".join(f"\n{note}" for note in notes_of(tables))
@@ -169,7 +169,7 @@ def _in_unknown_units(candidates: Sequence[Place]) -> list[str]:
 def _in_unit(place: Place, name: str, given: str, unit: str) -> Place:
     """Return a place with its values in the robot's unit."""
     table, column = place
-    if not given:
+    if given in ("", AS_IT_IS):
         return place
     values = in_si(table.columns[column], given, unit)
     if values is None:

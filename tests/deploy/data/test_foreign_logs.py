@@ -204,6 +204,7 @@ def parser(tmp_path, monkeypatch):
         ("def read(path): return [bytearray(2**30)]", r"takes more than 0.5 GiB of memory.*--read-gib"),
         ("def read(path): return {}[path.name]", "its reader stopped with KeyError: 'a.log'"),
         ("def read(path): return read(path)", "its reader stopped with RecursionError"),
+        ("def read(path): raise PermissionError(13, 'Permission denied', str(path))", "you may not read it .*copy it"),
         ("import os, signal\ndef read(path): os.kill(os.getpid(), signal.SIGSEGV)", r"crashed \(SIGSEGV\)"),
         ("import os\ndef read(path): os._exit(3)", r"crashed \(status 3\)"),
     ],

@@ -154,6 +154,12 @@ def test_a_robot_without_a_recording_uses_the_model_set_that_comes_with_it(elsew
     assert len(elsewhere) == 1
 
 
+def test_an_automatic_mode_that_cannot_be_fitted_names_the_command_for_the_other(elsewhere, short):
+    simulated_recording.load_or_record(GROUND, None, 2)
+    with pytest.raises(BadData, match=r"mode direct cannot be fitted: .*`brakeline certify DESCRIPTION --use`"):
+        model_store.model_for(GROUND, ModelConfig(mode=AUTO))
+
+
 def test_the_store_makes_what_is_missing_and_only_that(elsewhere, capsys):
     model = model_store.model_for(GROUND, ModelConfig(), BOUND)
     assert data_paths.record_path(GROUND).exists() and len(elsewhere) == 1

@@ -161,6 +161,18 @@ def test_a_compass_heading_is_named_and_converted(driven, plain, tmp_path, capsy
     same(plain, imported(path, "--unit", "heading=compass"), 1e-5)
 
 
+@pytest.mark.parametrize("word", ["heading=deg", "heading=compass", "v=km/h", "speed=mm/s", "w=deg/s"])
+def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsys, word):
+    path, out = write_csv(tmp_path / "drive.csv", *driven), tmp_path / "none.safetensors"
+    text = refused(capsys, ["import", path, "--robot", FILE, "--out", out, "--unit", word])
+    assert f"already: only without --unit {word} does the motion agree" in text and not out.exists()
+
+
+def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    same(plain, imported(path, "--unit", "heading=1", "v=1"), 1e-12)
+
+
 def test_a_unit_that_does_not_fit_is_refused(driven, tmp_path, capsys):
     path = write_csv(tmp_path / "drive.csv", *driven)
     for word, said in (("v=deg", "v is in m/s"), ("v=furlong", "UNIT is one of"), ("why=deg", "must be one of x, y")):
