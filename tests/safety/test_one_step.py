@@ -122,6 +122,18 @@ def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_pr
     assert report.chosen.error < 0.5 * min(c.error for c in report.candidates if c.degree == 1)
 
 
+def test_lost_rows_at_the_start_of_a_recording_leave_five_even_folds():
+    """Twenty pieces of a second, and minutes without a loss: as whole trajectories, one fold would hold nearly all."""
+    torn, whole = driven(seed=5, trajectories=2).trajectories
+    names = ("inputs", "paths", "turned")
+    pieces = [
+        Trajectory(torn.states[i : i + 9], *(getattr(torn, name)[i : i + 8] for name in names), torn.inputs[i - 1])
+        for i in range(1, 190, 9)
+    ]
+    folds = np.bincount(samples_of(Dataset(ROBOT, (*pieces, whole))).fold)
+    assert len(pieces) > 20 and len(folds) == 5 and folds.min() > 0.15 * folds.sum()
+
+
 def test_the_stated_shares_hold_on_fresh_driving_overall_and_in_every_kind_of_driving():
     model, report = certified()
     fresh = samples_of(driven(seed=77, trajectories=40))

@@ -13,6 +13,7 @@ from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import BadData, NoSource
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.repeated_driving import repeated_driving
 from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import (
     write_bag,
@@ -124,6 +125,18 @@ def test_a_recording_counts_once_under_whatever_name(driven, from_csv, tmp_path)
         Dataset.load(tmp_path / "twice.safetensors")
     other = write_csv(tmp_path / "other.csv", *drive(seconds=60.0, seed=5))
     assert import_sources([one, other], porter()).data.periods > 1.9 * from_csv.periods
+
+
+def test_a_part_of_a_recording_and_a_later_copy_count_as_copies_too(driven):
+    time, values = driven
+    whole, part = (
+        resample([table(time[rows], values[rows])], porter(), LogOptions()).data for rows in (time > -1.0, time > 15.99)
+    )
+    twice = repeated_driving(porter(), whole.trajectories + part.trajectories)
+    assert twice is not None and twice.seconds > 40.0, "resampling rounds"
+    later = table(np.r_[time, time + time[-1] + 31.3], np.vstack([values, values]))
+    with pytest.raises(BadData, match="a copy is no evidence"):  # its heading is unwrapped on and on
+        resample([later], porter(), LogOptions())
 
 
 # --- periods out of columns --------------------------------------------------------------------------------------
