@@ -292,6 +292,16 @@ def test_each_kind_of_driving_has_its_share_outside_and_only_starts_have_a_facto
     assert SetFactors.of(plan, first, kinds, 0.05).plan == 2.0  # of the hundred rare ones, five may be outside
 
 
+def test_pieces_of_a_recording_with_many_gaps_are_no_starts_of_their_own():
+    """Otherwise no window, or few, would calibrate the sets of a robot that drives on."""
+    plan, at = np.full(3000, 0.5), np.arange(3000)
+    plan[::10] = 2.0
+    for starts, expected in ((3000, (2.0, 1.0)), (1000, (2.0, 1.0)), (700, (1.0, 2.0))):
+        plan[at >= starts] = 0.5
+        factors = SetFactors.of(plan, plan, {START: at < starts, JUMPING: at < 0}, 0.001)
+        assert (factors.plan, factors.start) == expected and factors.first == factors.plan
+
+
 def test_an_error_that_is_no_number_counts_as_outside():
     errors, widths = np.array([np.nan, 0.1, np.inf, 0.0, 0.0, 0.1]), np.array([0.2, 0.2, np.inf, 0.0, np.inf, np.nan])
     assert shares(errors, widths).tolist() == [np.inf, 0.5, np.inf, 0.0, 0.0, np.inf]

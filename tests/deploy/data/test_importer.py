@@ -177,6 +177,27 @@ def test_a_recording_at_the_robots_period_is_taken_as_it_is():
     assert lengths(made) == [99], "the first period tells the input in force"
 
 
+def test_a_state_between_two_samples_shows_nothing_of_the_input_that_follows_it():
+    """Odometry every 40 ms, 20 ms beside the inputs, as two nodes that know nothing of each other publish them."""
+    robot, rng = Porter(np.random.default_rng(0)), np.random.default_rng(1)
+    inputs = rng.uniform(porter().low(), porter().high(), (100, 2))
+    true, rows = [], []
+    for u in inputs:
+        true.append(robot.true)
+        for wait in (0.02, *(0.04,) * 4, 0.02):
+            robot.step(u, wait)
+            rows.append(robot.true)
+        rows.pop()
+    odometry = Table("/odom", 0.02 + 0.04 * np.arange(len(rows)), dict(zip(COLUMNS, np.array(rows).T, strict=False)))
+    commands = Table("/cmd", 0.2 * np.arange(len(inputs)), dict(zip(COLUMNS[5:], inputs.T, strict=True)))
+    places = {name: f"/odom/{name}" for name in COLUMNS[:5]} | {name: f"/cmd/{name}" for name in COLUMNS[5:]}
+    made = resample([odometry, commands], porter(), LogOptions(fields=places)).data.joined()
+    (t,) = made.trajectories
+    first = int(np.flatnonzero((inputs == t.inputs[0]).all(1))[0])
+    off = np.abs(t.states[:-1] - np.array(true)[first : first + len(t.inputs)])
+    assert len(t.inputs) > 95 and off[:, 3].max() < 0.02 and off[:, 4].max() < 0.05
+
+
 def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     time, values = steady()
     kept = np.r_[0:30, 31:101]
