@@ -138,7 +138,7 @@ def _unbraked_ranges(one: ValueRange) -> list[str]:
 
 
 def _windows_missing(plans: int, free: int, linear: bool) -> list[str]:
-    """Return what is missing. linear: `certify` fits a linear mode by default, for which windows of plans are better."""
+    """Return what is missing. linear: `certify` fits a linear mode by default, for which plan windows are better."""
     enough = math.ceil(ModelConfig().fewest / (1.0 - HELD_OUT))
     if free < enough:
         return [f"only {free} windows of a plan's length, but about {enough} are needed: record more"]
@@ -244,7 +244,7 @@ def _plans_for(violations: int, plans: int, limit: float) -> int | None:
 
 
 def _kinds_left(report: ValidationReport) -> tuple[ViolationGroup, ...]:
-    """Return the violations of mode one-step, which knows the regime of each plan but not the part that left its set."""
+    """Return the violations of mode one-step, which knows the regime of each plan, not the part outside."""
     left = (g for g in report.groups if g.name in REGIMES and g.violations)
     return tuple(ViolationGroup("", g.name, g.violations, g.plans, g.excess) for g in left)
 

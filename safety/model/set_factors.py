@@ -35,8 +35,8 @@ class SetFactors:
 
         Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude. For all
         driving, `plan` would have to be several times as large. No plan of the filter jumps like this, so only `first`
-        covers it. Many lost rows cut a recording into pieces of a few plans' lengths. Then most windows count as starts,
-        although the robot drove on, and all of them decide about both parts.
+        covers it. Many lost rows cut a recording into pieces of a few plans' lengths. Then most windows are starts,
+        although the robot drove on, and all of them decide about all sets.
 
         Args:
             plan (T,), first (T,): scores of the windows, for both parts.
