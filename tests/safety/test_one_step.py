@@ -125,10 +125,9 @@ def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_pr
 def test_lost_rows_at_the_start_of_a_recording_leave_five_even_folds():
     """Twenty pieces of a second, and minutes without a loss: as whole trajectories, one fold would hold nearly all."""
     torn, whole = driven(seed=5, trajectories=2).trajectories
-    names = ("inputs", "paths", "turned")
     pieces = [
-        Trajectory(torn.states[i : i + 9], *(getattr(torn, name)[i : i + 8] for name in names), torn.inputs[i - 1])
-        for i in range(1, 190, 9)
+        Trajectory(torn.states[i : i + 9], torn.inputs[rows], torn.paths[rows], torn.turned[rows], torn.inputs[i - 1])
+        for i, rows in ((i, slice(i, i + 8)) for i in range(1, 190, 9))
     ]
     folds = np.bincount(samples_of(Dataset(ROBOT, (*pieces, whole))).fold)
     assert len(pieces) > 20 and len(folds) == 5 and folds.min() > 0.15 * folds.sum()
