@@ -54,7 +54,7 @@ class CertifyCommand:
     """Let this share of the recorded plans leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""
     until_held: bool = False
-    """Widen each error bound until no held-out plan leaves its set, and no further."""
+    """Widen each error bound of the linear modes until no held-out plan leaves its set, and no further."""
     last: int = 20_000
     """Take this many steps from the end of a log."""
     use: bool = False
@@ -78,6 +78,10 @@ class CertifyCommand:
         results: dict[str, Any] = {}
         notes: list[str] = []
         forms = self._forms(data.robot)
+        if self.until_held and (RESIDUAL, ONE_STEP) in forms:
+            raise ValueError(
+                "--until-held is for --mode direct and recursion; in mode one-step, a smaller --outside widens the sets"
+            )
         with under_way("certifying", PERCENT * len(forms)) as advance:
             for kind, mode in forms:
                 advance(0, f"certifying {kind}, {mode}")
@@ -91,7 +95,7 @@ class CertifyCommand:
                 except Unsupported as error:
                     figures = {"refused": str(error)}
                     errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
-                    if not self.few:
+                    if not self.few and mode != ONE_STEP:  # which needs no number of windows
                         errors.print("give --few to certify minutes of driving", markup=False)
                 else:
                     models.append((model, report))

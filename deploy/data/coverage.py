@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import at_bound
-from brakeline.safety.model.error_causes import AFTER, BOTH, FAST, PATH, STANDING, TURNING
+from brakeline.safety.model.error_causes import AFTER, BOTH, FAST, PATH, REGIMES, STANDING, TURNING, ViolationGroup
 from brakeline.safety.model.fitting import FEWEST_STOPS
-from brakeline.safety.model.model_set import DIRECT, ModelConfig
+from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig
 from brakeline.safety.model.stated_bound import plans_needed
 from brakeline.safety.model.turning_in_place import standing_limits
 from brakeline.safety.model.validation import ValidationReport, upper_bound
@@ -86,7 +87,7 @@ def coverage(data: Dataset) -> Coverage:
     missing = _stops_missing(robot, stops, rested)
     missing += [text for one in seen for text in _unreached_bounds(one)]
     missing += [text for one in braked for text in _unbraked_ranges(one)]
-    missing += _windows_missing(plans, free)
+    missing += _windows_missing(plans, free, linear=bool(robot.feedback))
     return Coverage((*seen, *followers), stops, tuple(braked), plans, free, tuple(missing))
 
 
@@ -136,11 +137,12 @@ def _unbraked_ranges(one: ValueRange) -> list[str]:
     return [above] * (one.most < one.high - room) + [below] * (one.low < 0.0 and one.least > one.low + room)
 
 
-def _windows_missing(plans: int, free: int) -> list[str]:
+def _windows_missing(plans: int, free: int, linear: bool) -> list[str]:
+    """Return what is missing. linear: `certify` fits a linear mode by default, for which plan windows are better."""
     enough = math.ceil(ModelConfig().fewest / (1.0 - HELD_OUT))
     if free < enough:
         return [f"only {free} windows of a plan's length, but about {enough} are needed: record more"]
-    if plans < enough:
+    if linear and plans < enough:
         return [
             f"only {plans} windows brake as the filter's plans do; with about {enough} the sets become narrower than "
             "with free windows: hold an input for one period, then stop by the description's rules"
@@ -199,19 +201,25 @@ def _too_loose(report: ValidationReport, data: Dataset) -> list[str]:
             f"{plans}{how}"
         ]
     share = f"{violations / plans:.1%}"
-    driving = dict.fromkeys(one.regime for one in report.leaving if one.part not in ABOUT_PARTS)
-    parts = {one.part for one in report.leaving}
+    leaving = report.leaving or _kinds_left(report)
+    driving = dict.fromkeys(one.regime for one in leaving if one.part not in ABOUT_PARTS)
+    parts = {one.part for one in leaving}
+    wider = (
+        "`certify` with a smaller --outside lets fewer of the plans leave them, except those with jumping inputs"
+        if report.mode == ONE_STEP
+        else f"`certify --until-held` widens each envelope {report.excess:.2g} times, so that none of "
+        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; with "
+        f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times"
+    )
     return [
-        f"{bounded}; {violations} of {plans} held-out plans ({share}) left their sets: {_where(report)}",
+        f"{bounded}; {violations} of {plans} held-out plans ({share}) left their sets: {_where(leaving)}",
         f"more minutes like these do not help: the share of {share} is above the limit of {percent(limit)}"
         if wanted is None
         else f"{more} more minutes like these, {wanted} held-out plans, reach the limit only if no larger share than "
         f"{share} of them leaves its sets",
         *(f"{regime}: {_remedy(data.robot, regime)}" for regime in driving),
         *(text for part, text in ABOUT_PARTS.items() if part in parts),
-        f"or wider sets: `certify --until-held` widens each envelope {report.excess:.2g} times, so that none of "
-        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; with "
-        f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times",
+        f"or wider sets: {wider}",
     ]
 
 
@@ -235,13 +243,20 @@ def _plans_for(violations: int, plans: int, limit: float) -> int | None:
     )
 
 
-def _where(report: ValidationReport) -> str:
+def _kinds_left(report: ValidationReport) -> tuple[ViolationGroup, ...]:
+    """Return the violations of mode one-step, which knows the regime of each plan, not the part outside."""
+    left = (g for g in report.groups if g.name in REGIMES and g.violations)
+    return tuple(ViolationGroup("", g.name, g.violations, g.plans, g.excess) for g in left)
+
+
+def _where(leaving: Sequence[ViolationGroup]) -> str:
     """Describe the largest groups of violations, each with the number of plans in its regime."""
     shown = [
-        f"{one.plans} by {one.part} while {one.regime} (of {one.of} plans there; up to {one.excess:.2g} × its bound)"
-        for one in report.leaving[:MOST_SHOWN]
+        f"{one.plans}{f' by {one.part}' if one.part else ''} while {one.regime} (of {one.of} plans there; up to "
+        f"{one.excess:.2g} × its bound)"
+        for one in leaving[:MOST_SHOWN]
     ]
-    rest = sum(one.plans for one in report.leaving[MOST_SHOWN:])
+    rest = sum(one.plans for one in leaving[MOST_SHOWN:])
     return ", ".join(shown + ([f"{rest} elsewhere"] if rest else []))
 
 

@@ -30,6 +30,7 @@ MOSTLY = 0.9  # share of a period: an input held for longer is the period's inpu
 FEWEST_PERIODS = 5  # shorter trajectories are dropped
 LONGEST, FEWEST_PARTS = 300, 60  # periods per trajectory; number of trajectories, so that 30 % can be held out
 MAX_SAMPLES = 20  # positions per period
+SAME = 1e-6  # s: closer times are the same, but for rounding
 PHASES = 40  # bins of the phase at which inputs change
 
 
@@ -109,7 +110,8 @@ def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list
     if count < 1:
         return [], np.zeros(0), 0
     edges: Array = np.asarray(begin + period * np.arange(count + 1), float)
-    states = np.column_stack([np.interp(edges, time, values) for time, values in r.states])
+    changes = np.unique(np.concatenate([time[1:][np.diff(values) != 0.0] for time, values in r.inputs]))
+    states = np.column_stack([_at_edges(edges, time, values, changes) for time, values in r.states])
     fine: Array = np.asarray(begin + period / samples * np.arange(count * samples + 1), float)
     d = robot.path_dim
     at = np.column_stack([np.interp(fine, time, values) for time, values in r.states[:d]])
@@ -135,6 +137,29 @@ def _trajectories(r: GapFreeRecording, robot: Robot, samples: int) -> tuple[list
             within = None if headings is None else headings[rows]
             pieces.append(Trajectory(states[i + 1 : j + 1], inputs[rows], paths[rows], turned[rows], inputs[i], within))
     return pieces, uneven.astype(float), int((~good).sum())
+
+
+def _at_edges(edges: Array, time: Array, values: Array, changes: Array) -> Array:
+    """Return the values (T,) at the edges of periods, from the samples around each edge.
+
+    If an input changes between these samples, the later one shows what the new input did. So the state at the start of
+    a period would contain its input, which no measurement at that time does. Such an edge has the values that the two
+    samples before it predict.
+
+    Args:
+        edges (T,), time (S,), changes (C,): times in s; of the samples, and of the changes of any input.
+        values (S,): samples.
+    """
+    found = np.interp(edges, time, values)
+    if len(time) < 3:
+        return found
+    last = np.clip(np.searchsorted(time, edges, "right") - 1, 1, len(time) - 2)
+    between = np.searchsorted(changes, time[last + 1] - SAME) > np.searchsorted(changes, time[last] + SAME)
+    late = np.flatnonzero(between & (edges > time[last] + SAME) & (edges < time[last + 1] - SAME))
+    at = last[late]
+    slope = (values[at] - values[at - 1]) / (time[at] - time[at - 1])
+    found[late] = values[at] + slope * (edges[late] - time[at])
+    return found
 
 
 def _phase(r: GapFreeRecording, period: float) -> float:

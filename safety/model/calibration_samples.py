@@ -45,13 +45,15 @@ class Samples:
 def samples_of(data: Dataset) -> Samples:
     """Cut recorded driving into periods and windows, each with its fold.
 
-    With many trajectories, a fold consists of whole trajectories; otherwise, of one block of each trajectory.
+    With many trajectories, none of which is longer than a fold, a fold consists of whole trajectories; otherwise, of
+    one block of each trajectory.
 
     Raises:
         BadData: a fold holds no window; the message says how much driving is missing.
     """
     robot, N = data.robot, data.robot.horizon
-    whole = len(data.trajectories) >= 4 * FOLDS
+    longest = max(len(t.inputs) for t in data.trajectories)
+    whole = len(data.trajectories) >= 4 * FOLDS and longest * FOLDS <= data.periods  # few gaps leave one long rest
     parts: list[tuple[NDArray[Any], ...]] = []
     for number, t in enumerate(data.trajectories):
         periods = len(t.inputs)

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 SHORTEST, FEWEST_ROWS = 3.0, 20  # s and periods: shorter equal stretches do not count, such as equal starts
 LEAST = 10.0  # s of equal driving, in all, that make a copy
+DIGITS = 8  # of the largest value of a column: a copy with other stamps differs by rounding when it is resampled
+Array = NDArray[np.float64]
 Words = NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
 class RepeatedDriving:
-    """Driving that two trajectories share, to the bit, and its length in all trajectories."""
+    """Driving that two trajectories share, but for rounding, and its length in all trajectories."""
 
     first: int  # index of the trajectory that holds it first
     second: int  # index of the one that holds it again
@@ -32,15 +34,17 @@ class RepeatedDriving:
 def repeated_driving(robot: Robot, trajectories: Sequence[Trajectory]) -> RepeatedDriving | None:
     """Return the driving that occurs more than once; None if there is none.
 
-    Two stretches are the same if all states and inputs of `SHORTEST` seconds are equal to the bit and the state changes
-    in each of these periods. No sensor repeats its noise; a robot that stands still may repeat its state.
+    Two stretches are the same if all states and inputs of `SHORTEST` seconds are equal in `DIGITS` digits and the state
+    changes in each of these periods. No sensor repeats its noise; a robot that stands still may repeat its state.
     """
     length = max(FEWEST_ROWS, math.ceil(SHORTEST / robot.period))
     if sum(len(t.inputs) for t in trajectories) < 2 * length:
         return None
-    rows = np.concatenate([np.hstack([t.states[1:], t.inputs]) for t in trajectories])
+    states = _rounded([_turned_once(robot, t.states) for t in trajectories])
+    inputs = _rounded([t.inputs for t in trajectories])
+    rows = np.concatenate([np.hstack([x[1:], u]) for x, u in zip(states, inputs, strict=True)])
     words = np.ascontiguousarray(rows + 0.0).view(np.uint64)  # + 0.0: no negative zero
-    moves = np.concatenate([(np.diff(t.states, axis=0) != 0.0).any(1) for t in trajectories])
+    moves = np.concatenate([(np.diff(x, axis=0) != 0.0).any(1) for x in states])
     owner = np.repeat(np.arange(len(trajectories)), [len(t.inputs) for t in trajectories])
     chain = _chains(trajectories)[owner]
     still = np.concatenate([[0], np.cumsum(~moves)])
@@ -76,6 +80,22 @@ def _chains(trajectories: Sequence[Trajectory]) -> NDArray[np.intp]:
     """Number the trajectories (T,); one that begins where the one before it ends has the same number."""
     goes_on = [np.array_equal(one.states[-1], two.states[0]) for one, two in pairwise(trajectories)]
     return np.cumsum([0, *(not on for on in goes_on)])
+
+
+def _turned_once(robot: Robot, states: Array) -> Array:
+    """Return states (T, n) with the heading in [0, 2 pi): an unwrapped heading depends on the driving before."""
+    if robot.heading is None:
+        return states
+    states = states.copy()
+    states[:, robot.heading] %= 2.0 * np.pi
+    return states
+
+
+def _rounded(parts: Sequence[Array]) -> list[Array]:
+    """Return arrays (T, n) of one quantity with `DIGITS` digits after the largest value of each column."""
+    largest = np.max([np.abs(part).max(0) for part in parts], axis=0)
+    largest[largest <= 0.0] = 1.0
+    return [np.round(part / largest, DIGITS) for part in parts]
 
 
 def _window_values(words: Words, length: int) -> Words:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.safety.model.driving_kinds import JUMPING, START
 
+MOST_STARTS = 0.25  # of the windows: with more, what is left would not calibrate the sets of a robot that drives on
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -34,7 +35,8 @@ class SetFactors:
 
         Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude. For all
         driving, `plan` would have to be several times as large. No plan of the filter jumps like this, so only `first`
-        covers it.
+        covers it. Many lost rows cut a recording into pieces of a few plans' lengths. Then most windows are starts,
+        although the robot drove on, and all of them decide about all sets.
 
         Args:
             plan (T,), first (T,): scores of the windows, for both parts.
@@ -42,7 +44,7 @@ class SetFactors:
             outside: the share.
             same: whether both parts have the same factor.
         """
-        begun = ~kinds[START]
+        begun = ~kinds[START] | (kinds[START].mean() > MOST_STARTS)
         others = [np.ones(len(plan), dtype=bool), *(kind for name, kind in kinds.items() if name != START)]
         for_plan = max(_quantile(plan[kind & begun & ~kinds[JUMPING]], outside) for kind in others)
         for_first = max(_quantile(first[kind & begun], outside) for kind in others)

@@ -122,6 +122,17 @@ def test_four_minutes_of_free_driving_give_sets_a_quarter_as_wide_as_a_linear_pr
     assert report.chosen.error < 0.5 * min(c.error for c in report.candidates if c.degree == 1)
 
 
+def test_lost_rows_at_the_start_of_a_recording_leave_five_even_folds():
+    """Twenty pieces of a second, and minutes without a loss: as whole trajectories, one fold would hold nearly all."""
+    torn, whole = driven(seed=5, trajectories=2).trajectories
+    pieces = [
+        Trajectory(torn.states[i : i + 9], torn.inputs[rows], torn.paths[rows], torn.turned[rows], torn.inputs[i - 1])
+        for i, rows in ((i, slice(i, i + 8)) for i in range(1, 190, 9))
+    ]
+    folds = np.bincount(samples_of(Dataset(ROBOT, (*pieces, whole))).fold)
+    assert len(pieces) > 20 and len(folds) == 5 and folds.min() > 0.15 * folds.sum()
+
+
 def test_the_stated_shares_hold_on_fresh_driving_overall_and_in_every_kind_of_driving():
     model, report = certified()
     fresh = samples_of(driven(seed=77, trajectories=40))
@@ -278,6 +289,16 @@ def test_each_kind_of_driving_has_its_share_outside_and_only_starts_have_a_facto
     assert (factors.plan, factors.first, factors.start) == (2.0, 1.0, 1.5)
     assert factors.shares(plan, first, kinds).max() == 1.0
     assert SetFactors.of(plan, first, kinds, 0.05).plan == 2.0  # of the hundred rare ones, five may be outside
+
+
+def test_pieces_of_a_recording_with_many_gaps_are_no_starts_of_their_own():
+    """Otherwise no window, or few, would calibrate the sets of a robot that drives on."""
+    plan, at = np.full(3000, 0.5), np.arange(3000)
+    plan[::10] = 2.0
+    for starts, expected in ((3000, (2.0, 1.0)), (1000, (2.0, 1.0)), (700, (1.0, 2.0))):
+        plan[at >= starts] = 0.5
+        factors = SetFactors.of(plan, plan, {START: at < starts, JUMPING: at < 0}, 0.001)
+        assert (factors.plan, factors.start) == expected and factors.first == factors.plan
 
 
 def test_an_error_that_is_no_number_counts_as_outside():

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands.certify_command import CertifyCommand
 from brakeline.deploy.data.certification import MAX_INFLATION, certify
-from brakeline.deploy.data.coverage import recording_advice
+from brakeline.deploy.data.coverage import coverage, recording_advice
+from brakeline.safety.model.dataset import Trajectory
 from brakeline.safety.model.error_causes import BOTH, FAST, SLOW, STANDING, TURNING, ViolationGroup, regimes
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
@@ -99,6 +101,29 @@ def test_few_cruises_are_missing_from_the_data_of_a_policy_that_will_cruise(held
     assert line.startswith("only 0 plans with turn rate at its bound (of") and "speed at" not in line
     enough = (*groups, replace(groups[0], name="turn rate at its bound"))
     assert not recording_advice(replace(held, mode="one-step", groups=enough), loose)
+
+
+def test_mode_one_step_names_the_kinds_that_left_their_sets_and_the_option_that_widens_them(held, data):
+    kinds = ("start of an episode", 9, 2), (FAST, 300, 5), (STANDING, 200, 0)
+    groups = tuple(GroupStatement(name, n, n, left, 0.0, 1.0, 1.3, 0, 1.0) for name, n, left in kinds)
+    bad = replace(held, mode="one-step", windows=600, violations=5, bound_plan=upper_bound(5, 600), groups=groups)
+    advice = "\n".join(recording_advice(bad, data))
+    assert "5 of 600 held-out plans (0.8%) left their sets: 5 while fast (of 300 plans there; up to 1.3 ×" in advice
+    assert "--until-held" not in advice and "smaller --outside" in advice and "lower the bounds of speed" in advice
+
+
+def test_options_and_advice_of_the_linear_modes_are_not_for_mode_one_step(data, tmp_path, capsys):
+    path = tmp_path / "data.safetensors"
+    data.save(path)
+    with pytest.raises(ValueError, match=r"--until-held is for --mode direct and recursion.*smaller --outside"):
+        CertifyCommand(robot="ground", data=path, until_held=True).run()
+    assert not any("brake as the filter" in text for text in coverage(data).missing), "mode one-step uses all driving"
+    first = data.trajectories[0]
+    short = Trajectory(first.states[:13], first.inputs[:12], first.paths[:12], first.turned[:12])
+    replace(data, trajectories=(short,)).save(path)
+    assert CertifyCommand(robot="ground", data=path).run() == 1
+    said = capsys.readouterr().err
+    assert "one-step: refused:" in said and "--few" not in said, "more driving is missing, whatever the limits"
 
 
 def test_how_it_drove_is_told_by_inputs_and_speeds():

@@ -13,6 +13,7 @@ from brakeline.deploy.data.resample import resample
 from brakeline.deploy.data.sources.source_table import Table
 from brakeline.errors import BadData, NoSource
 from brakeline.safety.model.dataset import Dataset
+from brakeline.safety.model.repeated_driving import repeated_driving
 from brakeline.safety.model.windows import _off_chord
 from tests.deploy.data.bags import (
     write_bag,
@@ -126,6 +127,18 @@ def test_a_recording_counts_once_under_whatever_name(driven, from_csv, tmp_path)
     assert import_sources([one, other], porter()).data.periods > 1.9 * from_csv.periods
 
 
+def test_a_part_of_a_recording_and_a_later_copy_count_as_copies_too(driven):
+    time, values = driven
+    whole, part = (
+        resample([table(time[rows], values[rows])], porter(), LogOptions()).data for rows in (time > -1.0, time > 15.99)
+    )
+    twice = repeated_driving(porter(), whole.trajectories + part.trajectories)
+    assert twice is not None and twice.seconds > 40.0, "resampling rounds"
+    later = table(np.r_[time, time + time[-1] + 31.3], np.vstack([values, values]))
+    with pytest.raises(BadData, match="a copy is no evidence"):  # its heading is unwrapped on and on
+        resample([later], porter(), LogOptions())
+
+
 # --- periods out of columns --------------------------------------------------------------------------------------
 
 
@@ -162,6 +175,27 @@ def test_a_recording_at_the_robots_period_is_taken_as_it_is():
     states = np.vstack([t.states[:-1] for t in made.data.trajectories] + [made.data.trajectories[-1].states[-1:]])
     assert np.allclose(states, values[1:, :5]) and made.report.samples == 1
     assert lengths(made) == [99], "the first period tells the input in force"
+
+
+def test_a_state_between_two_samples_shows_nothing_of_the_input_that_follows_it():
+    """Odometry every 40 ms, 20 ms beside the inputs, as two nodes that know nothing of each other publish them."""
+    robot, rng = Porter(np.random.default_rng(0)), np.random.default_rng(1)
+    inputs = rng.uniform(porter().low(), porter().high(), (100, 2))
+    true, rows = [], []
+    for u in inputs:
+        true.append(robot.true)
+        for wait in (0.02, *(0.04,) * 4, 0.02):
+            robot.step(u, wait)
+            rows.append(robot.true)
+        rows.pop()
+    odometry = Table("/odom", 0.02 + 0.04 * np.arange(len(rows)), dict(zip(COLUMNS, np.array(rows).T, strict=False)))
+    commands = Table("/cmd", 0.2 * np.arange(len(inputs)), dict(zip(COLUMNS[5:], inputs.T, strict=True)))
+    places = {name: f"/odom/{name}" for name in COLUMNS[:5]} | {name: f"/cmd/{name}" for name in COLUMNS[5:]}
+    made = resample([odometry, commands], porter(), LogOptions(fields=places)).data.joined()
+    (t,) = made.trajectories
+    first = int(np.flatnonzero((inputs == t.inputs[0]).all(1))[0])
+    off = np.abs(t.states[:-1] - np.array(true)[first : first + len(t.inputs)])
+    assert len(t.inputs) > 95 and off[:, 3].max() < 0.02 and off[:, 4].max() < 0.05
 
 
 def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
