@@ -116,6 +116,7 @@ import signal
 import threading
 from brakeline.messaging.stop_signals import stop_on_signals
 signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the rest of a volley comes when it is through
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
 with stop_on_signals(threading.Event()) as stop:
     print("ready", flush=True)
     {wait}
