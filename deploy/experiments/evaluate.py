@@ -51,6 +51,13 @@ class Evaluation:
     backend: Backend = "single"  # batch: many robots at once, each alone (deploy/experiments/batch_evaluation.py)
     accept_bound: float | None = None  # the largest stated bound that is accepted; None: the robot's own limit
 
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or self.seed < 0 or self.fleet < 0:
+            raise ValueError(
+                "an evaluation has at least 1 episode, a seed of at least 0 and a fleet of at least 0 robots, not "
+                f"{self.episodes}, {self.seed} and {self.fleet}"
+            )
+
 
 def in_process(model: Model, accept_bound: float | None = None) -> Ask:
     """Return a function that calls the core of the safety service directly.

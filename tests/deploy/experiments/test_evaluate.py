@@ -80,3 +80,9 @@ def test_what_was_one_question_is_asked_again_as_one():
     assert len(_joint_requests(waiting, *one("b", 2))) == 2 and not waiting
     alone = pb.Request(actor="a"), pb.Reply()
     assert _joint_requests(waiting, *alone) == [alone]
+
+
+@pytest.mark.parametrize("change", [{"episodes": 0}, {"seed": -1}, {"fleet": -2}])
+def test_an_evaluation_of_nothing_is_refused(change):
+    with pytest.raises(ValueError, match="at least 1 episode"):
+        replace(TRAINED, **change)
