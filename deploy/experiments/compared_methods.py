@@ -56,7 +56,7 @@ METHODS: dict[str, ComparedMethod] = {
     NONE: ComparedMethod("TD3", NONE, NOTHING, NOTHING, "Fujimoto et al. 2018"),
     "lagrange": ComparedMethod(
         *("TD3-Lagrange", NONE, NOTHING, NOTHING, "Ray et al. 2019; Tessler et al. 2019"),
-        td3={"cost_limit": 0.01},
+        td3={"cost_limit": 0.01, "multiplier_rate": 1.0},
         tuned="multiplier_rate",
         robots=BATCHES,
     ),
