@@ -151,7 +151,7 @@ def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
         (results / "ground" / f"{job.name}.json").write_text(json.dumps({"study": configuration(job), **row}))
     text = page(results, ["ground"])
     assert "| CBF-QP | rate α [1/s] | **0.5**: A* 60 goals; greedy 20, 1 collisions |" in text
-    assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | 10 |" in text
+    assert "**30**: 118 goals, 30 collisions; 7 in training | 1 | 1 |" in text
 
 
 def test_the_best_learner_has_the_fewest_collisions_of_those_that_reach_the_goal():
