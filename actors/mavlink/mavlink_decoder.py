@@ -64,7 +64,7 @@ class MavlinkDecoder:
         self.armed = False
         self.custom_mode = 0
         self.emergency = False
-        # why its map or our command of it no longer holds: the first reason since the caller emptied this text
+        # why our command of the vehicle has ended: the first reason since the caller emptied this text
         self.interruption = ""
         self.source: str | None = None  # the address of the autopilot; None before its first message
         self.second_source = ""  # another address whose messages have its system id; empty: none yet
@@ -172,9 +172,8 @@ class MavlinkDecoder:
                 if self.armed and not armed:
                     self._interrupt("it has disarmed")
                 self.armed = armed
-                self.emergency = (
-                    message.system_status >= mavlink.MAV_STATE_CRITICAL
-                )  # also: ends its flight, powers off
+                # the higher states are emergencies, too: it ends its flight, or powers off
+                self.emergency = message.system_status >= mavlink.MAV_STATE_CRITICAL
                 self.custom_mode = message.custom_mode
                 self.message_counts["mode"] += 1
             case "COMMAND_ACK" if message.result != mavlink.MAV_RESULT_IN_PROGRESS:
@@ -215,7 +214,7 @@ class MavlinkDecoder:
         """Say that two vehicles have one system id, and what to do."""
         return (
             f"vehicle {self.system} is at {self.source}, and messages with its system id also come from "
-            f"{self.second_source}: they don't count. Give each vehicle on a link a system id of its own"
+            f"{self.second_source}: these are ignored. Give each vehicle on a link a system id of its own"
         )
 
     def _newer(self, sample: MotionSample) -> bool:
