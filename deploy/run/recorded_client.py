@@ -16,14 +16,13 @@ from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brakeline.errors import BadRequest, BusError
-from brakeline.logs.mcap_container import model_attachment_name
-from brakeline.logs.recorder import PERIOD, LogSettings, Recording
+from brakeline.extras import missing_extra
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.inbox import Inbox
@@ -37,7 +36,11 @@ from brakeline.safety.service.client import request_message
 from brakeline.safety.service.filter_client import Answer, FilterClient, obstacles_in
 from brakeline.safety.service.wire import KIND_NUMBERS, decision_reply
 
+if TYPE_CHECKING:
+    from brakeline.logs.recorder import Recording
+
 LOG = "run.mcap"
+PERIOD = 0.5  # s between two writes
 
 
 class RecordedClient:
@@ -67,13 +70,14 @@ class RecordedClient:
         Raises:
             FileExistsError: the folder has a log. Nothing is ever written over it.
             OSError: the log cannot be written.
+            MissingExtra: the extra `logs` is not installed.
         """
         self.client, self.path = client, Path(folder) / LOG
         if self.path.exists():
             raise FileExistsError(f"{self.path} exists: give the log a folder of its own")
         self._name, self._run = name, secrets.randbits(32)
         self._inbox, self._sequences = Inbox(), dict.fromkeys((EXCHANGE, STEP), 0)
-        self._recording = Recording(LogSettings(self.path, *_contents(client)), self._inbox)
+        self._recording = _recording(self.path, client, self._inbox)
         self._recording.save()
         if self._recording.failure:
             raise OSError(self._recording.failure)
@@ -228,13 +232,19 @@ class RecordedClient:
             self._recording.save()
 
 
-def _contents(client: FilterClient) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-    """Return the metadata of the log, and the model set of a filter in this process, so that a replay needs no more."""
+def _recording(path: Path, client: FilterClient, inbox: Inbox) -> Recording:
+    """Return what writes the log. With a filter in this process, it holds the model set, so a replay needs no more."""
+    try:
+        from brakeline.logs.mcap_container import model_attachment_name
+        from brakeline.logs.recorder import LogSettings, Recording
+    except ModuleNotFoundError as error:
+        raise missing_extra(error) or error from error
     robot, model = client.robot, getattr(getattr(client, "method", None), "model", None)
     run = {"policy": "own program", "robots": robot.name}
     metadata = {"run": run, "versions": {"brakeline": version("brakeline")}}
     metadata["robots"] = {robot.kind: json.dumps(robot.description)}
-    if model is None:
-        return metadata, {}
-    metadata[f"model {robot.name}"] = {"version": model.version, **model.about}
-    return metadata, {model_attachment_name(robot.name, model.version): model.encode()}
+    files = {}
+    if model is not None:
+        metadata[f"model {robot.name}"] = {"version": model.version, **model.about}
+        files[model_attachment_name(robot.name, model.version)] = model.encode()
+    return Recording(LogSettings(path, metadata, files), inbox)
