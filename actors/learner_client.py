@@ -7,7 +7,9 @@ import threading
 import time
 from collections.abc import Callable
 
-from brakeline.errors import BadWeights, BusError, Implausible, RefusedByLearner
+from google.protobuf.message import DecodeError
+
+from brakeline.errors import BadMessage, BadWeights, BusError, Implausible, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.policy_weights import MLP, decode
@@ -70,22 +72,40 @@ class LearnerClient:
         log_at = 0.0
         while not stop():
             try:
-                payload = self.bus.ask(JOIN, message.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
-            except BusError as error:
+                reply = self._ask_to_join(message)
+            except (BusError, BadMessage) as error:
                 if time.monotonic() >= log_at:
                     log.info("%s waits for a learner: %s", self.actor, error)
                     log_at = time.monotonic() + LOG_INTERVAL
                 time.sleep(0.2)
                 continue
-            reply = pb.JoinReply.FromString(payload)
-            if reply.error.type:
-                raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
             with self._changed:
                 self.flow, self._index, self._doubtful = reply.flow, index, False
                 self._incarnation = reply.flow.incarnation
                 self._take(reply.weights, joining=True)
             return reply.episode
         return None
+
+    def _ask_to_join(self, join: pb.Join) -> pb.JoinReply:
+        """Return a learner's reply.
+
+        Raises:
+            BusError: no learner answers.
+            BadMessage: the reply is damaged. Ask again: the learner answers the same join twice.
+            RefusedByLearner: with the learner's reason.
+        """
+        payload = self.bus.ask(JOIN, join.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
+        try:
+            reply = pb.JoinReply.FromString(payload)
+        except DecodeError as error:
+            raise BadMessage(f"its reply cannot be read ({error})") from error
+        if reply.HasField("error"):
+            raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
+        if not (reply.HasField("flow") and reply.HasField("weights")):
+            raise BadMessage("its reply has no weights, or no permissions")
+        if (limit := reply.flow.limit.get(self.actor, 0)) > join.index + MOST_STEPS_AHEAD:
+            raise BadMessage(f"its reply permits {limit} steps at step {join.index}")
+        return reply
 
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
         """Wait for permission for step number `index`. Return False if the run is over or `stop` returned true."""

@@ -223,6 +223,11 @@ class Task:
         return (*(f"ray {i} [range/{rays.range:g} m]" for i in range(len(rays.directions))), *self.observation)
 
     @property
+    def default_arena(self) -> str:
+        """The arena that is taken if none is named: the one called `default`, or the first in the file."""
+        return "default" if "default" in self.arenas else next(iter(self.arenas), "default")
+
+    @property
     def observation_dim(self) -> int:
         return len(self.observed)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.filter.widening import PastWindow, Widening
 
@@ -17,8 +18,8 @@ SAME_SET = 1e-9  # m, rad, ...: rounding allowed in the comparison of a measurem
 UNVERIFIED = "unverified"  # in place of a version: no model set verified the committed plan
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, eq=False)
+class Prediction(ComparedByValue):
     """The predicted set of the next measured state: |state - center| <= half_width, in the frame of `heading`.
 
     >>> from brakeline import robot_named

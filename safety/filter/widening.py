@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.value_equality import ComparedByValue
 
 WINDOWS = 600  # last windows whose scores count
 PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets
@@ -40,8 +41,8 @@ def widening_factor(scores: Array, outside_share: float) -> Array:
     return np.asarray(np.clip(RESERVE * largest, 1.0, MOST))
 
 
-@dataclass(frozen=True)
-class PastWindow:
+@dataclass(frozen=True, eq=False)
+class PastWindow(ComparedByValue):
     """The last periods of a plan's length, up to the state in the request."""
 
     states: Array  # (N, n): measured states at the periods' starts

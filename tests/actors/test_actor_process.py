@@ -2,11 +2,13 @@
 service.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -103,6 +105,19 @@ def test_the_learner_refuses_another_layout(buses: tuple[Bus, Bus]) -> None:
     ScriptedLearner(buses[0]).layout = "that of another version"
     with pytest.raises(RefusedByLearner, match="layout: another"):
         LearnerClient(buses[1], GROUND, "actor-0").join(0, 0, never)
+
+
+def test_an_actor_asks_again_after_a_damaged_reply_to_its_join(caplog: pytest.LogCaptureFixture) -> None:
+    weights = ScriptedLearner.weights(cast(Any, SimpleNamespace(version=1)))
+    good = pb.JoinReply(weights=weights, flow=pb.Flow(robot="ground", incarnation=1), episode=3)
+    ahead = pb.JoinReply(weights=weights, flow=pb.Flow(incarnation=1, limit={"actor-0": 10**9}))
+    replies = [b"\xff\xff", good.SerializeToString()[:-3], b"", ahead.SerializeToString(), good.SerializeToString()]
+    bus: Any = SimpleNamespace(subscribe=lambda *_, **__: None, ask=lambda *_, **__: replies.pop(0))
+    client = LearnerClient(bus, GROUND, "actor-0")
+    with caplog.at_level(logging.INFO):
+        assert client.join(0, 0, never) == 3
+    assert not replies and version(client) == 1
+    assert "waits for a learner: its reply cannot be read" in caplog.text
 
 
 def test_wait_returns_when_the_learner_permits_the_step(buses: tuple[Bus, Bus]) -> None:
