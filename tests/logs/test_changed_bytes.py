@@ -48,7 +48,7 @@ def test_each_flipped_bit_is_named(path: Path) -> None:
 
 
 def test_a_damaged_first_chunk_costs_only_its_own_messages(path: Path) -> None:
-    """It declares the channels. The summary repeats them, and the metadata do for a file that a killed recorder left."""
+    """It declares the channels. The summary repeats them, and the metadata do if the recorder was killed."""
     other = ((f"log/{'bcd'[number]}", pb.LogLine(text=str(number)), 10**18 + 30 + number) for number in range(3))
     steps = ((KEY, pb.Step(actor="a", step=number), 10**18 + number) for number in range(30))
     written(path.with_name("two.mcap"), (*steps, *other))
