@@ -33,6 +33,7 @@ class LearnerClient:
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
         self.policy: MLP | None = None  # the newest; None before the first join
         self.flow = pb.Flow()  # the learner's latest message about permissions
+        self.earlier_steps = 0  # of this actor before its restart, as the learner counted them
         self._incarnation = 0  # of the learner that accepted this actor; 0: none
         self._index = 0  # of the latest step that this actor waited for
         self._doubtful = False  # whether a message contradicts our learner, so that we have to join again
@@ -80,6 +81,8 @@ class LearnerClient:
                 time.sleep(0.2)
                 continue
             with self._changed:
+                if not self._incarnation:
+                    self.earlier_steps = max(reply.steps - index, 0)
                 self.flow, self._index, self._doubtful = reply.flow, index, False
                 self._incarnation = reply.flow.incarnation
                 self._take(reply.weights, joining=True)

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from brakeline.actors import actor_process
-from brakeline.actors.actor_process import STOP_PRACTICE, ActorSettings, StopPractice, run
+from brakeline.actors.actor_process import STOP_PRACTICE, ActorRunner, ActorSettings, StopPractice, run
+from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.vehicle_factory import environment, fleet_world
@@ -118,6 +119,27 @@ def test_an_actor_asks_again_after_a_damaged_reply_to_its_join(caplog: pytest.Lo
         assert client.join(0, 0, never) == 3
     assert not replies and version(client) == 1
     assert "waits for a learner: its reply cannot be read" in caplog.text
+
+
+def test_the_physics_change_after_the_steps_of_the_whole_run_also_when_the_actor_was_restarted() -> None:
+    weights = ScriptedLearner.weights(cast(Any, SimpleNamespace(version=1)))
+    replies = [
+        pb.JoinReply(weights=weights, flow=pb.Flow(incarnation=run), steps=steps) for run, steps in ((1, 70), (2, 90))
+    ]
+    bus: Any = SimpleNamespace(subscribe=lambda *_, **__: None, ask=lambda *_, **__: replies.pop(0).SerializeToString())
+    client, changes = LearnerClient(bus, GROUND, "actor-0"), list[tuple[int, float]]()
+    client.join(0, 0, never)
+    proposer = SimpleNamespace(earlier_steps=client.earlier_steps, ready=lambda *_: True)
+    env = SimpleNamespace(alter=lambda payload_kg: changes.append((runner.index, payload_kg)))
+    runner = SimpleNamespace(index=0, env=env)
+    actor = SimpleNamespace(
+        runner=runner, proposer=proposer, change=PhysicsChange(100, 2.0), _changed=False, next_episode=3
+    )
+    for runner.index in range(50):
+        ActorRunner.may_step(cast(Any, actor), never)
+    assert changes == [(30, 2.0)], "70 steps came before the restart"
+    client.join(50, 5, never)
+    assert client.earlier_steps == 70, "the actor goes on: only the learner was restarted"
 
 
 def test_wait_returns_when_the_learner_permits_the_step(buses: tuple[Bus, Bus]) -> None:
