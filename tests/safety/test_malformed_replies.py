@@ -145,6 +145,17 @@ def test_every_malformed_field_of_a_reply_brakes_the_robot_with_a_reason(asked: 
     assert ("decision.reservation.center" in paths) == bool(asked.request.fleet)
 
 
+@pytest.mark.parametrize("part", ["tube", "predicted"])
+def test_a_verified_plan_without_a_set_is_refused_and_an_unverified_one_is_not(asked: Asked, part: str) -> None:
+    reply = asked.reply
+    for name in (f"{part}_center", f"{part}_half_width"):
+        reply = changed(reply, f"decision.{name}", None)
+    answered, why = asked.acted(reply)
+    assert not answered and f"{part}" in why and "without" in why
+    rival = changed(changed(reply, "decision.verified", False), "decision.bound", None)
+    assert asked.acted(rival) == (True, "")
+
+
 def test_answers_are_compared_by_their_values(asked: Asked) -> None:
     first, same = (read_reply(asked.reply, asked.request, asked.robot) for _ in range(2))
     other = read_reply(changed(asked.reply, "decision.margin", 0.123), asked.request, asked.robot)
