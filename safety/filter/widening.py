@@ -94,7 +94,7 @@ class Widening:
         return known
 
     def _begin(self, model: str) -> None:
-        self._model, self._of = model, self._models.pop(model, None) or _ModelScores()
+        self._model, self._of = model, self._models.pop(model, _ModelScores())
         self._models[model] = self._of  # the last one of the dictionary decided last
         if len(self._models) > MODELS:
             del self._models[next(iter(self._models))]

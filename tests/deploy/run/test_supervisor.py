@@ -78,10 +78,10 @@ def test_a_run_goes_on_without_a_process_that_it_does_not_need(clock, tmp_path, 
 
 
 class Hanging(SupervisedProcess):
-    """Runs until its standard input ends."""
+    """Runs until it is killed."""
 
     def start(self, held: bool = False) -> None:
-        self.popen = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        self.popen = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600.0)"])
         self.started = supervisor.time.monotonic()
 
 
