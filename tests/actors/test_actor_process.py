@@ -130,8 +130,8 @@ def test_the_physics_change_after_the_steps_of_the_whole_run_also_when_the_actor
     client, changes = LearnerClient(bus, GROUND, "actor-0"), list[tuple[int, float]]()
     client.join(0, 0, never)
     proposer = SimpleNamespace(earlier_steps=client.earlier_steps, ready=lambda *_: True)
-    env = SimpleNamespace(alter=lambda payload_kg: changes.append((runner.index, payload_kg)))
-    runner = SimpleNamespace(index=0, env=env)
+    runner = SimpleNamespace(index=0)
+    runner.env = SimpleNamespace(alter=lambda payload_kg: changes.append((runner.index, payload_kg)))
     actor = SimpleNamespace(
         runner=runner, proposer=proposer, change=PhysicsChange(100, 2.0), _changed=False, next_episode=3
     )
