@@ -106,8 +106,6 @@ class LearnerClient:
             raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
         if not (reply.HasField("flow") and reply.HasField("weights")):
             raise BadMessage("its reply has no weights, or no permissions")
-        if (limit := reply.flow.limit.get(self.actor, 0)) > join.index + MOST_STEPS_AHEAD:
-            raise BadMessage(f"its reply permits {limit} steps at step {join.index}")
         return reply
 
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
