@@ -176,6 +176,7 @@ class ActorRunner:
         self.proposal = np.zeros(robot.action_dim)  # the last one
         self.braking = False  # whether the robot brakes because there was no decision
         self.practice, self.change = StopPractice(settings.practice), settings.change
+        self._changed = False  # whether the physics have changed
         self.steps: MessageSink = publisher(STEP, robot=robot.name, source=actor)
         self.episodes: MessageSink = publisher(EPISODE, robot=robot.name, source=actor)
         self.exchanges: MessageSink = publisher(EXCHANGE, robot=robot.name, source=actor)
@@ -188,8 +189,10 @@ class ActorRunner:
 
     def may_step(self, stop: Stop) -> bool:
         """Wait for permission for the next step. Return False at the end of the run."""
-        if self.runner.index == self.change.after:
+        driven = self.runner.index + self.proposer.earlier_steps
+        if not self._changed and 0 <= self.change.after <= driven:
             self.runner.env.alter(**self.change.changes())
+            self._changed = True
         return self.proposer.ready(self.runner.index + 1, self.next_episode, stop)
 
     def begin(self, episode: pb.Episode) -> None:

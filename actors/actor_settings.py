@@ -13,7 +13,8 @@ class PhysicsChange:
     """
 
     after: int = -1
-    """Change the physics after this many steps of each robot. -1 never changes them."""
+    """Change the physics after this many steps of each robot. If it learns, its steps before a restart and those of
+    --from-logs count too. -1 never changes them."""
     payload_kg: float | None = None
     """Put this mass on top of the robot [kg]."""
     floor_friction: float | None = None

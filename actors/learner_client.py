@@ -7,7 +7,9 @@ import threading
 import time
 from collections.abc import Callable
 
-from brakeline.errors import BadWeights, BusError, Implausible, RefusedByLearner
+from google.protobuf.message import DecodeError
+
+from brakeline.errors import BadMessage, BadWeights, BusError, Implausible, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, Sample
 from brakeline.messaging.policy_weights import MLP, decode
@@ -31,6 +33,7 @@ class LearnerClient:
         self.bus, self.robot, self.actor, self.lockstep = bus, robot, actor, lockstep
         self.policy: MLP | None = None  # the newest; None before the first join
         self.flow = pb.Flow()  # the learner's latest message about permissions
+        self.earlier_steps = 0  # of this actor before its restart, as the learner counted them
         self._incarnation = 0  # of the learner that accepted this actor; 0: none
         self._index = 0  # of the latest step that this actor waited for
         self._doubtful = False  # whether a message contradicts our learner, so that we have to join again
@@ -70,22 +73,40 @@ class LearnerClient:
         log_at = 0.0
         while not stop():
             try:
-                payload = self.bus.ask(JOIN, message.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
-            except BusError as error:
+                reply = self._ask_to_join(message)
+            except (BusError, BadMessage) as error:
                 if time.monotonic() >= log_at:
                     log.info("%s waits for a learner: %s", self.actor, error)
                     log_at = time.monotonic() + LOG_INTERVAL
                 time.sleep(0.2)
                 continue
-            reply = pb.JoinReply.FromString(payload)
-            if reply.error.type:
-                raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
             with self._changed:
+                if not self._incarnation:
+                    self.earlier_steps = max(reply.steps - index, 0)
                 self.flow, self._index, self._doubtful = reply.flow, index, False
                 self._incarnation = reply.flow.incarnation
                 self._take(reply.weights, joining=True)
             return reply.episode
         return None
+
+    def _ask_to_join(self, join: pb.Join) -> pb.JoinReply:
+        """Return a learner's reply.
+
+        Raises:
+            BusError: no learner answers.
+            BadMessage: the reply is damaged. Ask again: the learner answers the same join twice.
+            RefusedByLearner: with the learner's reason.
+        """
+        payload = self.bus.ask(JOIN, join.SerializeToString(), JOIN_TIMEOUT, robot=self.robot.name)
+        try:
+            reply = pb.JoinReply.FromString(payload)
+        except DecodeError as error:
+            raise BadMessage(f"its reply cannot be read ({error})") from error
+        if reply.HasField("error"):
+            raise RefusedByLearner(f"{reply.error.field}: {reply.error.message}")
+        if not (reply.HasField("flow") and reply.HasField("weights")):
+            raise BadMessage("its reply has no weights, or no permissions")
+        return reply
 
     def wait(self, index: int, episode: int, stop: Callable[[], bool]) -> bool:
         """Wait for permission for step number `index`. Return False if the run is over or `stop` returned true."""

@@ -60,6 +60,7 @@ class FixedPolicy:
     """A policy that does not learn, for a number of steps (0: without end)."""
 
     version = 0  # it has none
+    earlier_steps = 0  # nobody counts its steps beyond a restart
 
     def __init__(self, make: PolicyFactory, seed: int, steps: int = 0) -> None:
         self.policy, self._steps = make(seed), steps

@@ -171,7 +171,7 @@ class SafetyError(BusError):
     """The service answered a request with an error, or its reply is not valid. `field` names the wrong field."""
 
     def __init__(self, error: pb.Error) -> None:
-        super().__init__(f"{error.type}: {error.message}")
+        super().__init__(f"{error.type or 'Error'}: {error.message or 'the service gives no reason'}")
         self.type, self.field = error.type, error.field
 
 

@@ -55,6 +55,13 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     return MLP.load(path, robot)
 
 
+def file_named(name: str, robot: RobotWithTask) -> Path | None:
+    """Return the file of your own that `policy_named` reads; None if a policy has this name, whatever files exist."""
+    if name in robot.task.policies or name == UNTRAINED or name in _stored(robot):
+        return None
+    return Path(name)
+
+
 def policy_hash(name: str, robot: RobotWithTask) -> str:
     """Return a hash of the file of the policy with this name; empty if none is read (see `policy_named`)."""
     path = _stored(robot).get(name, Path(name))

@@ -172,7 +172,8 @@ class Learner:
             self._present.add(join.actor)
         episode = self._ledger.join(join.actor, join.index, join.episode)
         self._limits[join.actor] = join.index
-        return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode)
+        steps = self._ledger.steps_of(join.actor)
+        return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode, steps=steps)
 
     def _may_join(self, asker: str, actor: str) -> bool:
         """Return whether a process may join for an actor: for itself or its robot; a feeder for all that are absent."""

@@ -71,6 +71,11 @@ class StepLedger:
             place.last_index = index
         return True
 
+    def steps_of(self, actor: str) -> int:
+        """Return how many distinct steps of an actor ever arrived."""
+        place = self.places.get(actor, ActorProgress())
+        return sum(last - first + 1 for ranges in place.seen.values() for first, last in ranges)
+
     def refuse(self, actor: str, index: int) -> None:
         """Note a step that arrived, but does not count, so that it does not count as lost."""
         self.places[actor].last_index = max(self.places[actor].last_index, index)

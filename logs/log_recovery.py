@@ -14,10 +14,12 @@ from typing import IO, Any
 
 import mcap.writer
 from mcap.records import Attachment, Header, Metadata
+from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from brakeline.errors import LogError, NotMcap
 from brakeline.logs.mcap_container import DamagedBytes, LogChannel, records
-from brakeline.logs.segment import CHUNK, being_written
+from brakeline.logs.segment import CHUNK, being_written, schema_of
+from brakeline.messaging.topics import topic_of
 
 DAMAGED = ".damaged"
 UNFINISHED = ".recovering"
@@ -123,10 +125,14 @@ def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], 
     """Return the number of a channel in the new file; register its schema if needed."""
     schema, channel = series.schema, series.channel
     assert channel is not None, "the container has set it"
-    number = 0  # no schema
+    number, encoding, topic = 0, SchemaEncoding.Protobuf, topic_of(channel.topic)  # 0: no schema
+    content = None if schema is None else (schema.name, schema.data)
     if schema is not None:
-        content = schema.name, schema.data
+        encoding = schema.encoding
+    elif channel.message_encoding == MessageEncoding.Protobuf and topic is not None:  # its declaration is lost
+        content = topic.message.DESCRIPTOR.full_name, schema_of(topic.message)
+    if content is not None:
         if content not in schemas:
-            schemas[content] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            schemas[content] = writer.register_schema(content[0], encoding, content[1])
         number = schemas[content]
     return int(writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -33,6 +33,9 @@ BROKEN = (McapError, struct.error, ValueError, EOFError, OverflowError, RuntimeE
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
 ROS_PROFILES, ROS_ENCODINGS = ("ros1", "ros2"), ("ros1", "cdr")  # of files, of messages
 OWN_SCHEMAS = "brakeline."  # how the names of Brakeline's message types begin
+# Metadata of a log: the topics of its own channels by their numbers. A chunk declares the channels that begin in it, so
+# the later messages of a file without a summary would be lost with that chunk.
+CHANNELS = "channels"
 
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log_time, publish_time; then the payload
@@ -145,12 +148,21 @@ class _Tables:
     def __init__(self, make: MakeChannel, summary: Callable[[], bytes]) -> None:
         self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
         self.summary: Callable[[], bytes] | None = summary
+        self.topics = dict[int, str]()  # as the metadata say, by the channel's number
 
     def channel(self, number: int) -> LogChannel | None:
         """Return the channel of a message; None if nothing declares it."""
         if number not in self.series:
             self._read_summary()
+        if number not in self.series and number in self.topics:
+            series = self.make(self.topics[number], None)
+            series.channel = Channel(number, self.topics[number], MessageEncoding.Protobuf, {}, 0)
+            self.series[number] = series
         return self.series.get(number)
+
+    def note(self, topics: Mapping[str, str]) -> None:
+        """Take in the metadata `CHANNELS`."""
+        self.topics |= {int(number): topic for number, topic in topics.items() if number.isdecimal()}
 
     def _read_summary(self) -> None:
         if self.summary is not None:
@@ -267,7 +279,11 @@ def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
     elif opcode == Opcode.HEADER:
         yield Header.read(ReadDataStream(BytesIO(content)))
     elif opcode == Opcode.METADATA:
-        yield Metadata.read(ReadDataStream(BytesIO(content)))
+        metadata = Metadata.read(ReadDataStream(BytesIO(content)))
+        if metadata.name == CHANNELS:
+            tables.note(metadata.metadata)
+        else:
+            yield metadata
     elif opcode == Opcode.ATTACHMENT:
         yield Attachment.read(ReadDataStream(BytesIO(content)))
 

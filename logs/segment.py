@@ -11,7 +11,7 @@ import fcntl
 import itertools
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,7 +23,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from brakeline.errors import NotMcap
-from brakeline.logs.mcap_container import records
+from brakeline.logs.mcap_container import CHANNELS, OWN_SCHEMAS, records
 from brakeline.messaging.steady_clock import steady_time_ns
 
 NO_SCHEMA = 0
@@ -200,7 +200,8 @@ class Segment:
         Raises:
             OSError: the disk is full or broken. No entry is in the file; call `abandon`.
         """
-        left_out = 0
+        left_out, entries = 0, list(entries)
+        self._declare(entries)
         for entry in entries:
             if len(self._channels) >= MOST_CHANNELS and entry.key not in self._channels:
                 left_out += 1
@@ -238,6 +239,17 @@ class Segment:
         self._file.close()
         if self.empty:
             self.path.unlink(missing_ok=True)
+
+    def _declare(self, entries: Sequence[Entry]) -> None:
+        """Register the channels that begin with these entries, and write the topics of our own outside the chunks."""
+        own: dict[str, str] = {}
+        for key, kind in {entry.key: entry.type for entry in entries}.items():
+            if key not in self._channels and len(self._channels) < MOST_CHANNELS:
+                number = self._channel(key, kind)
+                if not isinstance(kind, str) and kind.DESCRIPTOR.full_name.startswith(OWN_SCHEMAS):
+                    own[str(number)] = key
+        if own:
+            self._writer.add_metadata(CHANNELS, own)
 
     def _channel(self, key: str, kind: type[Message] | str) -> int:
         if key not in self._channels:

@@ -1288,8 +1288,11 @@ class JoinReply(_message.Message):
     FLOW_FIELD_NUMBER: _builtins.int
     EPISODE_FIELD_NUMBER: _builtins.int
     ERROR_FIELD_NUMBER: _builtins.int
+    STEPS_FIELD_NUMBER: _builtins.int
     episode: _builtins.int
     """the episode to continue with"""
+    steps: _builtins.int
+    """of this actor that the learner has received, also before the actor's restart"""
     @_builtins.property
     def weights(self) -> Global___Weights: ...
     @_builtins.property
@@ -1303,10 +1306,11 @@ class JoinReply(_message.Message):
         flow: Global___Flow | None = ...,
         episode: _builtins.int = ...,
         error: Global___Error | None = ...,
+        steps: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["error", b"error", "flow", b"flow", "weights", b"weights"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["episode", b"episode", "error", b"error", "flow", b"flow", "weights", b"weights"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["episode", b"episode", "error", b"error", "flow", b"flow", "steps", b"steps", "weights", b"weights"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

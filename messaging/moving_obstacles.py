@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array, Obstacle, Shapes
+from brakeline.messaging.value_equality import ComparedByValue
 
 
-@dataclass(frozen=True)
-class MovingObstacles:
+@dataclass(frozen=True, eq=False)
+class MovingObstacles(ComparedByValue):
     """n moving obstacles; `brakeline.messaging.obstacle_motion` has the equations."""
 
     shapes: Shapes  # as measured

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brakeline.errors import BadShape
 from brakeline.messaging.obstacle_motion import Motion
+from brakeline.messaging.value_equality import ComparedByValue
 
 Array = NDArray[np.float64]
 
@@ -86,8 +87,8 @@ class Obstacle:
             raise BadShape("motion", problem)
 
 
-@dataclass(frozen=True)
-class Shapes:
+@dataclass(frozen=True, eq=False)
+class Shapes(ComparedByValue):
     """n obstacles as arrays.
 
     >>> shapes = Shapes.of([Obstacle("box", (2.0, 0.0), (1.0, 1.0)), Obstacle("sphere", (3.0, 0.0), (1.0,))], dim=2)

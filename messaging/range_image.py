@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
-from brakeline.messaging.scan import check_numbers, check_unit, same_values
+from brakeline.messaging.scan import check_numbers, check_unit
+from brakeline.messaging.value_equality import same_values
 
 Array = NDArray[np.float64]
 

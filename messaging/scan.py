@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import FARTHEST, Array
+from brakeline.messaging.value_equality import same_values
 
 MAX_BEAMS = 1000
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
@@ -50,18 +50,6 @@ def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[floa
         raise BadScan(f"a {name}'s errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
     if not (math.isfinite(least_width) and least_width > 0.0):
         raise BadScan(f"a {name}'s least width must be positive")
-
-
-def same_values(one: Any, other: object) -> bool:
-    """Return whether two dataclasses are of one type and have equal values; NaN equals NaN."""
-    names = [item.name for item in fields(one)]
-    return type(one) is type(other) and all(_same(getattr(one, name), getattr(other, name)) for name in names)
-
-
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray):
-        return np.array_equal(one, other, equal_nan=True)
-    return bool(np.all(one == other))
 
 
 @dataclass(frozen=True, eq=False)

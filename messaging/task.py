@@ -223,6 +223,11 @@ class Task:
         return (*(f"ray {i} [range/{rays.range:g} m]" for i in range(len(rays.directions))), *self.observation)
 
     @property
+    def default_arena(self) -> str:
+        """The arena that is taken if none is named: the one called `default`, or the first in the file."""
+        return "default" if "default" in self.arenas else next(iter(self.arenas), "default")
+
+    @property
     def observation_dim(self) -> int:
         return len(self.observed)
 
@@ -242,6 +247,8 @@ class Task:
             if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
                 raise missing from error
             raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
+        except Exception as error:  # whatever the file does when it is executed
+            raise UnknownTask(f"{place!r} is no code that can be loaded: {type(error).__name__}: {error}") from error
 
 
 # Where task files of version 0.2 look for code, and where it is now.
@@ -274,7 +281,11 @@ def _module_in(path: Path) -> Any:
             raise ImportError(f"{path} is no Python file")
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
-        spec.loader.exec_module(module)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]  # else the next one would find half of it
+            raise
     return sys.modules[name]
 
 

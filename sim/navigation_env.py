@@ -114,7 +114,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
     def __init__(
         self,
         robot: RobotWithTask | str,
-        arena: str = "default",
+        arena: str | None = None,
         make_vehicle: MakeVehicle | None = None,
         *,
         conditions: Conditions | None = None,
@@ -128,7 +128,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
 
         Args:
             robot: a robot with its task, or its name (`"ground"`), or the path of its file.
-            arena: the name of one of the task's arenas.
+            arena: the name of one of the task's arenas. Defaults to `default`, or to the task's first one.
             make_vehicle: puts a vehicle at the start of an arena. Defaults to the task's simulator under `conditions`.
             lidar_noise: standard deviation of a range [m]. Defaults to the conditions' value for this robot.
             seed_key: a number that is 0 or more; environments with different keys have different episodes.
@@ -144,6 +144,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode is None, 'rgb_array' or 'human', not {render_mode!r}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
+        arena = self.robot.task.default_arena if arena is None else arena
         if draw is draw_arena:
             arena_kind(self.robot, arena)
         self.arena_name, self.seed_key, self.render_mode = arena, seed_key, render_mode

@@ -13,12 +13,12 @@ from rich.markup import escape
 from brakeline.deploy.commands.command_output import errors, print_json, print_result
 from brakeline.deploy.commands.common_options import Json, LogReadOptions, Unprefixed
 from brakeline.deploy.data.description_summary import summary
-from brakeline.errors import BadDescription, NoSource
+from brakeline.errors import BadDescription, MissingExtra, NoSource, UnknownTask
 from brakeline.logs.stacking_table import plain_table
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_description import NAME, robot_from_description
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
-from brakeline.messaging.task import RobotWithTask, robot_maybe_with_task
+from brakeline.messaging.task import RobotWithTask, Task, robot_maybe_with_task
 
 if TYPE_CHECKING:
     from brakeline.deploy.data.log_options import LogOptions
@@ -75,8 +75,18 @@ class RobotCommand:
             else:
                 errors.print(str(error), markup=False)
             return 1
-        remarks = summary(robot)["remarks"]
-        simulated = isinstance(robot_maybe_with_task(self.file), RobotWithTask)
+        remarks, tasked = summary(robot)["remarks"], robot_maybe_with_task(self.file)
+        simulated = isinstance(tasked, RobotWithTask)
+        if isinstance(tasked, RobotWithTask):
+            problems, missing = _code_problems(tasked.task)
+            remarks = [*remarks, *missing]
+            if problems:
+                lines = "".join(f"\n  {place}: {what}" for place, what in problems)
+                if self.json:
+                    print_json({"file": self.file, "problems": problems})
+                else:
+                    errors.print(f"{robot.name}: the task names code that cannot be used:{lines}", markup=False)
+                return 1
         collect = f", or `brakeline collect {self.file}`" if simulated else ""
         print_result(
             self.json,
@@ -101,6 +111,21 @@ class RobotCommand:
                 rows.append((name.replace("_", " "), escape(text)))
         print_result(self.json, values, plain_table((), rows))
         return 0
+
+
+def _code_problems(task: Task) -> tuple[list[tuple[str, str]], list[str]]:
+    """Load the code that a task names. Return (field, mistake) pairs, and remarks on what cannot be loaded here."""
+    problems, missing = list[tuple[str, str]](), dict[str, None]()
+    policies = {f"policies.{name}": place for name, place in task.policies.items()}
+    for field_name, place in {"simulator": task.simulator, "senses": task.senses, **policies}.items():
+        try:
+            if not callable(task.code(place)):
+                problems.append((field_name, f"{place!r} is neither a function nor a class"))
+        except UnknownTask as error:
+            problems.append((field_name, str(error)))
+        except MissingExtra as error:
+            missing[f"the code of the task was not checked: {error}"] = None
+    return problems, list(missing)
 
 
 def _task_text(name: str) -> str:

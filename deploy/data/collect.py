@@ -91,7 +91,7 @@ def _recorded_at_once(robot: RobotWithTask, recipes: Sequence[_Recipe], conditio
     streams = NormalStreams(len(recipes), ahead=False)  # each generator draws the inputs as well
     for row, recipe in enumerate(recipes):
         streams.begin(row, recipe.rng)
-    kind = robot.task.arenas["default"]
+    kind = robot.task.arenas[robot.task.default_arena]
     with closing(vehicle_batch(robot, len(recipes), kind, conditions, THREADS, streams)) as robots:
         arenas = [empty_arena_at_random(robot, recipe.rng) for recipe in recipes]
         robots.begin(np.arange(len(recipes)), arenas, [recipe.rng for recipe in recipes])

@@ -82,9 +82,14 @@ def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str], give
     needless = [
         needless_conversion(name, given[name], fit.unit)
         for name, fit in gains.items()
-        if name in given and not same_gain(fit.gain) and same_gain(fit.gain / (factor(given[name], fit.unit) or 1.0))
+        if name in given and needlessly_converted(fit, given[name])
     ]
     return needless or _explained(log, gains)
+
+
+def needlessly_converted(fit: SpeedFit, given: str) -> bool:
+    """Return whether a column that was converted from a unit agrees with the motion only without that."""
+    return not same_gain(fit.gain) and same_gain(fit.gain / (factor(given, fit.unit) or 1.0))
 
 
 def needless_conversion(name: str, given: str, si: str) -> str:

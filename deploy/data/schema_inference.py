@@ -27,8 +27,11 @@ from brakeline.deploy.data.message_columns import FIELDS
 from brakeline.deploy.data.message_columns import HEADING as HEADING_NAME
 from brakeline.deploy.data.motion_check import (
     SAME_CORRELATION,
+    UNCONVERTED,
     heading_contradiction,
     heading_unit,
+    needless_conversion,
+    needlessly_converted,
     same_gain,
     speed_contradiction,
     speed_fit,
@@ -121,7 +124,7 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
             f"the log needs two position columns ({', '.join(AXES)}) that change: {'; '.join(notes) or 'none'}"
         )
     if not sources[0][0].name:
-        notes += _find_heading(log)
+        notes += _find_heading(log, options)
         _find_speeds(log, options)
     others = [n for n in log.columns if n not in (*log.positions, log.heading, *log.inputs)]
     pairs = followers_of_inputs(log, others)
@@ -328,15 +331,21 @@ def _listed(names: Sequence[str]) -> str:
 # --- roles and units from the motion -------------------------------------------------------------------------------
 
 
-def _find_heading(log: AlignedLog) -> list[str]:
-    """Set the heading of a robot in the plane, and return notes on it. Raises NoSource for one in another unit."""
+def _find_heading(log: AlignedLog, options: LogOptions) -> list[str]:
+    """Set the heading of a robot in the plane, and return notes on it.
+
+    Raises:
+        NoSource: it is in another unit, or in rad and converted all the same.
+    """
     if len(log.positions) != 2:
         return []
     candidates = [n for n in log.columns if n not in (*log.positions, *log.inputs)]
-    fits = {name: heading_unit(log, name) for name in candidates}
+    fits = {name: heading_unit(log, name, options.units.get(name, "")) for name in candidates}
     best = max(fits, key=lambda name: fits[name][1], default="")
     if best and fits[best][1] > SAME_CORRELATION:
         unit, score = fits[best]
+        if unit == UNCONVERTED:
+            raise NoSource(needless_conversion(best, options.units[best], "rad"))
         if unit != "rad":
             raise NoSource(heading_contradiction(best, unit, score))
         log.set_heading(best)
@@ -352,10 +361,14 @@ def _find_speeds(log: AlignedLog, options: LogOptions) -> None:
     speeds = speeds_of_motion(log, log.heading)
     problems = []
     for name in log.columns:
-        if name in (*log.positions, log.heading) or name in options.units:
+        if name in (*log.positions, log.heading):
             continue
-        fit = speed_fit(log, name, speeds, name in log.inputs)
+        fit, given = speed_fit(log, name, speeds, name in log.inputs), options.units.get(name)
         if fit is None:
+            continue
+        if given is not None:
+            if needlessly_converted(fit, given):
+                problems.append(needless_conversion(name, given, fit.unit))
             continue
         if same_gain(fit.gain):
             log.units |= {} if name in log.inputs else {name: fit.unit}

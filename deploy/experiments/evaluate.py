@@ -13,7 +13,7 @@ from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
-from brakeline.deploy.policy_loading import policy_named
+from brakeline.deploy.policy_loading import file_named, policy_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
@@ -227,7 +227,8 @@ def parts_of(robot: RobotWithTask, what: Evaluation) -> list[EvaluationPart]:
     rounds = -(-what.episodes // max(what.fleet, 1))
     size = EPISODES_OF_A_BATCH if what.backend == "batch" else EPISODES_A_PART
     size = max(rounds, 1) if what.policy.endswith(".csv") else size
-    content = path.read_bytes() if (path := Path(what.policy)).is_file() else None
+    path = file_named(what.policy, robot)
+    content = path.read_bytes() if path is not None and path.is_file() else None
     firsts = range(0, rounds, size)
     return [EvaluationPart(robot, what, first, min(size, rounds - first), content) for first in firsts]
 

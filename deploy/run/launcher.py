@@ -166,6 +166,9 @@ class Launcher:
                         if not self._must_wait(child):
                             child.supervise()
                     self._drain()
+                    if not self._inbox:
+                        for child in self.processes:
+                            child.report_silence()
                     show(self)
                     process.stop.wait(PERIOD)
             except LaunchError as error:

@@ -13,6 +13,7 @@ from pathlib import Path
 from brakeline.deploy.interpreter import ONE_THREAD, PYTHON
 from brakeline.deploy.run.processes import HELD, HOPELESS, UNFINISHED, ProcessSpec
 from brakeline.errors import LaunchError
+from brakeline.messaging.process_runtime import MAX_SILENCE
 
 log = logging.getLogger("brakeline.launcher")
 
@@ -33,8 +34,10 @@ class SupervisedProcess:
     restarts: int = 0
     failures: int = 0  # in a row, none of them after a healthy time
     popen: subprocess.Popen[bytes] | None = None
-    started: float = 0.0  # monotonic time [s], as the next two
+    started: float = 0.0  # monotonic time [s], as of the signs of life and of `next_start`
     first_sign_of_life: float | None = None
+    last_sign_of_life: float | None = None
+    reported_silent: bool = False
     next_start: float = 0.0
     finished: bool = False  # it ended with status 0: its work is done
 
@@ -57,7 +60,8 @@ class SupervisedProcess:
                 env=environment,
                 start_new_session=True,  # ^C reaches only the launcher, which ends the processes in order
             )
-        self.started, self.first_sign_of_life = time.monotonic(), None
+        self.started, self.first_sign_of_life, self.last_sign_of_life = time.monotonic(), None, None
+        self.reported_silent = False
 
     def release(self) -> None:
         """Let a process that was started as `held` begin."""
@@ -71,8 +75,33 @@ class SupervisedProcess:
 
     def record_sign_of_life(self, pid: int) -> None:
         """Note a health message of the process with this id and this name."""
-        if self.popen is not None and self.popen.pid == pid and self.first_sign_of_life is None:
-            self.first_sign_of_life = time.monotonic()
+        if self.popen is None or self.popen.pid != pid:
+            return
+        now = time.monotonic()
+        if self.reported_silent:
+            log.warning("%s gives signs of life again", self.spec.name)
+        self.reported_silent = False
+        self.first_sign_of_life = now if self.first_sign_of_life is None else self.first_sign_of_life
+        self.last_sign_of_life = now
+
+    def report_silence(self) -> None:
+        """Log once that the process runs but gives no sign of life. Call it when no health message waits.
+
+        A process that hangs is not ended here: one that a busy machine holds up looks the same.
+        """
+        if self.popen is None or self.reported_silent or not self.alive:
+            return
+        last = self.last_sign_of_life
+        since, most = (self.started, START_ALLOWANCE) if last is None else (last, MAX_SILENCE)
+        if (silent := time.monotonic() - since) > most:
+            self.reported_silent = True
+            log.error(
+                "%s has given no sign of life for %.0f s: it hangs, or the machine is too busy. If it hangs, end it "
+                "with `kill -9 %d`: the launcher starts it again",
+                self.spec.name,
+                silent,
+                self.popen.pid,
+            )
 
     def supervise(self) -> None:
         """Start the process if it is time, and schedule a restart if it has failed.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.filter.widening import PastWindow, Widening
 
@@ -17,8 +18,8 @@ SAME_SET = 1e-9  # m, rad, ...: rounding allowed in the comparison of a measurem
 UNVERIFIED = "unverified"  # in place of a version: no model set verified the committed plan
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, eq=False)
+class Prediction(ComparedByValue):
     """The predicted set of the next measured state: |state - center| <= half_width, in the frame of `heading`.
 
     >>> from brakeline import robot_named
@@ -89,7 +90,6 @@ class BackupPlan:
     def __init__(self, robot: Robot, turn_aside: bool = False) -> None:
         self.robot, self.turn_aside = robot, turn_aside
         self.widening = Widening(robot)
-        self._scored_by = ""
         self.reset()
 
     def reset(self) -> None:
@@ -147,13 +147,11 @@ class BackupPlan:
             outside_share: the share of windows that may leave the sets.
         """
         self._judged = judges
-        if verified and model != self._scored_by:  # scores are relative to the sets of one model set
-            self.widening.forget()
-            self._scored_by = model
-        elif score is not None:
-            self.widening.judge(score, outside_share)
-        elif not judges and self._compare and self.predicted is not None:
+        if score is None and not judges and self._compare and self.predicted is not None:  # the model set before did
             self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
+        known = not verified or self.widening.use(model)
+        if score is not None and known:
+            self.widening.judge(score, outside_share)
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED

@@ -9,6 +9,7 @@ import numpy as np
 from brakeline.messaging.moving_obstacles import MovingObstacles
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
 from brakeline.safety.filter.moving_halfspaces import swept_half_spaces
 from brakeline.safety.filter.reservation import OtherReservations
@@ -19,8 +20,8 @@ from brakeline.safety.perception.scan_free_space import half_spaces as unseen_ha
 UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
-@dataclass(frozen=True)
-class BlockingConstraint:
+@dataclass(frozen=True, eq=False)
+class BlockingConstraint(ComparedByValue):
     """The constraint that a proposal violated, or came nearest to."""
 
     # `cylinder`, `box`, `sphere` or `wall`, with the prefix `moving ` if it moves; `unseen`; `robot` (another robot's

@@ -16,6 +16,7 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
 from brakeline.messaging.sensor_messages import RangeMeasurement
+from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import BlockingConstraint
 from brakeline.safety.filter.reservation import OtherReservations, Reservation
@@ -38,8 +39,8 @@ STOPPED = 0.9e-9  # an input below it surely belongs to a stop (`Robot.is_stop_i
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
 
 
-@dataclass(frozen=True)
-class Request:
+@dataclass(frozen=True, eq=False)
+class Request(ComparedByValue):
     """A request: all that the filter must know to decide on one proposal.
 
     >>> from brakeline import Filter, Obstacle
@@ -106,8 +107,8 @@ class Request:
         return committed and robot.is_standing(self.state)
 
 
-@dataclass(frozen=True)
-class Decision:
+@dataclass(frozen=True, eq=False)
+class Decision(ComparedByValue):
     """The answer to a request.
 
     >>> from brakeline import Filter, InProcess

@@ -22,14 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.obstacle import Array, Shapes
+from brakeline.messaging.value_equality import ComparedByValue
 from brakeline.safety.filter.halfspaces import TOUCHING, roomiest, viewpoints
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.qp import ConstraintRows
 
 
-@dataclass(frozen=True)
-class Reservation:
+@dataclass(frozen=True, eq=False)
+class Reservation(ComparedByValue):
     """The reservation of one robot from now on."""
 
     # center, half_width (N, d) [m]: one box for each period, world
@@ -50,8 +51,8 @@ class Reservation:
         return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 
 
-@dataclass(frozen=True)
-class OtherReservations:
+@dataclass(frozen=True, eq=False)
+class OtherReservations(ComparedByValue):
     """The reservations of n other robots: their boxes (n·N) as shapes, with the radii as margins."""
 
     shapes: Shapes

@@ -10,17 +10,19 @@ Some model sets predict plans only, so the filter cannot score windows. Then the
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.value_equality import ComparedByValue
 
 WINDOWS = 600  # last windows whose scores count
 PLANS = 200  # last windows that do not overlap, of which it is known how many left their sets
 ROUNDING = 1e-9  # of a share times `WINDOWS`
 MOST = 1e3  # beyond it nothing is verified anyway, and a request needs a finite factor
 RESERVE = 1.1  # factor on the largest score that counts
+MODELS = 4  # model sets whose scores a client keeps: replicas of a service may serve different versions
 
 
 def widening_factor(scores: Array, outside_share: float) -> Array:
@@ -39,8 +41,8 @@ def widening_factor(scores: Array, outside_share: float) -> Array:
     return np.asarray(np.clip(RESERVE * largest, 1.0, MOST))
 
 
-@dataclass(frozen=True)
-class PastWindow:
+@dataclass(frozen=True, eq=False)
+class PastWindow(ComparedByValue):
     """The last periods of a plan's length, up to the state in the request."""
 
     states: Array  # (N, n): measured states at the periods' starts
@@ -50,11 +52,20 @@ class PastWindow:
     from_start: bool = False
 
 
+@dataclass
+class _ModelScores:
+    """The scores of one model set, which are relative to its sets."""
+
+    scores: Array = field(default_factory=lambda: np.zeros(WINDOWS))  # score i stands at i modulo WINDOWS
+    count: int = 0
+    factor: float = 1.0
+    left: deque[bool] = field(default_factory=lambda: deque(maxlen=PLANS))
+
+
 class Widening:
     """The last measured states and executed inputs of one robot, and the factor that follows from their scores.
 
     Attributes:
-        left: of the last `PLANS` windows that do not overlap, whether each left its sets as they were widened.
         factor: the factor on every set: at least 1.
     """
 
@@ -63,13 +74,32 @@ class Widening:
         self.interrupt()
         self.forget()
 
+    @property
+    def left(self) -> deque[bool]:
+        """Of the last `PLANS` windows that do not overlap, whether each left its sets as they were widened."""
+        return self._of.left
+
     def forget(self) -> None:
-        """Drop all scores: another model set is in use."""
-        self._scores, self._count = np.zeros(WINDOWS), 0  # score i stands at i modulo WINDOWS
-        self.factor = 1.0
-        self.left: deque[bool] = deque(maxlen=PLANS)
-        self._uncounted = 0  # periods since the last window in `left` ended
+        """Drop the scores of every model set."""
+        self._models: dict[str, _ModelScores] = {}
         self._asked = 1.0  # the factor of the last request
+        self._begin("")
+
+    def use(self, model: str) -> bool:
+        """Count the scores of this model set from now on. Return whether it has decided before: it keeps its scores."""
+        if model == self._model:
+            return True
+        known = model in self._models
+        self._begin(model)
+        return known
+
+    def _begin(self, model: str) -> None:
+        self._model, self._of = model, self._models.pop(model, _ModelScores())
+        self._models[model] = self._of  # the last one of the dictionary decided last
+        if len(self._models) > MODELS:
+            del self._models[next(iter(self._models))]
+        self.factor = self._of.factor
+        self._uncounted = 0  # periods since the last window in `left` ended
         self._factors.extend(1.0 for _ in range(len(self._factors)))
 
     def interrupt(self) -> None:
@@ -120,9 +150,10 @@ class Widening:
             self._add(score if score > 1.0 else 0.0, share_used > 1.0, 0.0)
 
     def _add(self, score: float, left: bool, outside_share: float) -> None:
+        scored = self._of
         if self._factors and self._uncounted >= self.robot.horizon:
-            self.left.append(left)
+            scored.left.append(left)
             self._uncounted = 0
-        self._scores[self._count % WINDOWS] = score
-        self._count += 1
-        self.factor = float(widening_factor(self._scores, outside_share))
+        scored.scores[scored.count % WINDOWS] = score
+        scored.count += 1
+        self.factor = scored.factor = float(widening_factor(scored.scores, outside_share))

@@ -254,9 +254,11 @@ class ModelSet:
                 f"{path} is a description: give the model set that `brakeline certify {path} --use` wrote, "
                 "such as data/NAME/residual-one-step.safetensors"
             )
-        if isinstance(source, str) and not path.suffix and not path.exists():
-            path = SHIPPED / f"{source}.model.safetensors"
-            if not path.is_file():
+        if isinstance(source, str) and source == path.name and not path.suffix:
+            shipped = SHIPPED / f"{source}.model.safetensors"
+            if shipped.is_file():  # a file here that is called like the robot is ./ground
+                path = shipped
+            elif not path.exists():
                 names = ", ".join(sorted(p.name.partition(".")[0] for p in SHIPPED.glob("*.model.safetensors")))
                 raise BadModel(f"no model set comes with {source!r}; there are: {names}, or give the path of a file")
         try:

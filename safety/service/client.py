@@ -27,6 +27,7 @@ from brakeline.messaging.robot import Array, Robot, robot_named
 from brakeline.messaging.sensor_messages import RangeMeasurement, set_measurement
 from brakeline.messaging.topics import DECIDE
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
+from brakeline.safety.model.model_config import MOST_OUTSIDE
 from brakeline.safety.service.filter_client import (
     Answer,
     accept,
@@ -36,6 +37,7 @@ from brakeline.safety.service.filter_client import (
     scan_in,
     vector_in,
 )
+from brakeline.safety.service.plan_token import SIZE
 from brakeline.safety.service.wire import array_of, decision_of, digest, reservation_message, reservation_of
 
 DEADLINE = 0.1  # s
@@ -100,14 +102,33 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
     """Return the answer in the reply to a request.
 
     Raises:
-        SafetyError: the reply is an error, or its plan is not possible for this robot after the input in force, or its
-            prediction is not valid, or it contradicts itself.
+        SafetyError: the reply is an error, or its plan is not possible for this robot after the input in force, or
+            another field is not valid, or it says that a plan is verified and lacks what the verification gives.
     """
-    if reply.WhichOneof("result") != "decision":
-        raise SafetyError(reply.error)
+    if (result := reply.WhichOneof("result")) != "decision":
+        raise _bad_reply("", "neither a decision nor an error") if result is None else SafetyError(reply.error)
     if reply.robot != robot.name:
         raise _bad_reply("robot", f"a decision about {reply.robot[:100]!r}")
     decision = reply.decision
+    _check_plan(decision, request, robot)
+    _check_prediction(decision, robot)
+    _check_figures(decision, robot)
+    if decision.verified:
+        _check_verified(decision, robot)
+    try:
+        if request.fleet:
+            reservation_of(decision.reservation, robot)
+        answer = decision_of(decision, robot)
+    except BadRequest as error:
+        raise _bad_reply(error.field, str(error)) from error
+    plan_tokens = tuple(decision.plan_tokens)
+    return Answer.of(
+        answer, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
+    )
+
+
+def _check_plan(decision: pb.Decision, request: pb.Request, robot: Robot) -> None:
+    """Raise SafetyError if the robot cannot execute the plan after the input in force."""
     plan = array_of(decision.plan)
     if plan.size != robot.horizon * robot.action_dim:
         raise _bad_reply("plan", f"a plan of {plan.size} numbers")
@@ -119,26 +140,50 @@ def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:
         raise _bad_reply("plan", "a plan that does not end in a stop")
     if not _follows(plan, request, robot):
         raise _bad_reply("plan", "a plan that does not follow the input in force")
+
+
+def _check_prediction(decision: pb.Decision, robot: Robot) -> None:
+    """Raise SafetyError if the predicted set of the next state or the margin is not valid."""
     sizes = {len(decision.predicted_center), len(decision.predicted_half_width)}
     if sizes not in ({robot.state_dim}, {0}):  # the rivals predict nothing
         raise _bad_reply("predicted_center", "a predicted state of the wrong size")
     numbers = [*decision.predicted_center, *decision.predicted_half_width, decision.predicted_heading, decision.margin]
     if not all(map(math.isfinite, numbers)) or min(decision.predicted_half_width, default=0.0) < 0.0:
         raise _bad_reply("predicted_center", "a predicted state or a margin that is not valid")
-    if decision.verified and decision.model in ("", UNVERIFIED):  # an empty one would say that the robot stands
+
+
+def _check_figures(decision: pb.Decision, robot: Robot) -> None:
+    """Raise SafetyError if what the decision states beside its plan and sets is not valid."""
+    for name in ("time_ms", "solve_ms", "verify_ms", "queue_ms"):
+        if not math.isfinite(getattr(decision, name)):
+            raise _bad_reply(name, "a time that is not finite")
+    if not 0.0 <= decision.bound <= 1.0:  # NaN fails too
+        raise _bad_reply("bound", "a bound that is no share of plans")
+    if not 0.0 <= decision.outside_share <= MOST_OUTSIDE:
+        raise _bad_reply("outside_share", f"a share of windows outside that is not within 0 and {MOST_OUTSIDE:g}")
+    if not decision.score >= 0.0:  # infinity is a score
+        raise _bad_reply("score", "a score that is no ratio")
+    if len(decision.plan_tokens) > robot.horizon + 1 or any(len(token) != SIZE for token in decision.plan_tokens):
+        raise _bad_reply("plan_tokens", "plan tokens of the wrong size or number")
+    stopped = decision.stopped
+    if {len(stopped.normal), len(stopped.at)} not in ({robot.position_dim}, {0}):
+        raise _bad_reply("stopped", "a constraint in another number of coordinates")
+    if math.isnan(stopped.room) or not all(map(math.isfinite, (stopped.after, *stopped.normal, *stopped.at))):
+        raise _bad_reply("stopped", "a constraint that holds NaN or infinity")
+
+
+def _check_verified(decision: pb.Decision, robot: Robot) -> None:
+    """Raise SafetyError if a decision says that its plan is verified, and lacks what each verification gives."""
+    if decision.model in ("", UNVERIFIED):  # an empty one would say that the robot stands
         raise _bad_reply("model", "a verified plan without the model that verified it")
-    if decision.verified and decision.kind == pb.RECOVERING:
+    if decision.kind == pb.RECOVERING:
         raise _bad_reply("kind", "a verified plan to recover: nothing verifies such plans")
-    try:
-        if request.fleet:
-            reservation_of(decision.reservation, robot)
-        result = decision_of(decision, robot)
-    except BadRequest as error:
-        raise _bad_reply(error.field, str(error)) from error
-    plan_tokens = tuple(decision.plan_tokens)
-    return Answer.of(
-        result, robot, queue_ms=decision.queue_ms, token_rejected=decision.token_rejected, plan_tokens=plan_tokens
-    )
+    if len(decision.tube_center) != robot.horizon * robot.position_dim:
+        raise _bad_reply("tube_center", "a verified plan without its tube")
+    if not decision.predicted_center:
+        raise _bad_reply("predicted_center", "a verified plan without the predicted state")
+    if not decision.HasField("bound"):
+        raise _bad_reply("bound", "a verified plan without the bound that its model set states")
 
 
 def _follows(plan: Array, request: pb.Request, robot: Robot) -> bool:

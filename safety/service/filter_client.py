@@ -24,7 +24,7 @@ from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.request import Decision
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Answer(Decision):
     """A decision as a client returns it.
 

@@ -62,7 +62,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self,
         robot: RobotWithTask | str,
         num_envs: int,
-        arena: str = "default",
+        arena: str | None = None,
         *,
         conditions: Conditions | None = None,
         seed_key: int = 0,
@@ -88,6 +88,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         if num_envs < 1:
             raise ValueError(f"a batch has at least one robot, not {num_envs}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
+        arena = self.robot.task.default_arena if arena is None else arena
         self.conditions, self.num_envs, self.arena_name = conditions or Conditions(), num_envs, arena
         check_batch(self.robot, arena, self.conditions)
         self.reward, self.seed_key = reward or self.robot.task.reward, seed_key

@@ -2,17 +2,20 @@
 service.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from brakeline.actors import actor_process
-from brakeline.actors.actor_process import STOP_PRACTICE, ActorSettings, StopPractice, run
+from brakeline.actors.actor_process import STOP_PRACTICE, ActorRunner, ActorSettings, StopPractice, run
+from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.learner_client import LearnerClient
 from brakeline.deploy.vehicle_factory import environment, fleet_world
@@ -103,6 +106,39 @@ def test_the_learner_refuses_another_layout(buses: tuple[Bus, Bus]) -> None:
     ScriptedLearner(buses[0]).layout = "that of another version"
     with pytest.raises(RefusedByLearner, match="layout: another"):
         LearnerClient(buses[1], GROUND, "actor-0").join(0, 0, never)
+
+
+def test_an_actor_asks_again_after_a_damaged_reply_to_its_join(caplog: pytest.LogCaptureFixture) -> None:
+    weights = ScriptedLearner.weights(cast(Any, SimpleNamespace(version=1)))
+    good = pb.JoinReply(weights=weights, flow=pb.Flow(robot="ground", incarnation=1), episode=3)
+    replies = [b"\xff\xff", good.SerializeToString()[:-3], b"", good.SerializeToString()]
+    bus: Any = SimpleNamespace(subscribe=lambda *_, **__: None, ask=lambda *_, **__: replies.pop(0))
+    client = LearnerClient(bus, GROUND, "actor-0")
+    with caplog.at_level(logging.INFO):
+        assert client.join(0, 0, never) == 3
+    assert not replies and version(client) == 1
+    assert "waits for a learner: its reply cannot be read" in caplog.text
+
+
+def test_the_physics_change_after_the_steps_of_the_whole_run_also_when_the_actor_was_restarted() -> None:
+    weights = ScriptedLearner.weights(cast(Any, SimpleNamespace(version=1)))
+    replies = [
+        pb.JoinReply(weights=weights, flow=pb.Flow(incarnation=run), steps=steps) for run, steps in ((1, 70), (2, 90))
+    ]
+    bus: Any = SimpleNamespace(subscribe=lambda *_, **__: None, ask=lambda *_, **__: replies.pop(0).SerializeToString())
+    client, changes = LearnerClient(bus, GROUND, "actor-0"), list[tuple[int, float]]()
+    client.join(0, 0, never)
+    proposer = SimpleNamespace(earlier_steps=client.earlier_steps, ready=lambda *_: True)
+    runner = SimpleNamespace(index=0)
+    runner.env = SimpleNamespace(alter=lambda payload_kg: changes.append((runner.index, payload_kg)))
+    actor = SimpleNamespace(
+        runner=runner, proposer=proposer, change=PhysicsChange(100, 2.0), _changed=False, next_episode=3
+    )
+    for runner.index in range(50):
+        ActorRunner.may_step(cast(Any, actor), never)
+    assert changes == [(30, 2.0)], "70 steps came before the restart"
+    client.join(50, 5, never)
+    assert client.earlier_steps == 70, "the actor goes on: only the learner was restarted"
 
 
 def test_wait_returns_when_the_learner_permits_the_step(buses: tuple[Bus, Bus]) -> None:

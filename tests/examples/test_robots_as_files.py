@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from itertools import islice
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
+from brakeline.deploy.cli import main
 from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
@@ -214,3 +216,27 @@ def test_the_trained_policy_lies_beside_the_task(kind: RobotWithTask) -> None:
     policy = policy_named("trained", kind, 0)
     observation, info = environment(kind, "default", FRESH).reset(seed=0)
     assert policy(observation, info).shape == (kind.action_dim,)
+
+
+def test_check_finds_every_mistake_in_the_code_that_a_task_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("car.toml", "car.task.toml", "car.py", "car.xml"):
+        (tmp_path / name).write_text((EXAMPLES / "car" / name).read_text())
+    file, task = str(tmp_path / "car.toml"), tmp_path / "car.task.toml"
+    assert main(["robot", "check", file]) == 0 and "no mistake" in capsys.readouterr().out
+    right = task.read_text()
+    task.write_text(right.replace("car.py:Greedy", "car.py:Gredy").replace(":PlanarObservation", ":np"))
+    assert main(["robot", "check", file, "--json"]) == 1
+    problems = dict(json.loads(capsys.readouterr().out)["problems"])
+    assert problems.keys() == {"policies.greedy", "senses"} and "Gredy" in problems["policies.greedy"]
+    task.write_text(right.replace("car.py", "broken.py"))
+    for code, said in (
+        ("import nothing_of_this_name", "nothing_of_this_name"),
+        ("1 / 0", "ZeroDivision"),
+        ("(", "Synt"),
+    ):
+        (tmp_path / "broken.py").write_text(code)
+        assert main(["robot", "check", file]) == 1
+        told = capsys.readouterr().err
+        assert told.count(said) >= 4, "the second policy from the file too, not half of a module"

@@ -76,6 +76,7 @@ def test_ledger_over_restarts():
     assert ledger.record("a", 0, 5, 6)  # one that was on its way; its index is of the actor before
     assert ledger.record("a", 1, 0, 1)
     assert (ledger.missing, ledger.places["a"].last_index) == (0, 1)
+    assert [one.steps_of("a") for one in (ledger, again)] == [7, 5] and ledger.steps_of("b") == 0
 
 
 def expected_transitions(arrived: list[ActorStep], n: int) -> list[Transition]:

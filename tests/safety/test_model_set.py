@@ -248,3 +248,14 @@ def test_other_bytes_are_refused_with_a_reason():
             unpack(garbage, "entry")
     with pytest.raises(BadTensors, match="no object"):
         unpack(pack({}, "entry", [1]), "entry")
+
+
+def test_a_file_that_is_called_like_a_robot_does_not_replace_the_model_set_that_comes_with_it(tmp_path, monkeypatch):
+    version = ModelSet.load("ground").version
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ground").write_bytes(b"not this one")
+    (tmp_path / "quadrotor").mkdir()
+    assert ModelSet.load("ground").version == version and ModelSet.load("quadrotor").robot.name == "quadrotor"
+    for path in ("./ground", tmp_path / "ground"):
+        with pytest.raises(BadModel, match="ground"):
+            ModelSet.load(path)

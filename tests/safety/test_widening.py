@@ -13,7 +13,7 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
-from brakeline.safety.filter.widening import MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
+from brakeline.safety.filter.widening import MODELS, MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
 from brakeline.safety.model.model_config import MOST_OUTSIDE
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
@@ -191,6 +191,26 @@ def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_sco
     assert decision_of(sent, ROBOT).score == answer.score and decision_of(sent, ROBOT).judges
     plan.accept(answer.plan, "another", answer.predicted, True, judges=True, score=5.0)
     assert plan.widening.factor == 1.0
+
+
+def test_replicas_with_different_model_sets_keep_the_scores_of_each():
+    """The client asks all replicas again from time to time, so the one that answers changes."""
+    plan, box, still = BackupPlan(ROBOT), Prediction(np.zeros(5), np.full(5, 0.1), 0.0), np.zeros((N, 2))
+
+    def answered(model, score=None, used=0.0):
+        plan.measured(np.full(5, 0.1 * used))
+        plan.accept(still, model, box, True, judges=score is not None, score=score)
+        return plan.widening.factor
+
+    answered("old"), answered("new")
+    assert answered("old", 3.0) == pytest.approx(3.0 * RESERVE), "it has decided before: its score counts"
+    assert answered("new", 1.5) == pytest.approx(1.5 * RESERVE)
+    assert answered("old", 0.1) == pytest.approx(3.0 * RESERVE) and answered("new", 0.1) == pytest.approx(1.5 * RESERVE)
+    assert answered("old", used=2.0) == pytest.approx(3.0 * RESERVE), "the new one predicted the period"
+    assert answered("new", 0.1) == pytest.approx(2.0 * 3.0 * RESERVE**2), "at the widening of the request before"
+    for name in range(MODELS):
+        assert answered(f"later {name}", 9.0) == 1.0
+    assert answered("new", 0.1) == 1.0, "a client keeps the scores of few model sets"
 
 
 def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from brakeline.deploy.data.collect import record
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadWeights, UnknownName, UnknownRobot, UnknownTask
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
@@ -145,6 +146,20 @@ def test_the_episode_seed_determines_the_episode(make: Make) -> None:
     for other in (observed(env, "random", 6), observed(make(seed_key=1), "random", 5)):
         assert not np.array_equal(first[0], other[0])
     assert env.reset(options={"episode_seed": 5})[1]["episode_seed"] == 5
+
+
+def test_a_task_without_an_arena_called_default_begins_in_its_first_one() -> None:
+    task = GROUND.task
+    mine = with_task(GROUND, replace(task, arenas={"hall": task.arenas["open"], "yard": task.arenas["dense"]}))
+    assert NavigationEnv(mine).reset(seed=0)[1]["arena"].name == "hall"
+    assert NavigationEnv(mine, "yard").arena_name == "yard"
+    batch = BatchNavigationEnv(mine, 1)
+    assert batch.arena_name == "hall"
+    batch.close()
+    with pytest.raises(UnknownName, match="there are: hall, yard"):
+        NavigationEnv(mine, "default")
+    assert NavigationEnv(GROUND).arena_name == "default"
+    assert len(next(record(mine, 1, 5, Conditions())).states) > 1
 
 
 def test_a_reset_can_change_the_arena_and_its_seed_determines_the_sequence_of_episodes() -> None:

@@ -166,6 +166,9 @@ def test_a_conversion_of_a_column_in_si_units_is_refused(driven, tmp_path, capsy
     path, out = write_csv(tmp_path / "drive.csv", *driven), tmp_path / "none.safetensors"
     text = refused(capsys, ["import", path, "--robot", FILE, "--out", out, "--unit", word])
     assert f"already: only without --unit {word} does the motion agree" in text and not out.exists()
+    mine = tmp_path / "my.toml"
+    text = refused(capsys, ["robot", "new", mine, "--from", path, "--unit", word])
+    assert f"already: only without --unit {word} does the motion agree" in text and not mine.exists()
 
 
 def test_the_unit_1_takes_a_column_as_it_is(driven, plain, tmp_path):

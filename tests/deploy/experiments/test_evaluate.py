@@ -86,3 +86,12 @@ def test_what_was_one_question_is_asked_again_as_one():
 def test_an_evaluation_of_nothing_is_refused(change):
     with pytest.raises(ValueError, match="at least 1 episode"):
         replace(TRAINED, **change)
+
+
+@pytest.mark.parametrize("name", ["trained", "untrained", "astar"])
+def test_a_file_that_is_called_like_a_policy_is_not_sent_to_the_workers(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(b"another policy")
+    assert all(part.policy_file is None for part in parts_of(GROUND, replace(TRAINED, policy=name)))
+    (part,) = parts_of(GROUND, replace(TRAINED, policy=f"./{name}"))
+    assert part.policy_file == b"another policy", "a path names the file"

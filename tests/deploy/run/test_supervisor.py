@@ -18,6 +18,7 @@ from brakeline.deploy.run.supervisor import (
 )
 from brakeline.errors import CommandLost, LaunchError
 from brakeline.messaging.bus import BusSettings
+from brakeline.messaging.process_runtime import MAX_SILENCE
 
 
 @pytest.fixture
@@ -74,6 +75,44 @@ def test_a_run_goes_on_without_a_process_that_it_does_not_need(clock, tmp_path, 
     for _ in range(MOST_FAILURES):
         lives(child, clock, 0.5, 2.0)
     assert child.finished and "the run goes on without it" in caplog.text
+
+
+class Hanging(SupervisedProcess):
+    """Runs until it is killed."""
+
+    def start(self, held: bool = False) -> None:
+        self.popen = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600.0)"])
+        self.started = supervisor.time.monotonic()
+
+
+def test_a_process_that_hangs_is_reported_once_and_when_it_goes_on(clock, tmp_path, caplog) -> None:
+    child = Hanging(ProcessSpec("actor-0", "actor", "ground"), tmp_path)
+    child.supervise()
+    assert child.popen is not None
+    try:
+        clock[0] += START_ALLOWANCE - 1.0
+        child.report_silence()
+        child.record_sign_of_life(child.popen.pid)
+        clock[0] += MAX_SILENCE - 1.0
+        child.report_silence()
+        assert not caplog.text
+        for _ in range(3):
+            clock[0] += 1.5
+            child.report_silence()
+        assert caplog.text.count("actor-0 has given no sign of life for 10 s") == 1
+        assert f"kill -9 {child.popen.pid}" in caplog.text
+        child.record_sign_of_life(child.popen.pid)
+        assert "actor-0 gives signs of life again" in caplog.text
+        clock[0] += MAX_SILENCE + 1.0
+        child.report_silence()
+        assert caplog.text.count("no sign of life") == 2
+    finally:
+        child.popen.kill()
+    child.popen.wait()
+    child.supervise()
+    assert child.restarts == 1, "as the report promises"
+    child.report_silence()
+    assert caplog.text.count("no sign of life") == 2
 
 
 class Diverging(SupervisedProcess):
