@@ -53,7 +53,7 @@ STATED = {
 @pytest.mark.parametrize(
     "words, said",
     [
-        ("safety ground --listen nonsense", "cannot listen on nonsense"),
+        ("safety ground --listen nonsense", "'nonsense' is no endpoint: give PROTOCOL/HOST:PORT"),
         ("recorder {folder}/x.mcap --listen smoke/signals", "smoke/signals is open to other machines"),
         ("train ground --listen tls/127.0.0.1 --out {folder}/run", "invalid socket address"),
         ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "there are: crossing, default"),
