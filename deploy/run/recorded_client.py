@@ -149,7 +149,7 @@ class RecordedClient:
         return action
 
     def record_outcome(self, reward: float, *, goal: bool = False, collision: bool = False) -> None:
-        """Record the reward of a period, after its `decide` or `fallback`, and after the last one how the episode ended.
+        """Record a period's reward, after its `decide` or `fallback`; after the last one also how the episode ended.
 
         A reward that is not finite, or above 1e9, counts as zero, because a log with it has no sums.
         """
