@@ -149,7 +149,7 @@ def test_a_wrong_choice_is_answered_with_the_possible_ones(command, words):
 def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, tmp_path):
     for _ in range(2):
         status, _, err = command(
-            "train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "tcp/127.0.0.1:99999", "--no-secured"
+            "train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "tcp/127.0.0.1:x", "--no-secured"
         )
         assert status == 1 and "cannot listen" in err
 
