@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import struct
 import warnings
 from collections.abc import Iterator
@@ -175,13 +176,16 @@ def to_minari(log: Log, robot: RobotWithTask, name: str) -> dict[str, Any]:
     `$MINARI_DATASETS_PATH`, by default ~/.minari/datasets.
 
     Raises:
-        ExportError: the data set exists, or the log has no step of this robot.
+        ExportError: the data set exists, or its name has no version. The log has no step of this robot, or one without
+            the observation of the robot's task.
         LogError: as `Log`.
     """
     import gymnasium
     import minari
     from minari.storage.datasets_root_dir import get_dataset_path
 
+    if re.search(r"-v\d+$", name) is None:
+        raise ExportError(f"the Minari data set {name!r}: end its name in -v<number>, as in brakeline/ground-v0")
     path = Path(get_dataset_path(name))
     if path.exists():
         raise ExportError(f"{path} exists already: give another name, e.g. with the next -v<number>")
@@ -198,7 +202,8 @@ def to_minari(log: Log, robot: RobotWithTask, name: str) -> dict[str, Any]:
     dataset: Any = None
     count = steps = 0
     while batch := [
-        _buffer(number, episode) for number, episode in enumerate(islice(all_episodes, EPISODES_AT_ONCE), count)
+        _buffer(number, episode, robot.task.observation_dim)
+        for number, episode in enumerate(islice(all_episodes, EPISODES_AT_ONCE), count)
     ]:
         if dataset is None:
             with warnings.catch_warnings():
@@ -211,10 +216,12 @@ def to_minari(log: Log, robot: RobotWithTask, name: str) -> dict[str, Any]:
     return {"path": str(path), "episodes": count, "steps": steps}
 
 
-def _buffer(number: int, steps: list[pb.Step]) -> Any:
+def _buffer(number: int, steps: list[pb.Step], dim: int) -> Any:
     from minari.data_collector import EpisodeBuffer
 
     observations = [steps[0].observation, *(step.next_observation for step in steps)]
+    if any(len(observation) != dim for observation in observations):
+        raise ExportError(f"a step without the {dim} observed values of the task, such as one of a program: give --csv")
     truncations = [step.truncated for step in steps]
     truncations[-1] |= not steps[-1].terminated
     infos = {name: np.array([getattr(step, name) for step in steps]) for name in INFOS}

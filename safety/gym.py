@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 # In place of a decision's kind: no service answered, or the state could not be used, so the backup plan continued.
 UNANSWERED = "unanswered"
+# How an episode ended, in the words of `RecordedClient.record_outcome` and of `info`.
+OUTCOMES = {"goal": "at_goal", "collision": "collision"}
 
 
 class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -128,6 +130,9 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         executed = self.backup_plan.next_input
         safe_action = cast_action(self._actions.control_to_action(executed), self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(safe_action)
+        if (record := getattr(self.client, "record_outcome", None)) is not None:  # of a `RecordedClient`
+            ended = terminated or truncated
+            record(float(reward), **{name: ended and bool(info.get(key)) for name, key in OUTCOMES.items()})
         penalty = correction_penalty(self.client.robot, proposed, before, executed, self.penalty)
         figures = diagnostics(answer, reason) | {"proposed": proposed, "executed": executed}
         info = info | {"safety": answer, "proposed": action, "penalty": penalty, "diagnostics": figures}

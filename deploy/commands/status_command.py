@@ -27,13 +27,15 @@ class StatusCommand:
     def run(self) -> int:
         """Listen, and print the processes. Returns the exit status."""
         from brakeline.logs.metrics import learner  # imports NumPy, which the help does not need
+        from brakeline.logs.watch.run_history import NOTE  # the curves of the live page
 
         processes: dict[str, Any] = {}
         learners: dict[str, Any] = {}
 
         def receive_health(sample: Sample) -> None:
             health = sample.message()
-            processes[health.process] = {"pid": health.pid, **dict(health.figures), **dict(health.notes)}
+            notes = {name: text for name, text in health.notes.items() if name != NOTE}
+            processes[health.process] = {"pid": health.pid, **dict(health.figures), **notes}
 
         def receive_learner(sample: Sample) -> None:
             learners[sample.message().robot] = learner(sample.message())

@@ -2,7 +2,8 @@
 
 with RecordedClient(InProcess(Filter.load("ground")), "runs/mine") as safety:
     answer = safety.decide(state, action, obstacles)      # once a period, as without a log
-    safety.reset()                                        # the end of an episode
+    safety.record_outcome(reward)                         # if your program has rewards
+    safety.reset(goal=True)                               # the end of an episode
 
 brakeline analyse runs/mine --html report.html
 """
@@ -26,6 +27,7 @@ from brakeline.extras import missing_extra
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
 from brakeline.messaging.bus.inbox import Inbox
+from brakeline.messaging.message_checks import MAX_VALUE, NAME
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
@@ -46,12 +48,14 @@ PERIOD = 0.5  # s between two writes
 class RecordedClient:
     """A client of the filter that writes each request, each answer and each step of the robot to a log.
 
-    It has the methods of the client that it wraps, so a `SafetyWrapper` takes it, too. A thread writes the log twice a
-    second, as `brakeline recorder` does; while the disk is full, it keeps up to 64 MiB in memory and tries again.
+    It has the methods of the client that it wraps, so a `SafetyWrapper` takes it, too, and calls `record_outcome`. A
+    thread writes the log twice a second, as `brakeline recorder` does; while the disk is full, it keeps up to 64 MiB in
+    memory and tries again.
 
     The log states what your program knows: positions and speeds are the measured ones, clearances are those to the
-    obstacles of the requests (none with a scan alone), and rewards are zero. A step is complete when the next request
-    has the state after it, so the last decision of an episode has no step.
+    obstacles of the requests (none with a scan alone). Rewards, goals and collisions are those of `record_outcome` and
+    `reset`; without these calls they are zero. A step is complete when the next request has the state after it, so the
+    last decision of an episode has no step, and its outcome counts for the step before.
 
     >>> from brakeline import Filter, InProcess
     >>> with RecordedClient(InProcess(Filter.load("ground")), FOLDER / "mine") as safety:
@@ -70,8 +74,14 @@ class RecordedClient:
         Raises:
             FileExistsError: the folder has a log. Nothing is ever written over it.
             OSError: the log cannot be written.
+            TypeError: `client` is no client.
+            ValueError: `name` has other characters.
             MissingExtra: the extra `logs` is not installed.
         """
+        if not isinstance(client, FilterClient):
+            raise TypeError(f"a client is needed here, not a {type(client).__name__}: give InProcess(filter)")
+        if not NAME.fullmatch(name):
+            raise ValueError(f"the name {name!r:.200}: use up to 100 letters, digits, dots, dashes and underscores")
         self.client, self.path = client, Path(folder) / LOG
         if self.path.exists():
             raise FileExistsError(f"{self.path} exists: give the log a folder of its own")
@@ -137,6 +147,15 @@ class RecordedClient:
         action = self.client.fallback()
         self._begin_step(action.tolist(), action)
         return action
+
+    def record_outcome(self, reward: float, *, goal: bool = False, collision: bool = False) -> None:
+        """Record a period's reward, after its `decide` or `fallback`; after the last one also how the episode ended.
+
+        A reward that is not finite, or above 1e9, counts as zero, because a log with it has no sums.
+        """
+        if self._pending is not None:
+            self._pending.reward = reward if abs(reward) <= MAX_VALUE else 0.0
+            self._pending.goal, self._pending.collision = goal, collision
 
     def reset(self, *, goal: bool = False, collision: bool = False) -> None:
         """End the episode and begin the next one with a robot that stands still. The arguments say how it ended."""
@@ -207,6 +226,9 @@ class RecordedClient:
     def _end_episode(self, goal: bool = False, collision: bool = False) -> None:
         """Mark the last complete step as the episode's end. The period after it has no measured end, so no step."""
         if self._complete is not None:
+            if (last := self._pending) is not None:
+                self._complete.reward += last.reward
+                goal, collision = goal or last.goal, collision or last.collision
             self._complete.goal, self._complete.collision = goal, collision
             self._complete.terminated, self._complete.truncated = goal or collision, not (goal or collision)
         self._put_complete()

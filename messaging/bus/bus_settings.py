@@ -20,6 +20,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0  # between two attempts to connect to a ro
 MOST_UNAUTHENTICATED = 4000  # connections that wait for their authentication at a router
 AUTHENTICATION_TIME = 3.0  # for it [s]
 MOST_SESSIONS = 10_000  # of a router
+ENDPOINT = re.compile(r"[a-z][a-z0-9_]*(-[a-z0-9_]+)?/.+", re.DOTALL)  # PROTOCOL/ADDRESS
 SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")  # the place in Zenoh's source in an error message
 
 
@@ -65,13 +66,15 @@ class BusSettings:
         """Check the settings.
 
         Raises:
-            ValueError: there is no endpoint, or an endpoint needs keys and there are none, or the reverse.
+            ValueError: there is no endpoint, or one has another form, or needs keys and there are none, or the reverse.
             BadKeys: other machines could connect, and there are no keys.
         """
         endpoints = (*self.connect, *self.listen)
         if not endpoints:
             raise ValueError("a bus needs an endpoint: `connect` to a router, or `listen` to be one")
         for endpoint in endpoints:
+            if not ENDPOINT.match(endpoint):
+                raise ValueError(f"{endpoint!r} is no endpoint: give PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447")
             if endpoint.startswith("tls/") != (self.keys is not None):
                 raise ValueError(f"{endpoint}: with keys a bus is at tls/HOST:PORT, and without it is not")
         open_to_others = [endpoint for endpoint in self.listen if not local(endpoint)]

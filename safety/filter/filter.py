@@ -85,8 +85,11 @@ class Filter:
         """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs.
 
         Raises:
+            TypeError: `model` is no model set.
             ValueError: the clearance margin is negative or not finite.
         """
+        if not isinstance(model, ModelSet):
+            raise TypeError(f"Filter takes a ModelSet, not a {type(model).__name__}: give Filter.load(NAME_OR_PATH)")
         if clearance_margin is not None and not 0.0 <= clearance_margin < math.inf:  # NaN fails too
             raise ValueError(f"a clearance margin is a finite number of at least 0, not {clearance_margin:g}")
         self.model = model

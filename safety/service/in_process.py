@@ -51,8 +51,11 @@ class InProcess:
                 validation report states it. Defaults to the limit in the robot's description.
 
         Raises:
+            TypeError: `method` is neither.
             TooLoose: the report states a larger probability, or there is no report.
         """
+        if not hasattr(method, "decide"):
+            raise TypeError(f"a filter is needed here, not a {type(method).__name__}: give Filter.load(NAME_OR_PATH)")
         from brakeline.safety.model.stated_bound import check_bound  # a client of a service loads no model
 
         check_bound(getattr(method, "model", None), method.robot, accept_bound)

@@ -53,7 +53,7 @@ STATED = {
 @pytest.mark.parametrize(
     "words, said",
     [
-        ("safety ground --listen nonsense", "cannot listen on nonsense"),
+        ("safety ground --listen nonsense", "'nonsense' is no endpoint: give PROTOCOL/HOST:PORT"),
         ("recorder {folder}/x.mcap --listen smoke/signals", "smoke/signals is open to other machines"),
         ("train ground --listen tls/127.0.0.1 --out {folder}/run", "invalid socket address"),
         ("actor ground --listen tcp/127.0.0.1:0 --arena ballroom", "there are: crossing, default"),
@@ -149,7 +149,7 @@ def test_a_wrong_choice_is_answered_with_the_possible_ones(command, words):
 def test_a_run_that_could_not_listen_can_be_started_again(command, data_folder, tmp_path):
     for _ in range(2):
         status, _, err = command(
-            "train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "nonsense", "--no-secured"
+            "train", "--experiment", "debug", "--out", tmp_path / "run", "--listen", "tcp/127.0.0.1:x", "--no-secured"
         )
         assert status == 1 and "cannot listen" in err
 

@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from brakeline import Filter, InProcess, RecordedClient
 from brakeline.messaging import brakeline_pb2 as pb
 from tests.robots import GROUND
 
@@ -66,6 +67,19 @@ def test_minari_loads_the_episodes(log, tmp_path, monkeypatch, command, figures)
         assert episode.infos["decision"].tolist() == [s.decision for s in mine]
     status, _, err = command("export", log, "--minari", "brakeline/ground-v0")
     assert status == 1 and "exists already" in err
+
+
+def test_minari_refuses_a_name_without_a_version_and_a_log_without_observations(log, tmp_path, monkeypatch, command):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    status, _, err = command("export", log, "--minari", "brakeline/ground")
+    assert status == 1 and "end its name in -v<number>" in err
+    with RecordedClient(InProcess(Filter.load("ground")), tmp_path / "mine") as client:
+        for _ in range(3):
+            client.decide([0.0] * 5, [0.0, 0.0], known_free=True)
+    status, _, err = command("export", client.path, "--minari", "brakeline/mine-v0")
+    assert status == 1 and "without the 26 observed values of the task" in err
+    assert not (tmp_path / "minari" / "brakeline" / "mine-v0").exists()
 
 
 def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, command, figures) -> None:

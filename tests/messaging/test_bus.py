@@ -153,6 +153,12 @@ def test_without_a_router_a_client_says_so_after_its_patience_and_two_routers_ca
         join("second", listen=True)
 
 
+@pytest.mark.parametrize("wrong", ["127.0.0.1:7447", "ground", "tcp", "tcp/", "/x", "tcp:127.0.0.1:7447"])
+def test_an_endpoint_without_protocol_or_address_is_refused_at_once(wrong: str) -> None:
+    with pytest.raises(ValueError, match=r"no endpoint: give PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447"):
+        BusSettings(connect=(wrong,)).check()
+
+
 def test_a_client_waits_for_its_router(join: Join) -> None:
     opened: list[Bus] = []
     waiting = threading.Thread(target=lambda: opened.append(join("actor-0", patience=10.0)))

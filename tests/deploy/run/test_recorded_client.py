@@ -138,3 +138,55 @@ def test_a_wrapped_environment_ends_episodes(method, tmp_path) -> None:
             for _ in range(4):
                 wrapped.step(np.array([0.2, 0.0]))
     assert [(s.episode, s.step) for s in messages(client.path, "step")] == [(k, i) for k in range(2) for i in range(3)]
+
+
+class Lane(gymnasium.Env):
+    """A robot that follows its inputs at once, for four periods: each earns 2, and the episode ends as it is named."""
+
+    action_space = gymnasium.spaces.Box(np.array([0.0, -0.5]), np.array([0.25, 0.5]), dtype=float)
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,), dtype=float)
+    ends = ("at_goal", "collision", "neither")
+
+    def __init__(self):
+        self.episode = -1
+
+    def reset(self, *, seed=None, options=None):
+        self.state, self.periods, self.episode = np.zeros(5), 0, self.episode + 1
+        return self.state, {"state": self.state, "obstacles": []}
+
+    def step(self, action):
+        self.state, self.periods = after(self.state, action), self.periods + 1
+        ended, end = self.periods == 4, self.ends[self.episode]
+        info = {"state": self.state, "obstacles": [], "at_goal": end == "at_goal", "collision": end == "collision"}
+        return self.state, 2.0, ended and end != "neither", ended and end == "neither", info
+
+
+def test_the_log_of_a_wrapped_environment_has_its_rewards_and_how_its_episodes_ended(method, tmp_path, figures) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as client:
+        env = SafetyWrapper(Lane(), client, penalty=1.0)
+        for _ in Lane.ends:
+            env.reset()
+            while not any(env.step(np.array([0.2, 0.0]))[2:4]):
+                pass
+    steps = messages(client.path, "step")
+    assert [[s.reward for s in steps if s.episode == k] for k in range(3)] == [[2.0, 2.0, 4.0]] * 3
+    ends = [(s.goal, s.collision, s.terminated, s.truncated) for s in steps if s.terminated or s.truncated]
+    assert ends == [(True, False, True, False), (False, True, True, False), (False, False, False, True)]
+    run = figures("analyse", client.path)
+    assert [run[name] for name in ("episodes", "goals", "collisions", "mean_reward")] == [3, 1, 1, 8.0]
+
+
+def test_a_reward_that_no_log_can_hold_counts_as_zero(method, tmp_path) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        for reward in (np.nan, -np.inf, 1e300, 3.0, 0.0):
+            safety.decide([0] * 5, [0.0, 0.0], known_free=True)
+            safety.record_outcome(reward)
+    assert [s.reward for s in messages(safety.path, "step")] == [0.0, 0.0, 0.0, 3.0]
+
+
+def test_what_is_no_client_or_no_name_is_refused_before_a_log_begins(method, tmp_path) -> None:
+    with pytest.raises(TypeError, match=r"not a Filter: give InProcess\(filter\)"):
+        RecordedClient(method, tmp_path / "mine")
+    with pytest.raises(ValueError, match="use up to 100 letters"):
+        RecordedClient(InProcess(method), tmp_path / "mine", "my robot")
+    assert not (tmp_path / "mine").exists()
