@@ -71,7 +71,8 @@ class Px4Flight:
         self._times = dict.fromkeys(INTERVALS, 0.0)  # s, of the newest message of each kind
         self.setpoint = np.zeros(3)  # m/s
         self.starts = 0  # of PX4
-        self.lost = ""  # why PX4 has not followed our setpoints since `enter`, or its state does not count; empty: it did
+        # why PX4 has not followed our setpoints since `enter`, or its state does not count; empty: all is well
+        self.lost = ""
 
     @property
     def flies(self) -> bool:

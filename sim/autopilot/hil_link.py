@@ -106,7 +106,7 @@ class HilLink:
                 "the autopilot was built without lockstep; build PX4 for SITL with lockstep, its default"
             )
         if message.time_usec > self._now:
-            raise AutopilotGone("the autopilot does not take its time from the simulator: its command is for the future")
+            raise AutopilotGone("the autopilot does not take its time from the simulator: its command is ahead of it")
         controls = message.controls[:ROTORS]
         if not all(map(math.isfinite, controls)):
             raise AutopilotGone(f"the autopilot commands its motors with {list(controls)}")
