@@ -39,6 +39,7 @@ from brakeline.actors.mavlink.vehicle_client import VehicleClient
 from brakeline.actors.mavlink.vehicle_messages import FlightRequest
 from brakeline.actors.proposers import PolicyFactory, Stop
 from brakeline.errors import BusError, Mismatch, TakeoffNotVerified
+from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -160,6 +161,7 @@ class FlightRunner(ActorRunner):
         self._stages, self._next_stages = stages, cycle(stages)
         super().__init__(process, settings, 0, self._environment(conditions), propose, continuous=True)
         self._vehicle: RealTimeVehicle | None = None
+        self._began_lost = False  # whether the state before the step did not count
         self.answers: Counter[str] = Counter()  # "in time", "late", "none", "lost" or "not needed"
         self.steps, self.episodes, self.exchanges = map(publisher.wrap, (self.steps, self.episodes, self.exchanges))
         self.frames.publisher = publisher.wrap(self.frames.publisher)
@@ -182,6 +184,7 @@ class FlightRunner(ActorRunner):
     def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
         """Commit the answer's plan. Return an outcome without an answer if the plan is late, or its state is lost."""
         period, answer = self.vehicle.current_period, outcome.answer
+        self._began_lost = bool(period.lost)
         if period.lost:
             result, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
         elif outcome.failure == STOP_PRACTICE:
@@ -194,6 +197,11 @@ class FlightRunner(ActorRunner):
             result, outcome = "late", replace(outcome, answer=None, failure="Late: its period had begun")
         self.answers[result] += 1
         return outcome
+
+    def publish(self, step: pb.Step) -> None:
+        """Publish a step. Nothing may learn from it if the vehicle did not follow it, or a state of it is not known."""
+        step.lost = self._began_lost or bool(self.vehicle.current_period.lost)
+        super().publish(step)
 
     def brake(self) -> None:
         """Wait until the vehicle has flown its committed plan to the end, and hovers."""

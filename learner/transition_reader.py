@@ -34,6 +34,8 @@ class StepReader:
             raise BadStep("robot", f"{step.robot!r}, not {self.robot.name!r}")
         if not step.actor:
             raise BadStep("actor", "empty")
+        if step.lost:
+            raise BadStep("lost", "true: the vehicle did not follow the action, or its state is not known")
         if step.index == 0:
             raise BadStep("index", "counts from 1")
         if max(step.episode, step.step) >= LATEST:

@@ -149,6 +149,8 @@ def episodes(log: Log, robot: RobotWithTask) -> Iterator[list[pb.Step]]:
     running: dict[str, list[pb.Step]] = {}
     for record in robot_steps(log, robot):
         step: pb.Step = record.message
+        if step.lost:  # it shows nothing about its action
+            continue
         steps = running.setdefault(step.actor, [])
         if steps:
             last = steps[-1]

@@ -1004,6 +1004,7 @@ class Step(_message.Message):
     BROKEN_FIELD_NUMBER: _builtins.int
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     CLOSEST_FIELD_NUMBER: _builtins.int
+    LOST_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -1059,6 +1060,8 @@ class Step(_message.Message):
     """as the decision says"""
     closest: _builtins.float
     """m, least clearance at the physics samples of the period; absent: a log from before"""
+    lost: _builtins.bool
+    """in real time: the vehicle did not follow the action, or its state is not known"""
     @_builtins.property
     def header(self) -> Global___Header: ...
     @_builtins.property
@@ -1124,10 +1127,11 @@ class Step(_message.Message):
         broken: _builtins.int = ...,
         for_clearance: _builtins.bool | None = ...,
         closest: _builtins.float | None = ...,
+        lost: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "closest", b"closest", "for_clearance", b"for_clearance", "header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "lost", b"lost", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__closest: _TypeAlias = _typing.Literal["closest"]  # noqa: Y015
     _WhichOneofArgType__closest: _TypeAlias = _typing.Literal["_closest", b"_closest"]  # noqa: Y015

@@ -60,6 +60,7 @@ class MavlinkVehicle(PeriodicVehicle):
         rejected: RejectedMessages | None = None,
         stop: Callable[[], bool] = lambda: False,
         mavlink_truth: MavlinkGroundTruth | None = None,
+        from_ground: bool = False,
     ) -> None:
         """Take control, climb to `flight.height` unless the vehicle flies already, and begin period 0.
 
@@ -68,6 +69,7 @@ class MavlinkVehicle(PeriodicVehicle):
             rejected: counts messages that cannot be handled.
             stop: once it returns true, nothing here waits any more.
             mavlink_truth: the ground truth of the autopilot's own simulator; without effect if `flight.truth` is set.
+            from_ground: refuse a vehicle that flies already.
 
         Raises:
             BadLink, OSError: the link cannot be opened.
@@ -87,13 +89,14 @@ class MavlinkVehicle(PeriodicVehicle):
         self._mavlink_truth = None if flight.truth else mavlink_truth
         self._client = AutopilotClient(self._send, flight.system, tap, lambda text: log.info("it says: %s", text))
         self._watch = FlightWatch(self._client, self.timing)
-        self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold)
+        self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold, from_ground)
         self.notes = self._takeoff.notes
         try:
             if flight.truth:
                 self._truth = UdpGroundTruth(flight.truth, flight.system, self._rejected)
             self._takeoff.fly()
         except BaseException:
+            self._land_after_failure()
             self._disconnect()
             raise
         self._client.interruption = ""  # the map and our command hold from here on
@@ -143,6 +146,16 @@ class MavlinkVehicle(PeriodicVehicle):
         return self._client.armed
 
     @property
+    def offboard(self) -> bool:
+        """Whether the vehicle is in the mode that follows our setpoints, by its last heartbeat."""
+        return self._client.offboard
+
+    @property
+    def mode(self) -> str:
+        """The name of its mode, by its last heartbeat."""
+        return self._client.mode
+
+    @property
     def idle(self) -> bool:
         """Whether the input in force is zero and no other input follows."""
         return not self._plan and not self.current_period.input.any()
@@ -180,6 +193,16 @@ class MavlinkVehicle(PeriodicVehicle):
         self._link.close()
         if self._truth is not None:
             self._truth.close()
+
+    def _land_after_failure(self) -> None:
+        """Land a vehicle whose takeoff failed after we had armed it, unless somebody else has it."""
+        self._velocity, self._stop_requested = None, lambda: False
+        if self._takeoff.armed_it and self._client.armed and self._client.offboard:
+            log.error("the takeoff failed: landing")
+            try:
+                self._client.land(self._wait)
+            except MavlinkError as error:
+                log.error("the vehicle does not land, so land it yourself: %s", error)
 
     def _request_truth(self) -> None:
         try:

@@ -26,6 +26,7 @@ from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from brakeline.sim.vehicle import Period
 
 RECEIVE_EVERY, SETPOINT_EVERY = 4, 20  # physics steps
 INTERVALS = {
@@ -35,6 +36,7 @@ INTERVALS = {
 }  # s between two messages, at the rate at which PX4 makes them
 FRESH = 0.0125  # s of simulated time: `settle` waits for newer messages than that
 SETTLE_TIMEOUT = 0.25  # s of real time
+OLDEST = 0.05  # s of simulated time: a state from older messages does not count
 POSITION_TIMEOUT, CLIMB_TIMEOUT, STOP_TIMEOUT = 90.0, 20.0, 10.0  # s
 SETTLING_TIME = 15.0  # s of hovering, after which the takeoff does not disturb the estimate any more
 HEIGHT, CLIMB = 3.0, 1.5  # m, m/s, of the takeoff
@@ -69,6 +71,8 @@ class Px4Flight:
         self._times = dict.fromkeys(INTERVALS, 0.0)  # s, of the newest message of each kind
         self.setpoint = np.zeros(3)  # m/s
         self.starts = 0  # of PX4
+        # why PX4 has not followed our setpoints since `enter`, or its state does not count; empty: all is well
+        self.lost = ""
 
     @property
     def flies(self) -> bool:
@@ -88,6 +92,7 @@ class Px4Flight:
         if not hovers:
             self._begin()
         self._replace(vehicle)
+        self.lost = self.client.interruption = ""
 
     def send_setpoint(self, velocity: Array) -> None:
         """Send this setpoint (3,) [m/s] from now on."""
@@ -114,12 +119,17 @@ class Px4Flight:
         return True
 
     def settle(self) -> None:
-        """Wait for the newest messages while simulated time stands still: PX4's threads may be behind."""
+        """Wait for the newest messages while simulated time stands still: PX4's threads may be behind.
+
+        If they do not come, the state of the vehicle is `lost`.
+        """
         end = time.monotonic() + SETTLE_TIMEOUT
         self._receive()
         while min(self._times.values()) < self.hil.time - FRESH and (left := end - time.monotonic()) > 0.0:
             select.select([self._link], [], [], left)
             self._receive()
+        if (age := self.hil.time - min(self._times.values())) > OLDEST:
+            self.lost = self.lost or f"PX4 sends no newer telemetry: the latest is {age:.2f} s old"
 
     def close(self) -> None:
         """End PX4. This also happens when the object is collected, and at the end of the program."""
@@ -190,6 +200,10 @@ class Px4Flight:
         with contextlib.suppress(BlockingIOError):
             while True:
                 self.client.feed(self._link.recv(65536))
+        client, left = self.client, ""
+        if not (client.offboard and self.hil.armed):
+            left = f"PX4 does not follow our setpoints ({client.mode if self.hil.armed else 'it is disarmed'})"
+        self.lost = self.lost or client.interruption or left
 
 
 def _shut(px4: Px4Process, link: socket.socket) -> None:
@@ -205,15 +219,36 @@ class Px4Vehicle(LockstepVehicle):
     """
 
     def __init__(self, flight: Px4Flight, vehicle: Quadrotor, robot: Robot) -> None:
-        """Raises the errors of `Px4Flight.enter`."""
+        """Raises the errors of `Px4Flight.enter`; AutopilotGone also if PX4 sends no state."""
         flight.enter(vehicle)
         super().__init__(robot, vehicle)
         self._flight = flight
         flight.send_setpoint(self.input)
         flight.settle()
+        self._check()
         self._offset = np.zeros(3)
         self._offset = self.true[:3] - self._estimate()[:3]
         self.measured = self._estimate()
+
+    def step(self, input: Array) -> Period:
+        """Fly one period, see `LockstepVehicle.step`.
+
+        A collision may disarm PX4: its period is the last one of the episode, and counts.
+
+        Raises:
+            AutopilotGone: also if PX4 did not follow the setpoint, or its state does not count. Nothing may be learned
+                from such a period.
+        """
+        period = super().step(input)
+        if not period.at_fault:
+            self._check()
+        return period
+
+    def _check(self) -> None:
+        """Raise AutopilotGone: PX4 did not follow the setpoint, or its state does not count."""
+        if why := self._flight.lost:
+            said = "; it says: " + "; ".join(texts) if (texts := self._flight.client.texts[-3:]) else ""
+            raise AutopilotGone(f"{why}{said}")
 
     def _fly(self) -> Array:
         flight, path = self._flight, self._flight.client.path
@@ -228,6 +263,6 @@ class Px4Vehicle(LockstepVehicle):
         return resampled(times, positions, begin + self._robot.period * np.arange(1, SAMPLES + 1) / SAMPLES)
 
     def _estimate(self) -> Array:
-        """Return the state (9,) of the latest telemetry, extrapolated to the current time."""
+        """Return the state (9,) of the latest telemetry, extrapolated to the current time, by `OLDEST` at most."""
         client = self._flight.client
-        return client.state(self._offset, max(self._flight.hil.time - client.time, 0.0))
+        return client.state(self._offset, min(max(self._flight.hil.time - client.time, 0.0), OLDEST))

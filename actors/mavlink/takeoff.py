@@ -43,14 +43,17 @@ class Takeoff:
         flight: FlightSettings,
         wait: Wait,
         hold: Callable[[Array | None], None],
+        from_ground: bool = False,
     ) -> None:
         """Prepare the takeoff of one vehicle.
 
         Args:
             wait: exchanges messages until a condition holds, or a time [s] is over.
             hold: called with a setpoint (3,) [m/s] to repeat from now on; None: send none.
+            from_ground: refuse a vehicle that flies already.
         """
         self._client, self._robot, self._flight, self._wait, self._hold = client, robot, flight, wait, hold
+        self._from_ground, self.armed_it = from_ground, False  # armed_it: whether this takeoff armed the vehicle
         self.notes: list[str] = []  # about the messages that are used, and the parameters that are too low
 
     def fly(self) -> None:
@@ -77,9 +80,12 @@ class Takeoff:
             self.note("it gets positions: if setpoints stop, it stops at the last one")
         if client.second_source:
             raise MavlinkError(client.two_sources)
+        if self._from_ground and client.airborne:
+            raise MavlinkError("the vehicle flies already: land it, for this flight begins on the ground")
         self._hold(np.zeros(3))
         client.follow_setpoints(wait)
         if not client.armed:
+            self.armed_it = True  # also if the answer to the command is lost
             client.arm(wait)
         if not client.airborne:
             self._climb(kind, self._flight.height)

@@ -19,7 +19,7 @@ from brakeline.deploy.data.certification import certify_supported
 from brakeline.deploy.data.coverage import recording_advice
 from brakeline.deploy.data.excitation import limit_slew, random_target
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
-from brakeline.errors import BadData, CommandLost, FlightEnded, Unsupported
+from brakeline.errors import BadData, FlightEnded, MavlinkError, Unsupported
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
@@ -119,21 +119,27 @@ class FirstFlight:
         self._rng, self._periods = np.random.default_rng(seed), 0
         self._flown: list[Trajectory] = []
         self._built: TrajectoryBuilder | None = None
+        self._reached, self._missing = 0.0, list[str]()
 
-    def fly(self, minutes: float, about: dict[str, str]) -> FirstFlightResult:
-        """Fly all levels and return the data, and the model set if the data support one."""
-        missing, reached = list[str](), 0.0
+    def fly(self, minutes: float) -> None:
+        """Fly all levels. An error of the vehicle ends the flight, and what was recorded stays."""
         try:
             for level, share in zip(LEVELS, SHARES, strict=True):
                 if not any(self._predicted(level, 60.0 * minutes * share) for _ in range(TRIES)):
-                    missing.append(
+                    self._missing.append(
                         f"no model predicts the vehicle at {level:.0%} of its speed, so it was not flown faster"
                     )
                     break
-                reached = level
-        except (CommandLost, FlightEnded) as error:
-            missing.append(str(error))
+                self._reached = level
+        except (MavlinkError, FlightEnded) as error:
+            self._missing.append(str(error))
         self._cut()
+
+    def result(self, about: dict[str, str]) -> FirstFlightResult:
+        """Return the data, and the model set if the data support one. Raises BadData: nothing was recorded."""
+        missing, reached = list(self._missing), self._reached
+        if not self._flown:
+            raise BadData(f"nothing was recorded: {'; '.join(missing)}")
         data = self._dataset(about)
         model, report = self._model(data, missing)
         if (drift := self._drift()) > MAX_DRIFT:
@@ -240,7 +246,7 @@ class FirstFlight:
         return float(np.quantile(np.linalg.norm(np.concatenate(errors), axis=1), 0.95))
 
     def _model(self, data: Dataset, missing: list[str]) -> tuple[ModelSet, ValidationReport] | tuple[None, None]:
-        """Certify while the vehicle hovers."""
+        """Certify the data."""
         try:
             config = ModelConfig(mode=ONE_STEP).of_minutes()
             return certify_supported(replace(data, robot=self._robot), config)[:2]

@@ -52,7 +52,8 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
 
 def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:
     """Yield a trajectory for each run of consecutive steps in one episode of one actor; a step counts once."""
-    unique = {(s.actor, s.header.run, s.episode, s.step): s for s in steps}  # a folder may have a copy of a log
+    # A folder may have a copy of a log. A vehicle that does not follow its inputs shows nothing about them.
+    unique = {(s.actor, s.header.run, s.episode, s.step): s for s in steps if not s.lost}
     ordered = [unique[place] for place in sorted(unique)]
     numbered = ((s.actor, s.header.run, s.episode, s.step - i) for i, s in enumerate(ordered))
     for _, group in groupby(zip(numbered, ordered, strict=True), key=lambda pair: pair[0]):

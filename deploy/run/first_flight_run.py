@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brakeline.errors import CommandLost
+from brakeline.errors import CommandLost, MavlinkError
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
+    from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
     from brakeline.deploy.data.first_flight import FirstFlightResult
+
+log = logging.getLogger("brakeline.collect")
 
 LANDING_TIMEOUT = 120.0  # s
 
@@ -44,7 +47,7 @@ class FirstFlightSettings:
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> FirstFlightResult:
     """Take off, fly, land, and return the recorded data and the model set of it.
 
-    SIGINT or SIGTERM land the vehicle at once; the data until then count.
+    SIGINT or SIGTERM land the vehicle at once, and so does any error; the data until then count.
 
     Args:
         robot: the description in real time.
@@ -65,18 +68,43 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
     )
     # A second signal must not leave the vehicle in the air. No actor of this machine may take the vehicle.
     with stop_on_signals(threading.Event(), patient=True) as stop, listening(url, settings.system):
-        vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set)
+        vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set, from_ground=True)
         try:
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
             metadata = {"autopilot": "; ".join(vehicle.notes), "url": url}
-            flight = FirstFlight(vehicle, robot, box, seed, stop.is_set).fly(settings.minutes, metadata)
-            with contextlib.suppress(CommandLost):  # it is not ours to land then; the result says so
-                vehicle.wait(vehicle.current_period.number + robot.horizon)
-                vehicle.land()
-                deadline = time.monotonic() + LANDING_TIMEOUT
-                while vehicle.armed and time.monotonic() < deadline:
-                    vehicle.listen(1.0)
+            flight = FirstFlight(vehicle, robot, box, seed, stop.is_set)
+            try:
+                flight.fly(settings.minutes)
+            finally:
+                land(vehicle, robot.horizon)
         finally:
             vehicle.close()
-    return flight
+    return flight.result(metadata)
+
+
+def land(vehicle: MavlinkVehicle, periods: int) -> None:
+    """Brake, land the vehicle and wait until it disarms, unless somebody else has it. Log what a person has to do.
+
+    Our command may have ended, or the vehicle may be in a mode that a pilot or a failsafe chose: it is not ours to land
+    then.
+
+    periods: control periods to brake for.
+    """
+    with contextlib.suppress(MavlinkError):  # the vehicle's thread may have died
+        vehicle.wait(vehicle.current_period.number + periods)
+    if isinstance(vehicle.failure, CommandLost):
+        return
+    if not vehicle.offboard:
+        log.error("not landing: the vehicle does not follow our setpoints (%s): land it", vehicle.mode)
+        return
+    try:
+        vehicle.land()
+        deadline = time.monotonic() + LANDING_TIMEOUT
+        while vehicle.armed and time.monotonic() < deadline:
+            vehicle.listen(1.0)
+    except MavlinkError as error:
+        log.error("the vehicle does not land, so land it yourself: %s", error)
+        return
+    if vehicle.armed:
+        log.error("the vehicle is still armed after %.0f s: land and disarm it yourself", LANDING_TIMEOUT)

@@ -67,8 +67,8 @@ def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda veh
     """
     port = _port(settings.url)
     arena = arena_or_field(settings.arena, settings.seed)
-    px4 = Px4Process(settings.folder, port, settings.parameters)
     truth = open_truth(settings.truth)
+    px4 = Px4Process(settings.folder, port, settings.parameters)
     try:
         with stop_on_signals(threading.Event(), patient=True) as stop:
             hil = HilLink(px4.connection, *_vehicle(settings, arena))

@@ -7,6 +7,7 @@ can, and nothing is ever late.
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 
@@ -20,6 +21,7 @@ ROTORS = 4
 ANSWER_TIMEOUT = 2.0  # s of real time
 MOST_UNANSWERED = 5  # timeouts in a row after which the autopilot counts as gone
 BOOT_TIMEOUT = 0.004  # s, the timeout before the first answer
+BOOT_LIMIT = 120.0  # s of real time without a first answer, after which the autopilot counts as gone
 
 
 class HilLink:
@@ -48,6 +50,7 @@ class HilLink:
         self._packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._unanswered_in_a_row = 0
         self._last_command = 0  # µs
+        self._started = time.monotonic()  # s
 
     @property
     def time(self) -> float:
@@ -58,7 +61,8 @@ class HilLink:
         """Advance by one physics step: send the sensors, wait for the commands, move the vehicle.
 
         Raises:
-            AutopilotGone: the autopilot closed the connection, no longer answers, or has no lockstep.
+            AutopilotGone: the autopilot closed the connection, no longer answers, has no lockstep, or its command is
+                not finite.
         """
         vehicle = self.vehicle
         self._now += self._step
@@ -96,17 +100,25 @@ class HilLink:
         return None
 
     def _apply(self, message: mavlink.MAVLink_hil_actuator_controls_message) -> None:
+        """Set the thrusts that a command asks for. Raises AutopilotGone: the command cannot be from a lockstep."""
         if not message.flags & LOCKSTEP:
             raise AutopilotGone(
                 "the autopilot was built without lockstep; build PX4 for SITL with lockstep, its default"
             )
+        if message.time_usec > self._now:
+            raise AutopilotGone("the autopilot does not take its time from the simulator: its command is ahead of it")
+        controls = message.controls[:ROTORS]
+        if not all(map(math.isfinite, controls)):
+            raise AutopilotGone(f"the autopilot commands its motors with {list(controls)}")
         self.answering = True
         self._last_command = message.time_usec
         self.armed = bool(message.mode & ARMED)
-        self.vehicle.set_thrusts(tuple(self._most_thrust * min(max(c, 0.0), 1.0) for c in message.controls[:ROTORS]))
+        self.vehicle.set_thrusts(tuple(self._most_thrust * min(max(c, 0.0), 1.0) for c in controls))
 
     def _miss(self) -> None:
         if not self.answering:
+            if time.monotonic() - self._started > BOOT_LIMIT:
+                raise AutopilotGone(f"the autopilot has connected, and does not start within {BOOT_LIMIT:g} s")
             return
         self.unanswered += 1
         self._unanswered_in_a_row += 1

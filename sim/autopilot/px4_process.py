@@ -25,6 +25,7 @@ INSTANCES = range(10, 200)  # PX4's own tools use those from 0 on
 LAUNCH = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 TRACES = ("px4-sock-{}", "px4_lock-{}")  # files of an instance in the folder for temporary files
 START_TIMEOUT = 30.0  # s until PX4 must have connected
+HEARTBEAT_RATE = 50  # Hz of simulated time
 ALIAS = re.compile(r"^alias (\w+)='px4-", re.MULTILINE)
 
 ARM, TORQUE = BODY.arm, BODY.rotor_torque
@@ -79,6 +80,8 @@ class Px4Process:
         lines = [f"param set {name} {value:.9g}\n" for name, value in values.items()]
         (root / "bin" / "px4-rc.params").write_text("#!/bin/sh\n" + "".join(lines))
         mavlink = f"mavlink start -x -u {self.local} -r 4000000 -f -m onboard -o {remote}\n"
+        # The heartbeat has the mode; once a second is five control periods.
+        mavlink += f"mavlink stream -u {self.local} -s HEARTBEAT -r {HEARTBEAT_RATE}\n"
         (root / "bin" / "px4-rc.mavlink").write_text("#!/bin/sh\n" + mavlink)
         instance, self._listener = _free_instance()
         self._traces = [Path(tempfile.gettempdir(), name.format(instance)) for name in TRACES]

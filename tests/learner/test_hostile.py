@@ -43,6 +43,7 @@ def test_steps_of_an_actor_that_never_joined_are_refused_and_counted(learner: Le
         ({"action": [1.0, 1.0]}, "action"),
         ({"robot": "ground"}, "robot"),
         ({"actor": ""}, "actor"),
+        ({"lost": True}, "lost"),
     ],
 )
 def test_a_step_that_is_wrong_names_its_field_and_changes_nothing(learner: Learner, fields: dict, field: str) -> None:

@@ -68,10 +68,14 @@ def test_sensor_errors_have_their_size_and_follow_from_the_seed() -> None:
 
 
 @contextmanager
-def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf) -> Iterator[tuple[HilLink, list[int]]]:
+def stand_in(
+    share: float = HOVER, lockstep: int = 1, answers: float = math.inf, ahead: int = 0
+) -> Iterator[tuple[HilLink, list[int]]]:
     """Yield the simulator's end of a connection, and the times of the readings that the autopilot received.
 
     That autopilot answers each of the first `answers` readings with the same share of full thrust.
+
+    ahead: µs from the time of a reading to the time of its answer.
     """
     ours, theirs = socket.socketpair()
     vehicle = Quadrotor(field(), np.random.default_rng(0), QuadrotorNoise(scale=0.0))
@@ -85,7 +89,8 @@ def stand_in(share: float = HOVER, lockstep: int = 1, answers: float = math.inf)
                 if message.get_type() == "HIL_SENSOR" and len(times) < answers:
                     times.append(message.time_usec)
                     controls = [share] * 4 + [0.0] * 12
-                    reply = mavlink.MAVLink_hil_actuator_controls_message(message.time_usec, controls, 129, lockstep)
+                    moment = message.time_usec + ahead
+                    reply = mavlink.MAVLink_hil_actuator_controls_message(moment, controls, 129, lockstep)
                     theirs.sendall(reply.pack(packer))
 
     thread = threading.Thread(target=answer)
@@ -114,12 +119,34 @@ def test_the_simulator_waits_for_every_command_and_applies_it() -> None:
 
 def test_an_autopilot_without_lockstep_or_without_answers_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with stand_in(lockstep=0) as (hil, _), pytest.raises(AutopilotGone, match="lockstep"):
-        hil.tick()
+        for _ in range(200):  # it may not wait for the first answer
+            hil.tick()
     monkeypatch.setattr("brakeline.sim.autopilot.hil_link.ANSWER_TIMEOUT", 0.02)
     with stand_in(answers=3) as (hil, _), pytest.raises(AutopilotGone, match="has not answered"):
         for _ in range(100):
             hil.tick()
     assert hil.unanswered == 5
+
+
+@pytest.mark.parametrize("share", [math.nan, math.inf])
+def test_a_motor_command_that_is_not_finite_is_an_error(share: float) -> None:
+    with stand_in(share) as (hil, _), pytest.raises(AutopilotGone, match="commands its motors with"):
+        for _ in range(200):
+            hil.tick()
+
+
+def test_an_autopilot_with_a_clock_of_its_own_is_an_error() -> None:
+    """Its command would count as the answer to all readings of the next hour."""
+    with stand_in(ahead=3_600_000_000) as (hil, _), pytest.raises(AutopilotGone, match="its time from the simulator"):
+        for _ in range(200):
+            hil.tick()
+
+
+def test_an_autopilot_that_never_starts_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("brakeline.sim.autopilot.hil_link.BOOT_LIMIT", 0.1, raising=False)
+    with stand_in(answers=0) as (hil, _), pytest.raises(AutopilotGone, match="does not start"):
+        for _ in range(200):
+            hil.tick()
 
 
 def test_a_folder_without_px4_is_refused(tmp_path: Any) -> None:

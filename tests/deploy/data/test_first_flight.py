@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
-from brakeline.deploy.data.first_flight import LEVELS, Box, FirstFlight, draw_manoeuvre, mirror_inwards
+from brakeline.deploy.data.first_flight import (
+    LEVELS,
+    Box,
+    FirstFlight,
+    FirstFlightResult,
+    draw_manoeuvre,
+    mirror_inwards,
+)
 from brakeline.errors import CommandLost
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP
@@ -69,9 +76,15 @@ class Sluggish:
         return Period(measured, state, False, np.inf, np.inf, path, 0.0)
 
 
+def flown(vehicle: Sluggish, minutes: float, about: dict[str, str] | None = None, seed: int = 0) -> FirstFlightResult:
+    flight = FirstFlight(vehicle, LATE, BOX, seed)
+    flight.fly(minutes)
+    return flight.result(about or {})
+
+
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
     vehicle = Sluggish()
-    recording = FirstFlight(vehicle, LATE, BOX, 0).fly(4.0, {"autopilot": "none"})
+    recording = flown(vehicle, 4.0, {"autopilot": "none"})
     assert recording.level == LEVELS[-1] and vehicle.fastest > 4.0 and vehicle.farthest < 0.0
     assert recording.model is not None and recording.model.robot == LATE
     assert recording.report is not None and recording.report.violations <= 0.25 * recording.report.windows
@@ -85,7 +98,7 @@ def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: 
 
 def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
     """The velocity follows the input of its own period, not of the next."""
-    recording = FirstFlight(Sluggish(constant=0.05), LATE, BOX, 1).fly(2.0, {})
+    recording = flown(Sluggish(constant=0.05), 2.0, seed=1)
     for t in recording.data.trajectories:
         assert t.states[1:, 3:6] == pytest.approx(t.inputs, abs=0.1)
 
@@ -101,7 +114,7 @@ def test_the_recorded_inputs_are_those_of_the_recorded_periods() -> None:
 )
 def test_what_ends_a_flight_or_makes_its_sets_wide_is_named(fault, minutes, line) -> None:
     vehicle = Sluggish(**fault)
-    recording = FirstFlight(vehicle, LATE, BOX, 0).fly(minutes, {})
+    recording = flown(vehicle, minutes)
     assert any(line in text for text in recording.missing)
     assert recording.seconds < 120.0 or ("box" not in line and "disarmed" not in line)
     assert len(recording.data.trajectories) > 0, "what was recorded stays"

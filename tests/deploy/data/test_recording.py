@@ -266,6 +266,14 @@ def test_trajectories_from_a_log_are_cut_at_gaps_episodes_actors_and_restarts():
         assert np.allclose(t.inputs[:, 1], 0.01 * (t.states[1:, 4] % 10))
 
 
+def test_steps_that_the_vehicle_did_not_follow_are_in_no_trajectory():
+    log = steps("a", 0, range(30))
+    for step in log[10:14]:
+        step.lost = True
+    found = [(int(t.states[0, 4]), len(t.inputs)) for t in trajectories_of(log, GROUND)]
+    assert found == [(0, 9), (14, 15)]
+
+
 def test_episodes_that_a_restarted_actor_drove_again_count_once(tmp_path):
     """It began again with the same seeds; the last episode of the first session was cut."""
     episodes = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 80, 3))

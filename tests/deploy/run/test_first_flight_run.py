@@ -1,0 +1,83 @@
+"""A first flight ends on the ground, however it ends; a vehicle that somebody else has is left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from brakeline.actors.actor_settings import FlightSettings
+from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.deploy.data.first_flight import FirstFlight
+from brakeline.deploy.run import first_flight_run
+from brakeline.deploy.run.first_flight_run import FirstFlightSettings
+from brakeline.errors import BadData, FlightEnded, MavlinkError
+from brakeline.sim.autopilot.endpoint import Autopilot
+from brakeline.sim.autopilot.flight_modes import Mode
+from tests.actors.conftest import served
+from tests.actors.test_lockstep_quadrotor import quadrotor
+from tests.robots import QUADROTOR
+from tests.waiting import until
+
+LATE = QUADROTOR.in_real_time()
+SETTINGS = FirstFlightSettings(height=1.0, room=20.0, minutes=1.0)
+
+
+@pytest.fixture
+def standing() -> Iterator[tuple[str, Autopilot]]:
+    autopilot = Autopilot(quadrotor(floor=0.02), "px4")
+    with served(autopilot) as url:
+        yield url, autopilot
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"), [(FlightEnded("the flight was stopped"), BadData), (RuntimeError("a defect"), RuntimeError)]
+)
+def test_a_flight_that_ends_at_once_or_fails_lands(
+    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, error: Exception, raised: type[Exception]
+) -> None:
+    url, autopilot = standing
+
+    def record(self: FirstFlight, level: float, seconds: float) -> None:
+        assert autopilot.flight.armed
+        raise error
+
+    monkeypatch.setattr(FirstFlight, "_record", record)
+    with pytest.raises(raised):
+        first_flight_run.fly(LATE, url, 0, SETTINGS)
+    assert not autopilot.flight.armed and autopilot.vehicle.on_floor
+
+
+def test_a_pilot_who_took_the_vehicle_keeps_it(
+    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    url, autopilot = standing
+
+    def record(self: FirstFlight, level: float, seconds: float) -> None:
+        autopilot.flight.change(Mode.HOLD)
+        self._wait_for_link()
+        until(lambda: self._vehicle.current_period.lost != "", "its heartbeat says so")
+        raise FlightEnded("no control of the vehicle for 10 s")
+
+    monkeypatch.setattr(FirstFlight, "_record", record)
+    with pytest.raises(BadData, match="nothing was recorded: no control"):
+        first_flight_run.fly(LATE, url, 0, SETTINGS)
+    assert autopilot.flight.armed and autopilot.flight.mode is Mode.HOLD
+    assert any("not landing" in record.message for record in caplog.records)
+
+
+def test_a_takeoff_that_is_stopped_lands(standing: tuple[str, Autopilot]) -> None:
+    url, autopilot = standing
+    with pytest.raises(MavlinkError, match="asked to stop"):
+        MavlinkVehicle(
+            QUADROTOR, FlightSettings(url, height=30.0), stop=lambda: float(autopilot.vehicle.state()[2]) > 1.0
+        )
+    until(lambda: not autopilot.flight.armed, "it lands", 30.0)
+
+
+def test_a_first_flight_does_not_begin_in_the_air() -> None:
+    """Its box reaches two thirds of --height below the place where it begins."""
+    autopilot = Autopilot(quadrotor(), "px4")
+    with served(autopilot) as url, pytest.raises(MavlinkError, match="flies already"):
+        first_flight_run.fly(LATE, url, 0, SETTINGS)
+    assert autopilot.flight.mode is not Mode.OFFBOARD
