@@ -16,8 +16,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brakeline.errors import BadInput
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import ArenaKind, Reward, RobotWithTask, arena_kind, robot_with_task
+from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.batch.batch_support import check_batch
