@@ -27,13 +27,13 @@ from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.scripted_policies import Policy
 
 MOVED = 6  # obstacles that a candidate moves
-PIECES = 10  # of the proposed inputs
+PIECES = 10  # constant inputs that the policy proposes one after the other
 PERIODS = 60  # of an episode
-AN_ARENA = 300  # episodes that are spent on one drawn arena
-MOST_ARENAS = 10  # without a single episode that counts
+EPISODES_OF_AN_ARENA = 300  # candidates in one drawn arena, before the next one is drawn
+MOST_ARENAS = 10  # arenas without an episode that counts, after which the search ends
 SPREAD = 0.5  # first standard deviation of a candidate's numbers, which are used within -1 and 1
-FAR = 4.0  # footprints, by which an obstacle is moved at most
-TOUCHED = 1.0  # m, by which a candidate with a contact is better than any without one
+MOST_SHIFT = 4.0  # largest shift of an obstacle, in radii of the robot's footprint
+CONTACT_BONUS = 1.0  # m, subtracted from the score of a candidate with a contact, so that it is below all others
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SearchedEpisode:
     def arena(self, drawn: Arena, robot: Robot) -> Arena:
         """Return the drawn arena with its moved obstacles and a shorter time limit."""
         dim = drawn.dim
-        shifts = FAR * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
+        shifts = MOST_SHIFT * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
         inside = [o for o in drawn.obstacles if o.kind != WALL and len(o.position) == dim and _movable(o, drawn)]
         inside.sort(key=lambda o: float(np.linalg.norm(np.subtract(o.position, drawn.start[:dim]))))
         moved = {
@@ -94,7 +94,12 @@ def search(
     size = MOVED * robot.position_dim + PIECES * robot.action_dim
     number = 0
     while found.episodes < episodes:
-        options = {"bounds": [-1.0, 1.0], "seed": what.seed + number + 1, "verbose": -9, "maxfevals": AN_ARENA}
+        options = {
+            "bounds": [-1.0, 1.0],
+            "seed": what.seed + number + 1,
+            "verbose": -9,
+            "maxfevals": EPISODES_OF_AN_ARENA,
+        }
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
         while not strategy.stop() and found.episodes < episodes:
             candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
@@ -140,7 +145,7 @@ class _Search:
         self.episodes, self._steps = self.episodes + 1, self._steps + int(row["steps"])
         touched = bool(row["collision"] or row["contact_moving"])
         self._collisions += touched
-        value = float(row["closest"]) - TOUCHED * touched
+        value = float(row["closest"]) - CONTACT_BONUS * touched
         if value < self._least:
             self._least, self.closest, self._worst = value, float(row["closest"]), candidate
         self._history.append(round(self.closest, 5))

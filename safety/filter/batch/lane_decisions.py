@@ -1,4 +1,7 @@
-"""Decide the rows of a batch that need no `Filter.decide`, in lanes; the batch is last."""
+"""Decide many rows of a batch at once. Each row is a *lane*, a place on the last axis of every array.
+
+`Filter.decide` decides the other rows one by one: those that need a search which lanes do not make.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,7 @@ PLAN_ROWS, ROWS = 1 << 14, 1 << 17
 FEWEST = 32  # lanes at once, whatever the number of obstacles
 MANY = 4  # times the lanes: rows whose near obstacles are found at once, and which are then sorted by their number
 LANES_ON_DEVICE, ROWS_ON_DEVICE = 1 << 18, 1 << 26
-HUGE = 1e100  # a larger number is left to the single path
+HUGE = 1e100  # `Filter.decide` decides rows with larger numbers
 
 
 class LaneDecisions:
