@@ -264,7 +264,7 @@ def _get_or_create(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
             raise Implausible(f"{name} is rejected: there are already {most}")
         if isinstance(name, str):
             identity = identity_of(name)
-            if sum(identity_of(other) == identity for other in table) >= MOST_NAMES_OF_ONE:
+            if sum(identity_of(str(other)) == identity for other in table) >= MOST_NAMES_OF_ONE:
                 raise Implausible(f"{name} is rejected: {identity} has {MOST_NAMES_OF_ONE} names already")
         table[name] = make()
     return table[name]

@@ -57,7 +57,7 @@ def check_options(options: Mapping[str, Any], *known: str) -> None:
         raise ValueError(f"a reset has no option {names}; there are: {', '.join(known)}")
 
 
-def action_and_observation_space(robot: RobotWithTask) -> tuple[Box, Box]:
+def action_and_observation_space(robot: RobotWithTask) -> tuple[Box[np.float32], Box[np.float32]]:
     """Return the space of a robot's inputs within their bounds, and the space of its observations."""
     limit = np.full(robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
     low, high = robot.low().astype(np.float32), robot.high().astype(np.float32)
