@@ -155,8 +155,7 @@ class ActorRunner:
         # A vehicle in real time publishes little, and the last period before a crash must not wait.
         publisher: Callable[..., Publisher] = partial(process.bus.publisher, bundled=not continuous)
         self.frames = FrameRecorder(publisher(FRAMES, robot=robot.name, source=actor), robot.name, actor)
-        tap = self.frames.record if settings.mavlink else None
-        env = env or make(robot, settings.arena, settings.seed, tap=tap)
+        env = env or make(robot, settings.arena, settings.seed, tap=self.frames.record if settings.mavlink else None)
         self.runner = EpisodeRunner(
             robot,
             env,

@@ -49,6 +49,7 @@ from brakeline.safety.service.client import query_service, request_message
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import goal_sequence
 from brakeline.sim.navigation_env import NavigationEnv
+from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.sim_conditions import Conditions
 from brakeline.sim.vehicle import Period
 
@@ -294,10 +295,7 @@ def run(
         raise Mismatch("a real-time flight needs the filter, and a robot whose plans allow for the delay")
     stages = goal_sequence(arena, GOALS, np.random.default_rng(settings.seed), robot)
     if propose is not None:
-        policy = propose(settings.seed)
-        for stage in stages if hasattr(policy, "prepare") else ():
-            policy.prepare(stage)  # type: ignore[attr-defined]
-        propose = lambda _: policy  # noqa: E731
+        propose = _prepared(propose(settings.seed), stages)
     stats, publisher = ActorStats(), BackgroundPublisher()
     with Process(settings.bus, settings.name) as process:
         stop, started = process.stop.is_set, time.monotonic()
@@ -325,3 +323,10 @@ def run(
             publisher.close()
         log.info("%s: %d periods, %d without an answer in time", settings.name, stats.steps, stats.fallbacks)
         return done
+
+
+def _prepared(policy: Policy, stages: Sequence[Arena]) -> PolicyFactory:
+    """Return what gives this policy, after it has seen all stages: planning takes longer than a period."""
+    for stage in stages if hasattr(policy, "prepare") else ():
+        policy.prepare(stage)  # type: ignore[attr-defined]
+    return lambda _: policy

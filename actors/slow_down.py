@@ -1,7 +1,7 @@
 """Drive slower while more plans leave their tubes than the model set states (docs/method.md §15).
 
-The widening follows a change within seconds. Where it does not, the statement of the model set no longer holds for this
-robot, and what the filter verifies means less than it says. Slower plans are shorter, so less depends on them.
+The widening follows a change within seconds. If it does not suffice, more verified plans leave their tubes than the
+model set states. A slower robot covers less ground in a plan, so leaving a tube is less dangerous.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from brakeline.messaging.stated_share import percent
 log = logging.getLogger("brakeline.actor")
 
 SLOW = 0.5  # share of the bounds of each input that moves the position
-BY_CHANCE = 0.001  # the limit begins if so many plans outside are less likely than this, were the statement true
+BY_CHANCE = 0.001  # the limit begins if the stated bound makes so many plans outside less likely than this
 
 
 class SlowDown:
@@ -43,13 +43,13 @@ class SlowDown:
         """
         outside, plans = sum(left), len(left)
         bound = 1.0 if bound is None else bound
-        told = f"{outside} of the last {plans} plans left their tubes, stated: at most {percent(bound)}"
-        if not self.active and outside and at_least(outside, plans, bound) < BY_CHANCE:
+        counts = f"{outside} of the last {plans} plans left their tubes, stated: at most {percent(bound)}"
+        if not self.active and outside and probability_of_at_least(outside, plans, bound) < BY_CHANCE:
             self.active = True
-            log.warning("%s: slowing down to %.0f %% of the largest inputs: %s", self._actor, 100.0 * SLOW, told)
+            log.warning("%s: slowing down to %.0f %% of the largest inputs: %s", self._actor, 100.0 * SLOW, counts)
         elif self.active and outside <= bound * plans:
             self.active = False
-            log.warning("%s: no longer slowed down: %s", self._actor, told)
+            log.warning("%s: no longer slowed down: %s", self._actor, counts)
 
     def proposal(self, proposal: Array) -> Array:
         """Return a proposal (m,) within the limit, in the same direction.
@@ -65,7 +65,7 @@ class SlowDown:
         return np.where(self._moves, proposal / max(1.0, float(finite.max(initial=1.0))), proposal)
 
 
-def at_least(outside: int, plans: int, bound: float) -> float:
-    """Return the probability of at least `outside` of `plans` plans outside, if each is with probability `bound`."""
+def probability_of_at_least(outside: int, plans: int, bound: float) -> float:
+    """Return the probability that at least `outside` of `plans` plans are outside, if `bound` is that of each."""
     less = (math.comb(plans, k) * bound**k * (1.0 - bound) ** (plans - k) for k in range(outside))
     return max(1.0 - math.fsum(less), 0.0)

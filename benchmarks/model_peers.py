@@ -190,7 +190,7 @@ def peer(recording: Recording, fit: Callable[[Array, Array, Array], Models]) -> 
     chosen = choose(robot, s)[0].candidate
     all_features = features_for(robot, s.v, chosen.degree, chosen.lags)
     monomials = np.flatnonzero((all_features.terms <= s.v.shape[1]).all(1))  # the peers' boxes have no others
-    features = Regression(robot, all_features.some(monomials), s).fit(chosen).features
+    features = Regression(robot, all_features.subset(monomials), s).fit(chosen).features
     started = process_time()
     noise, phi = Noise.of(features, s), features(s.v)
     tubes = ModelTubes(robot, features, fit(phi, s.y, noise.sizes(s.v)), noise)

@@ -18,6 +18,7 @@ import numpy as np
 
 from brakeline.errors import BadStep, CheckpointError, DamagedPart, Diverged
 from brakeline.learner import checkpoint
+from brakeline.learner.actor_permissions import ActorPermissions
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner_config import LearnerConfig
@@ -27,16 +28,10 @@ from brakeline.learner.replay import Batch, ReplayBuffer
 from brakeline.learner.step_ledger import StepLedger
 from brakeline.learner.symmetry import SymmetryAugmentation
 from brakeline.learner.td3 import TD3
-from brakeline.learner.transition_reader import LATEST, StepReader
+from brakeline.learner.transition_reader import StepReader
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights as policy
-from brakeline.messaging.bus.identity import identity_of, speaks_for
 from brakeline.messaging.task import RobotWithTask
-from brakeline.messaging.topics import AHEAD
-
-MOST_ACTORS = 2048
-MOST_ACTORS_OF_ONE = 256  # of one identity: so many robots of a process, or actors of a feeder's logs
-FEEDER = "feeder"  # role that joins for the actors of logs
 
 
 class Part(Protocol):
@@ -75,8 +70,7 @@ class Learner:
         self._limiter = RateLimiter(td3.updates_per_step * td3.batch, td3.batch, td3.warmup, ahead)
         limited = td3.cost_limit is not None
         self._multiplier = LagrangeMultiplier(td3.cost_limit or 0.0, td3.multiplier_rate) if limited else None
-        self._limits: dict[str, int] = {}
-        self._present: set[str] = set()  # actors that joined by themselves, for which no feeder may speak
+        self._permissions = ActorPermissions(robot, config, self._ledger)
         self._episode_ended = True  # whether the last step ended its episode
         self._saved_at = 0  # number of steps at the last checkpoint
         self.surplus = 0  # steps after the last one of the run
@@ -97,7 +91,7 @@ class Learner:
             BadStep: a size or value is wrong, or the actor may not publish this step. The step is only counted.
         """
         try:
-            self._check_sender(step, logged)
+            self._permissions.check_sender(step, logged)
             move = self._read(step)
         except BadStep:
             self.rejected += 1
@@ -119,16 +113,6 @@ class Learner:
         self._ages.append(self._version - step.weights_version)
         return True
 
-    def _check_sender(self, step: pb.Step, logged: bool) -> None:
-        """Raise BadStep if the actor, or a feeder for it, may not publish a step with this index."""
-        place = self._ledger.places.get(step.actor)
-        if place is None:
-            raise BadStep("actor", f"{step.actor} never joined")
-        if logged and step.actor in self._present:
-            raise BadStep("actor", f"a feeder publishes for {step.actor}, which has joined by itself")
-        if step.index > max(place.last_index, self._limits.get(step.actor, 0)) + AHEAD:
-            raise BadStep("index", f"{step.index}, but {step.actor} is at {place.last_index}")
-
     def _read(self, step: pb.Step) -> ActorStep:
         """Return the step in a message. A wrong one has arrived, too: its actor gets permission for the next ones."""
         try:
@@ -146,47 +130,11 @@ class Learner:
         Args:
             asker: name of the process that asks; empty: do not compare it with the actor's.
         """
-        layout, known = self.robot.learning_layout(), join.actor in self._limits
-        first, owner = next(iter(self._limits), ""), identity_of(join.actor)
-        full = not known and sum(identity_of(name) == owner for name in self._limits) >= MOST_ACTORS_OF_ONE
-        most = self._most_published(join.actor)
-        refusals = (
-            (join.robot != self.robot.name, "robot", f"{join.robot!r}, not {self.robot.name!r}"),
-            (join.layout != layout, "layout", f"{join.layout!r}, but {self.robot.name} has {layout!r} here"),
-            (not join.actor, "actor", "empty"),
-            (not self._may_join(asker, join.actor), "actor", f"{join.actor!r}, but {asker!r} asks"),
-            (max(join.index, join.episode) >= LATEST, "index", f"{join.index} steps, episode {join.episode}"),
-            (join.index > most, "index", f"{join.index} steps, but {join.actor} may have published {most} at most"),
-            (full, "actor", f"{join.actor!r} is one more of {owner} than {MOST_ACTORS_OF_ONE}"),
-            (not known and len(self._limits) == MOST_ACTORS, "actor", f"{join.actor!r} is one more than {MOST_ACTORS}"),
-            (
-                self.config.lockstep and bool(self._limits.keys() - {join.actor}),
-                "actor",
-                f"{join.actor!r}, but lockstep allows one actor, {first!r}",
-            ),
-        )
-        for refused, field, why in refusals:
-            if refused:
-                return pb.JoinReply(error=pb.Error(type="Refused", field=field, message=why))
-        if asker and not asker.startswith(FEEDER):
-            self._present.add(join.actor)
-        episode = self._ledger.join(join.actor, join.index, join.episode)
-        self._limits[join.actor] = join.index
+        episode = self._permissions.join(join, asker)
+        if isinstance(episode, pb.Error):
+            return pb.JoinReply(error=episode)
         steps = self._ledger.steps_of(join.actor)
         return pb.JoinReply(weights=self.weights(), flow=self.flow(), episode=episode, steps=steps)
-
-    def _may_join(self, asker: str, actor: str) -> bool:
-        """Return whether a process may join for an actor: for itself or its robot; a feeder for all that are absent."""
-        if asker.startswith(FEEDER):
-            return actor not in self._present
-        return not asker or speaks_for(asker, actor)
-
-    def _most_published(self, actor: str) -> int:
-        """Return how many steps an actor can have published since its start, by the permissions of this run."""
-        permitted = self._limits.get(actor)
-        if permitted is None:  # it may have its permission from an earlier learner
-            return LATEST if actor not in self._ledger.places else self.config.steps + AHEAD
-        return permitted + AHEAD
 
     def work(self, most: int) -> int:
         """Make at most `most` of the updates that are due. Return how many it made."""
@@ -271,38 +219,28 @@ class Learner:
     def flow(self) -> pb.Flow:
         """Return up to which index each actor may publish. A limit never falls."""
         if not (self.config.lockstep and (self._update_due() or self.weights_due())):
-            self._grant()
+            self._permissions.grant(self._room())
         return pb.Flow(
             robot=self.robot.name,
             incarnation=self.incarnation,
-            limit=self._limits,
+            limit=self._permissions.limits,
             weights_version=self._version,
             warmup=self._limiter.warming_up,
             done=self.done,
         )
 
-    def needed(self, limits: Mapping[str, int]) -> bool:
-        """Return whether an actor has used half of its window up to a limit, and may go on beyond it.
+    def flow_due(self, limits: Mapping[str, int]) -> bool:
+        """Return whether an actor has used half of its window up to a limit: `ActorPermissions.flow_due`."""
+        return self._permissions.flow_due(limits)
 
-        Args:
-            limits: of `flow` when it was published last.
-        """
-        half, places = self.config.window // 2, self._ledger.places
-        known = {actor: limits.get(actor, 0) for actor, limit in self._limits.items() if limit > limits.get(actor, 0)}
-        return any(limit - places[actor].last_index <= half for actor, limit in known.items())
-
-    def _grant(self) -> None:
+    def _room(self) -> int:
+        """Return how many more steps the actors may publish together."""
         room = 0 if self._enough() else self._limiter.room()
         if not len(self._replay) and not self._enough():
-            room = max(room, len(self._limits))  # no update can make room before the first window is full
+            room = max(room, len(self._permissions.limits))  # no update can make room before the first window is full
         if not self.config.lockstep:
             room = min(room, self.config.steps - self._limiter.inserts)
-        if room < 1 or not self._limits:
-            return
-        # No room is reserved, so a dead actor delays nobody; the band is exceeded by at most one actor's share.
-        share = 1 if self.config.lockstep else max(1, min(self.config.window, room // len(self._limits)))
-        for actor, limit in self._limits.items():
-            self._limits[actor] = max(limit, self._ledger.places[actor].last_index + share)
+        return room
 
     def metrics(self) -> pb.LearnerMetrics:
         """Return the metrics, with rates and staleness since the last call."""
@@ -327,7 +265,7 @@ class Learner:
             staleness=float(np.mean(ages)) if ages else 0.0,
             limiter_error=self._limiter.error,
             done=self.done,
-            limit=self._limits,
+            limit=self._permissions.limits,
             refused=self.rejected + self.surplus,
         )
 

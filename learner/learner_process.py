@@ -173,7 +173,7 @@ class LearnerLoop:
         if self._settings.learner.lockstep:
             due = flow != last
         else:
-            changed = (flow.warmup, flow.done) != (last.warmup, last.done) or self._learner.needed(last.limit)
+            changed = (flow.warmup, flow.done) != (last.warmup, last.done) or self._learner.flow_due(last.limit)
             due, self._flow_waits = changed and age >= FLOW_SPACING, changed and age < FLOW_SPACING
         if due or age > FLOW_PERIOD:
             self._last_flow.CopyFrom(flow)

@@ -262,15 +262,12 @@ def _get_or_create(table: dict[K, V], name: K, make: Callable[[], V]) -> V:
         most = MOST_STREAMS if make is PublisherStream else MOST_NAMES
         if len(table) >= most:
             raise Implausible(f"{name} is rejected: there are already {most}")
-        if isinstance(name, str) and _names_of(identity_of(name), table) >= MOST_NAMES_OF_ONE:
-            raise Implausible(f"{name} is rejected: {identity_of(name)} has {MOST_NAMES_OF_ONE} names already")
+        if isinstance(name, str):
+            identity = identity_of(name)
+            if sum(identity_of(str(other)) == identity for other in table) >= MOST_NAMES_OF_ONE:
+                raise Implausible(f"{name} is rejected: {identity} has {MOST_NAMES_OF_ONE} names already")
         table[name] = make()
     return table[name]
-
-
-def _names_of(identity: str, table: Mapping[Any, object]) -> int:
-    """Return how many names in a table an identity answers for."""
-    return sum(identity_of(name) == identity for name in table)
 
 
 def merge_runs(runs: Mapping[str, Metrics]) -> Figures:

@@ -11,11 +11,8 @@ Robots and tasks are values: a program reads them once, by name or path, and pas
 from __future__ import annotations
 
 import hashlib
-import importlib
-import importlib.util
 import json
 import math
-import sys
 from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -25,8 +22,8 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from brakeline.errors import UnknownName, UnknownTask
-from brakeline.extras import missing_extra
-from brakeline.messaging.number_checks import check_most, check_numbers, check_ranges, check_sizes
+from brakeline.messaging.arena_kinds import ArenaKind
+from brakeline.messaging.number_checks import check_most, check_numbers
 from brakeline.messaging.ray_directions import LidarRays, planar_rays, spherical_rays
 from brakeline.messaging.robot import FORMER_LAYOUTS, Robot, robot_named
 from brakeline.messaging.robot_files import (
@@ -37,6 +34,7 @@ from brakeline.messaging.robot_files import (
     task_file,
     task_values,
 )
+from brakeline.messaging.task_code import load_code
 
 _STRICT = ConfigDict(extra="forbid")
 
@@ -83,59 +81,6 @@ def check_penalty(penalty: float | None, robot: RobotWithTask | None = None) -> 
         raise ValueError(
             f"a penalty of {penalty:g} is out of proportion to the rewards of {robot.name}: give at most {int(most)}"
         )
-
-
-@dataclass(frozen=True)
-class MoverKind:
-    """Moving obstacles of an arena, and the errors with which a sensor measures them."""
-
-    __pydantic_config__ = _STRICT
-    count: tuple[int, int]  # (least, most)
-    radius: float  # of a disc in the plane, of a ball in space [m]
-    speed: float  # largest [m/s]
-    acceleration: float  # largest [m/s²]
-    keep: float  # least distance from the robot's start to the surface, when an episode begins [m]
-    position_error: float = 0.03  # [m]
-    velocity_error: float = 0.05  # [m/s]
-    steps_over: bool = False  # True: passes over a standing robot, which then continues; False: the episode ends
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "count")
-        check_numbers(self, "radius", above=0.0)
-        check_numbers(self, "speed", "acceleration", "keep", "position_error", "velocity_error", least=0.0)
-
-
-@dataclass(frozen=True)
-class ArenaKind:
-    """Distribution from which arenas of one name are drawn. Pairs are (least, most)."""
-
-    __pydantic_config__ = _STRICT
-    half_width: float  # [m]
-    cylinders: tuple[int, int]
-    radius: tuple[float, float]  # of a cylinder [m]
-    boxes: tuple[int, int]
-    edge: tuple[float, float]  # of a box [m]
-    square: bool  # boxes have two equal edges
-    gap: float  # least gap between obstacles in plan view, walls included, beyond the robot's diameter [m]
-    path_clearance: float  # clearance beyond the footprint along at least one path from start to goal [m]
-    goal_distance: float  # least distance from the start [m]
-    step_limit: int
-    start_clearance: float = 0.1  # clearance beyond the footprint at the start and at the goal [m]
-    goal_radius: float = 0.25  # [m]
-    height: float | None = None  # from floor to ceiling [m]; None: an arena in the plane
-    tall: tuple[float, float] = (0.0, 0.0)  # height of a box in space [m]
-    spheres: tuple[int, int] = (0, 0)
-    ball: tuple[float, float] = (0.0, 0.0)  # radius of a sphere [m]
-    movers: MoverKind | None = None
-    ring: float | None = None  # radius of a circle with starts and, opposite, goals, so that paths cross [m]
-
-    def __post_init__(self) -> None:
-        check_numbers(self, "half_width", "goal_distance", "goal_radius", "height", "ring", above=0.0)
-        check_numbers(self, "gap", "path_clearance", "start_clearance", least=0.0)
-        check_numbers(self, "step_limit", least=1)
-        check_ranges(self, "cylinders", "boxes", "spheres")
-        check_sizes(self, radius=self.cylinders, edge=self.boxes, ball=self.spheres)
-        check_sizes(self, tall=(0, 0) if self.height is None else self.boxes)
 
 
 @dataclass(frozen=True)
@@ -232,61 +177,8 @@ class Task:
         return len(self.observed)
 
     def code(self, place: str) -> Any:
-        """Import the object at `module:name`, or at `file.py:name` beside the task's file.
-
-        Raises:
-            MissingExtra: the object needs a package that an extra brings.
-            UnknownTask: the object cannot be imported.
-        """
-        module, _, name = FORMER_PLACES.get(place, place).partition(":")
-        try:
-            if module.endswith(".py"):
-                return getattr(_module_in(self.folder / module), name)
-            return getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, OSError) as error:
-            if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
-                raise missing from error
-            raise UnknownTask(f"{place!r} is no code that can be loaded: {error}") from error
-        except Exception as error:  # whatever the file does when it is executed
-            raise UnknownTask(f"{place!r} is no code that can be loaded: {type(error).__name__}: {error}") from error
-
-
-# Where task files of version 0.2 look for code, and where it is now.
-FORMER_PLACES = {
-    "deploy.quadrotors:behind_px4": "brakeline.deploy.quadrotor_vehicles:behind_px4",
-    "deploy.quadrotors:embedded": "brakeline.deploy.quadrotor_vehicles:embedded",
-    "sim.ground:simulated": "brakeline.sim.ground_robot:simulated",
-    "sim.senses:AirSenses": "brakeline.sim.observations:QuadrotorObservation",
-    "sim.senses:GroundSenses": "brakeline.sim.observations:GroundObservation",
-    "sim.senses:PlanarSenses": "brakeline.sim.observations:PlanarObservation",
-    "sim.senses:TrackingSenses": "brakeline.sim.observations:TrackingObservation",
-    "sim.policies:RandomInputs": "brakeline.sim.scripted_policies:RandomPolicy",
-    "sim.policies:Greedy": "brakeline.sim.scripted_policies:GroundGreedyPolicy",
-    "sim.policies:Adversary": "brakeline.sim.scripted_policies:GroundAdversary",
-    "sim.policies:MapDriver": "brakeline.sim.scripted_policies:GroundRoutePolicy",
-    "sim.policies:CarefulDriver": "brakeline.sim.scripted_policies:GroundCarefulPolicy",
-    "sim.pilots:GreedyPilot": "brakeline.sim.quadrotor_policies:QuadrotorGreedyPolicy",
-    "sim.pilots:HostilePilot": "brakeline.sim.quadrotor_policies:QuadrotorAdversary",
-    "sim.pilots:MapPilot": "brakeline.sim.quadrotor_policies:QuadrotorRoutePolicy",
-    "sim.pilots:CarefulPilot": "brakeline.sim.quadrotor_policies:QuadrotorCarefulPolicy",
-}
-
-
-def _module_in(path: Path) -> Any:
-    """Import the module in a file; each file is executed once."""
-    name = f"task_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path)
-        if spec is None or spec.loader is None:
-            raise ImportError(f"{path} is no Python file")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[name]  # else the next one would find half of it
-            raise
-    return sys.modules[name]
+        """Import the object at `module:name`, or at `file.py:name` beside the task's file. Errors: see `load_code`."""
+        return load_code(place, self.folder)
 
 
 @dataclass(frozen=True)

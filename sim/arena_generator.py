@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from brakeline.errors import NoArena
+from brakeline.messaging.arena_kinds import ArenaKind, MoverKind
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.task import ArenaKind, MoverKind, RobotWithTask, arena_kind
+from brakeline.messaging.task import RobotWithTask, arena_kind
 from brakeline.sim.arena import Arena, room_boundary, room_bounds, same_room
 from brakeline.sim.grid_planner import nearest_distances
 from brakeline.sim.traffic import Crowd

@@ -57,6 +57,13 @@ def check_options(options: Mapping[str, Any], *known: str) -> None:
         raise ValueError(f"a reset has no option {names}; there are: {', '.join(known)}")
 
 
+def action_and_observation_space(robot: RobotWithTask) -> tuple[Box[np.float32], Box[np.float32]]:
+    """Return the space of a robot's inputs within their bounds, and the space of its observations."""
+    limit = np.full(robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
+    low, high = robot.low().astype(np.float32), robot.high().astype(np.float32)
+    return Box(low, high, dtype=np.float32), Box(-limit, limit, dtype=np.float32)
+
+
 def episode_seed(value: Any) -> int:
     """Return the seed of an episode. Raises ValueError: it is no integer, or negative."""
     if not isinstance(value, Integral) or value < 0:
@@ -152,10 +159,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         self.reward = reward or self.task.reward
         self.conditions = conditions or Conditions()
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.robot.period)}
-        low, high = self.robot.low().astype(np.float32), self.robot.high().astype(np.float32)
-        self.action_space = Box(low, high, dtype=np.float32)
-        limit = np.full(self.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
-        self.observation_space = Box(-limit, limit, dtype=np.float32)
+        self.action_space, self.observation_space = action_and_observation_space(self.robot)
         self._make_observation_model = self.task.code(self.task.senses)
         self._make_vehicle = make_vehicle or simulated_vehicle(self.robot, self.conditions)
         if lidar_noise is None:

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.arena_kinds import MoverKind
 from brakeline.messaging.obstacle import CYLINDER, SPHERE, Array, Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion, Sighting
-from brakeline.messaging.task import MoverKind
 
 TICK = 0.05  # s; the acceleration of a moving obstacle is constant between two ticks
 MEAN_WISH_TIME = 2.0  # s, mean time until it chooses another velocity

@@ -73,10 +73,10 @@ MakeVehicle = Callable[[Arena, np.random.Generator], Vehicle]  # the generator i
 
 
 class SimulatedVehicle:
-    """A base of vehicles in MuJoCo: their reports, and the changes of their physics."""
+    """Base class of the vehicles in MuJoCo: it makes their reports and changes their physics."""
 
     robot: Robot
-    samples: int  # of the position in a period
+    samples: int  # positions that a report has of a period
     arena: Arena
     true: Array
     measured: Array

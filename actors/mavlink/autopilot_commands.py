@@ -161,7 +161,9 @@ class AutopilotClient(MavlinkDecoder):
             wait(lambda: False, REPLY_TIMEOUT)
         answer = "no answer" if result is None else RESULTS.get(result, str(result))
         name = mavlink.enums["MAV_CMD"][number].name
-        raise CommandRefused(f"{name}: {answer}{'; it says: ' + '; '.join(self.texts[-3:]) if self.texts else ''}")
+        raise CommandRefused(
+            f"{name}: {answer}{'; the autopilot says: ' + '; '.join(self.texts[-3:]) if self.texts else ''}"
+        )
 
     def stream(self, kind: int, interval: float, wait: Wait) -> None:
         """Request a message at an interval [s]; 0: never. Raises CommandRefused."""

@@ -7,7 +7,7 @@ from collections import deque
 
 from brakeline.actors.mavlink.flight_timing import ClockOffset, FlightTiming
 from brakeline.actors.mavlink.mavlink_decoder import MavlinkDecoder
-from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, missing
+from brakeline.actors.mavlink.telemetry import IN_FLIGHT, MOTION, unknown_quantities
 
 POLL = 0.005  # s between two reads of the link
 STALE = 0.2  # s without a position, an attitude or an acceleration after which telemetry counts as lost
@@ -77,7 +77,7 @@ class FlightWatch:
         if not (client.offboard and client.armed):
             state = client.mode if client.armed else "it is disarmed"
             return f"the autopilot does not follow our setpoints ({state})"
-        if client.estimator is not None and (unknown := missing(client.estimator)):
+        if client.estimator is not None and (unknown := unknown_quantities(client.estimator)):
             return f"its estimator does not know {', '.join(unknown)}"
         if client.outside:
             return f"the autopilot says that it is outside of its geofence ({client.outside})"

@@ -1,4 +1,4 @@
-"""Ground truth of a simulated flight: it judges the flight, and nothing flies by it.
+"""Ground truth of a simulated flight: it counts collisions, and no decision uses it.
 
 Two sources exist. Our own simulator sends it over UDP beside MAVLink (`UdpGroundTruth`). A real autopilot that runs in
 a simulator sends it over MAVLink beside the estimate (`MavlinkGroundTruth`).
@@ -51,7 +51,7 @@ class UdpGroundTruth:
         self._socket.close()
 
     def _take(self, values: Any) -> None:
-        """Raises ValueError, TypeError, KeyError: the datagram is not one of our simulator."""
+        """Take over the values of a datagram. Raises ValueError, TypeError, KeyError: it is not our simulator's."""
         if values["system"] != self._system:
             return
         state, clearance = np.array(values["state"], float), values["clearance"]
@@ -67,8 +67,8 @@ class UdpGroundTruth:
 class MavlinkGroundTruth:
     """Ground truth of one flight, from the latitude and longitude that an autopilot's simulator sends over MAVLink.
 
-    The first message lays the map so that truth and estimate agree. From then on the drift of the estimate counts
-    against the flight.
+    The first message places the map so that truth and estimate agree. From then on, the drift of the estimate can cause
+    collisions that count.
     """
 
     clearance_of: Callable[[Array], float]  # clearance [m] of a position (3,); below 0 the body touches an obstacle

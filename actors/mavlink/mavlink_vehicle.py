@@ -45,8 +45,8 @@ class MavlinkVehicle(PeriodicVehicle):
     process, which outlives the actor (`brakeline.actors.mavlink.vehicle_client`). If the vehicle leaves offboard or
     guided mode (pilot, failsafe, battery, fence), we do not take it back; periods are `lost` until it returns. If the
     vehicle disarms or restarts, or its estimate jumps, our command of it has ended: the vehicle brakes along the
-    committed plan (a disarmed one does not), and then nobody flies it. Nothing else could tell that the vehicle is
-    where our map says, or that a person has not taken it in hand.
+    committed plan (a disarmed one does not), and then nobody flies it. After such an event, we do not know whether the
+    vehicle is where our map says, or whether a person holds it.
 
     Collisions and clearance come from the ground truth of a simulator, if there is one.
     """
@@ -87,7 +87,9 @@ class MavlinkVehicle(PeriodicVehicle):
         self._link = open_link(flight.url)
         self._truth: UdpGroundTruth | None = None
         self._mavlink_truth = None if flight.truth else mavlink_truth
-        self._client = AutopilotClient(self._send, flight.system, tap, lambda text: log.info("it says: %s", text))
+        self._client = AutopilotClient(
+            self._send, flight.system, tap, lambda text: log.info("the autopilot says: %s", text)
+        )
         self._watch = FlightWatch(self._client, self.timing)
         self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold, from_ground)
         self.notes = self._takeoff.notes
@@ -165,7 +167,7 @@ class MavlinkVehicle(PeriodicVehicle):
         """Seconds since the last message of the autopilot."""
         return self._watch.silence(time.monotonic())
 
-    def judged(self) -> dict[str, float]:
+    def truth_figures(self) -> dict[str, float]:
         """Figures for Health from the ground truth of the autopilot's simulator; empty without one."""
         truth = self._mavlink_truth
         if truth is None or truth.state is None:
@@ -266,13 +268,13 @@ class MavlinkVehicle(PeriodicVehicle):
             self._logged_loss = kind
             texts = "; ".join(self._client.texts[-2:])
             if why:
-                log.warning("braking: %s%s", why, f"; it says: {texts}" if texts else "")
+                log.warning("braking: %s%s", why, f"; the autopilot says: {texts}" if texts else "")
             else:
                 log.warning("flying again, after: %s", before)
         battery = self._client.battery
         if battery is not None and battery < LOW_BATTERY and not self._logged_battery:
             self._logged_battery = True
-            log.warning("its battery is at %.0f %%", battery)
+            log.warning("the battery is at %.0f %%", battery)
 
     def _state(self, now: float) -> Array:
         """Return the state (9,) at time `now`: the latest telemetry, extrapolated by its velocity and acceleration."""

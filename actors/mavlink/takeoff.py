@@ -13,7 +13,7 @@ import numpy as np
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient, Wait, message_id
 from brakeline.actors.mavlink.autopilot_limits import AUTOPILOT_LIMITS, limits_below_demand
-from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, missing
+from brakeline.actors.mavlink.telemetry import ATTITUDE, FORCE, LANDED, MOTION, Array, unknown_quantities
 from brakeline.errors import MavlinkError, TelemetryMissing
 from brakeline.messaging.robot import Robot
 
@@ -103,9 +103,9 @@ class Takeoff:
         if not client.watch_estimator(wait):
             return
         began = logged_at = time.monotonic()
-        ready = lambda: client.estimator is not None and not missing(client.estimator)  # noqa: E731
+        ready = lambda: client.estimator is not None and not unknown_quantities(client.estimator)  # noqa: E731
         while not wait(ready, max(0.0, logged_at + PROGRESS_INTERVAL - time.monotonic())):
-            logged_at, unknown = time.monotonic(), ", ".join(missing(client.estimator or 0))
+            logged_at, unknown = time.monotonic(), ", ".join(unknown_quantities(client.estimator or 0))
             if client.estimator is None and logged_at - began > ESTIMATOR_SILENCE:
                 return
             if logged_at - began > ESTIMATE_TIMEOUT:

@@ -168,7 +168,7 @@ CONSTANT_POSITION = 128  # flag: the estimator only assumes that the vehicle sta
 ESTIMATORS = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 
 
-def missing(flags: int) -> list[str]:
+def unknown_quantities(flags: int) -> list[str]:
     """Return the names of the quantities that the estimator does not know yet, from its flags."""
     unknown = [name for name, bits in ESTIMATED.items() if not flags & bits]
     return unknown + ["anything except that the vehicle stands still"] * bool(flags & CONSTANT_POSITION)

@@ -252,7 +252,7 @@ class VehicleServer:
                 period=period_message(period),
                 frames=frames[start : start + FRAMES_PER_UPDATE],
                 passed_over=self._rejected.count,
-                figures=vehicle.timing.figures() | vehicle.judged() if figures else {},
+                figures=vehicle.timing.figures() | vehicle.truth_figures() if figures else {},
             )
             self._outbox.put(pb.VehicleMessage(update=update))
 

@@ -39,7 +39,7 @@ class GateStats:
 
     periods: int = 0
     kinds: Counter[str] = field(default_factory=Counter)  # periods by decision, or `no answer`, `late`, `blind`
-    commands: int = 0  # that the gate decided about
+    commands: int = 0  # about which the gate decided
     compared: int = 0  # measured states with a prediction
     outside: int = 0  # of those, states outside of the predicted set
     slips: int = 0  # periods that began late by a period or more
@@ -71,7 +71,7 @@ class CommandGate:
         assert robot.late, "in real time a decision is about the next period"
         self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot, turn_aside), GateStats()
         self.input = np.zeros(robot.action_dim)  # in force
-        self.kind, self.reason = BLIND, "not begun"  # the decision about it, and why it is not the command
+        self.kind, self.reason = BLIND, "not begun"  # the decision about this input, and why it is not the command's
         self.outcome: DecisionOutcome | None = None  # of this period's question
         self._ask, self._name = ask, name
         self._command: RawCommand | None = None  # the one that the outcome is about
@@ -82,9 +82,10 @@ class CommandGate:
     ) -> None:
         """Ask about a command in the state (n,) at the beginning of the period.
 
-        The gate first inflates the obstacles by `SCAN_DIFFERENCE`, since the next scan may show them that much nearer:
-        a robot that stopped where this scan just allowed it could then not even turn. If nothing can be verified with
-        that margin, the gate asks without it, but accepts no plan that ends nearer to an obstacle.
+        The gate first inflates the obstacles by `SCAN_DIFFERENCE`, since the next scan may show them that much nearer.
+        Otherwise a robot that stops at the edge of this scan's free space could not even turn after the next scan. If
+        nothing can be verified with that margin, the gate asks without it, but accepts no plan that ends nearer to an
+        obstacle.
 
         Args:
             obstacles: all obstacles that a scan shows; all other space is free.
@@ -111,8 +112,8 @@ class CommandGate:
     def slip(self, periods: int) -> None:
         """Pass over the committed plan's inputs for periods in which the process stood still.
 
-        Meanwhile the base went on with the last input, or its own timeout stopped it. The rest of the plan as it was
-        would set a robot that already stands in motion again.
+        Meanwhile the base went on with the last input, or its own timeout stopped it. The inputs of the missed periods
+        could set a robot in motion again that already stands.
         """
         self.stats.slips += 1
         for _ in range(min(periods, len(self.backup_plan.plan))):

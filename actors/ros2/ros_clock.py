@@ -12,7 +12,7 @@ POLL = 0.02  # s between two checks whether to stop
 
 
 class SystemClock:
-    """This machine's time. It runs evenly between two calls of `jumped`, so that setting the date stops nobody."""
+    """This machine's time. It runs evenly between two calls of `jumped`, even if the system's time is set."""
 
     def __init__(self) -> None:
         self._offset = time.time() - time.monotonic()

@@ -21,6 +21,7 @@ from brakeline.safety.model.model_config import KINDS, MODES, ONE_STEP, RESIDUAL
 from brakeline.safety.model.stated_bound import accepted_bound, refusal
 
 if TYPE_CHECKING:
+    from brakeline.deploy.progress import Advance
     from brakeline.messaging.robot import Robot
     from brakeline.safety.model.dataset import Dataset
     from brakeline.safety.model.model_set import ModelSet
@@ -69,41 +70,16 @@ class CertifyCommand:
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""
-        from brakeline.deploy.data.certification import certify_supported
-
         settings = ModelConfig(outside=self.outside)  # before data are recorded: it may be out of range
         path, data, note = self._load()
         accepted_bound(data.robot, self.accept_bound)
-        models: list[tuple[ModelSet, ValidationReport]] = []
-        results: dict[str, Any] = {}
-        notes: list[str] = []
         forms = self._forms(data.robot)
         if self.until_held and (RESIDUAL, ONE_STEP) in forms:
             raise ValueError(
                 "--until-held is for --mode direct and recursion; in mode one-step, a smaller --outside widens the sets"
             )
         with under_way("certifying", PERCENT * len(forms)) as advance:
-            for kind, mode in forms:
-                advance(0, f"certifying {kind}, {mode}")
-                progress = by_share(advance)
-                try:
-                    config = replace(settings, certificate=kind, mode=mode)
-                    config = config.of_minutes() if self.few else config
-                    model, report, unsupported = certify_supported(
-                        data, config, self.windows, self.until_held, progress
-                    )
-                except Unsupported as error:
-                    figures = {"refused": str(error)}
-                    errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
-                    if not self.few and mode != ONE_STEP:  # which needs no number of windows
-                        errors.print("give --few to certify minutes of driving", markup=False)
-                else:
-                    models.append((model, report))
-                    notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
-                    figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
-                    figures |= self._put_to_use(model, data)
-                results.setdefault(kind, {})[mode] = figures
-                progress(1.0)
+            models, notes, results = self._certify(forms, settings, data, advance)
         if self.json:
             # The figures of a certificate are those of the direct mode; those of each mode stand beside them.
             flat = {kind: row.get("direct", next(iter(row.values()))) | row for kind, row in results.items()}
@@ -119,8 +95,38 @@ class CertifyCommand:
             self._publish(models[0][0], data)
         return int(not models or any("not_used" in row for modes in results.values() for row in modes.values()))
 
+    def _certify(
+        self, forms: list[tuple[str, str]], settings: ModelConfig, data: Dataset, advance: Advance
+    ) -> tuple[list[tuple[ModelSet, ValidationReport]], list[str], dict[str, Any]]:
+        """Return the supported model sets with their reports, notes to print, and the figures of each form."""
+        from brakeline.deploy.data.certification import certify_supported
+
+        models: list[tuple[ModelSet, ValidationReport]] = []
+        results: dict[str, Any] = {}
+        notes: list[str] = []
+        for kind, mode in forms:
+            advance(0, f"certifying {kind}, {mode}")
+            progress = by_share(advance)
+            try:
+                config = replace(settings, certificate=kind, mode=mode)
+                config = config.of_minutes() if self.few else config
+                model, report, unsupported = certify_supported(data, config, self.windows, self.until_held, progress)
+            except Unsupported as error:
+                figures = {"refused": str(error)}
+                errors.print(f"[red]{kind}, {mode}: refused:[/] {escape(str(error))}")
+                if not self.few and mode != ONE_STEP:  # which needs no number of windows
+                    errors.print("give --few to certify minutes of driving", markup=False)
+            else:
+                models.append((model, report))
+                notes += [f"not supported: {windows} windows: {reason}" for windows, reason in unsupported.items()]
+                figures = report.figures() | {"windows_of": model.model_config.windows, "not_of": unsupported}
+                figures |= self._put_to_use(model, data)
+            results.setdefault(kind, {})[mode] = figures
+            progress(1.0)
+        return models, notes, results
+
     def _forms(self, robot: Robot) -> list[tuple[str, str]]:
-        """Return the pairs of error bound and mode to validate."""
+        """Return the forms to validate: pairs of an error bound and a mode."""
         mode = self.mode
         if mode is None and not self.certificates:
             mode = "direct" if robot.feedback else "one-step"

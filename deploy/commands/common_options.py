@@ -90,7 +90,7 @@ class LogReadOptions:
     unit: tuple[str, ...] = ()
     """Read these names in units that are not SI, each as NAME=UNIT: heading=deg, speed=km/h, time=ms."""
     topics: tuple[str, ...] = ()
-    """Take these topics or message types, where several hold the same quantity."""
+    """Take a quantity from these topics or message types, if several hold it."""
     read_seconds: float = 0.0
     """Stop reading a foreign log after this computing time [s]. 0 means 3 s, and 1 s more for each 200 kB."""
     read_gib: float = 4.0
@@ -250,7 +250,7 @@ class RunBusOptions:
         keys = self.keys or default_keys() or (make_run_keys(config, folder) if self.secured else None)
         endpoints: tuple[str, ...] = (free_endpoint("tcp" if keys is None else "tls"),)
         if self.listen:
-            # Strangers who crowd an endpoint that other machines reach do not delay the run's own processes at another.
+            # The run's own processes have another endpoint, so connections from other machines cannot delay them.
             endpoints = (self.listen,) if local(self.listen) else (*endpoints, self.listen)
         return BusSettings(listen=endpoints, keys=keys, insecure=self.insecure, metrics=self.metrics)
 

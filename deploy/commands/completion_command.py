@@ -15,7 +15,7 @@ class CompletionCommand:
     """The options of `brakeline completion`."""
 
     shell: Annotated[Literal["bash", "zsh"], tyro.conf.Positional] = "bash"
-    """Complete in this shell."""
+    """Print the completion for this shell."""
 
     def run(self) -> int:
         """Print the completion. Returns the exit status."""

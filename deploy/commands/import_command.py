@@ -30,16 +30,16 @@ class ImportCommand:
     out: Path | None = None
     """Write the data set to this file. Defaults to the data set in use, data/ROBOT/record.safetensors."""
     map: tuple[str, ...] = ()
-    """Find coordinates, inputs and the time at these places of the log, each as NAME=TABLE/FIELD (of a file of columns:
-    NAME=COLUMN), if they are not at their usual places."""
+    """Read a coordinate, an input or the time from this place of the log, if it is not found by its name. Write
+    NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns."""
     delay: float = 0.0
-    """Shift the inputs, which are stamped too early, by this time [s]. The report says how much later than its inputs
+    """Add this time to the stamps of the inputs, if these are too early [s]. The report says how long after its inputs
     the robot moves."""
     hold: float = HOLD
     """Let an input count for this time after its last message [s]."""
     reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)
     picture: Path | None = None
-    """Draw what was driven into this image (.png)."""
+    """Draw the recorded driving into this image (.png)."""
     quiet: Quiet = False
     json: Json = False
 

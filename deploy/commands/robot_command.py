@@ -15,8 +15,9 @@ from brakeline.deploy.commands.common_options import Json, LogReadOptions, Unpre
 from brakeline.deploy.data.description_summary import summary
 from brakeline.errors import BadDescription, MissingExtra, NoSource, UnknownTask
 from brakeline.logs.stacking_table import plain_table
+from brakeline.messaging.description_model import NAME
 from brakeline.messaging.robot import robot_named
-from brakeline.messaging.robot_description import NAME, robot_from_description
+from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import RobotWithTask, Task, robot_maybe_with_task
 

@@ -58,7 +58,6 @@ class Coverage:
 
     seen: tuple[ValueRange, ...]
     stops: int  # long enough to measure the remaining motion after a stop
-    braked_from: tuple[ValueRange, ...]  # strongest inputs in the time before each stop
     plans: int  # plan windows of the whole horizon
     windows: int  # free windows
     missing: tuple[str, ...]
@@ -88,7 +87,7 @@ def coverage(data: Dataset) -> Coverage:
     missing += [text for one in seen for text in _unreached_bounds(one)]
     missing += [text for one in braked for text in _unbraked_ranges(one)]
     missing += _windows_missing(plans, free, linear=bool(robot.feedback))
-    return Coverage((*seen, *followers), stops, tuple(braked), plans, free, tuple(missing))
+    return Coverage((*seen, *followers), stops, plans, free, tuple(missing))
 
 
 def _seen(name: str, unit: str, low: float, high: float, values: Array) -> ValueRange:

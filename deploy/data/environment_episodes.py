@@ -17,7 +17,7 @@ import numpy as np
 
 from brakeline.deploy.data.excitation import MOST_HELD, excitation
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
-from brakeline.deploy.progress import under_way
+from brakeline.deploy.progress import Advance, under_way
 from brakeline.errors import BadData
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
@@ -71,33 +71,52 @@ def collect(
         BadData: the recording is not a valid data set, or every episode ends at once.
     """
     driven = _Environment(env, robot, mapping_for_space(env.action_space, robot, actions), state, disturbed)
-    trajectories: list[Trajectory] = []
-    empty_episodes = number = recorded = 0
     with under_way(f"driving {robot.name}", periods) if shown else nullcontext(_ignore) as advance:
-        while recorded < periods:
-            inputs, left = excitation(robot, np.random.default_rng((seed, number)), held), periods - recorded
-            episode = driven.episode(inputs, min(LONGEST, left), None if number else seed, options)
-            new = [t for t in episode if len(t.inputs) >= min(FEWEST, left)]
-            number += 1
-            empty_episodes = 0 if new else empty_episodes + 1
-            if empty_episodes >= MAX_EMPTY:
-                raise BadData(
-                    f"{MAX_EMPTY} episodes in a row ended before period {FEWEST}: check why the environment ends"
-                )
-            trajectories += new
-            added = sum(len(t.inputs) for t in new)
-            recorded += added
-            advance(added)
+        trajectories = _drive(driven, robot, periods, held, seed, options, advance)
     if chord_deviation is None:
-        # Twice a·T²/8 in m: a path with acceleration a leaves its chord by a·T²/8 within a period T. The second
-        # differences of the positions are a·T².
-        sampled = any(t.paths.shape[1] > 1 for t in trajectories)
-        sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
-        chord_deviation = 0.0 if sampled else max((float(size.max()) for size in sizes), default=0.0) / 4.0
+        chord_deviation = _chord_deviation(robot, trajectories)
     about = {"origin": str(getattr(env.spec, "id", None) or type(env.unwrapped).__name__), "seed": str(seed)}
     data = Dataset(robot, without_repeats(robot, trajectories)[0], about, chord_deviation)
     data.check()
     return data
+
+
+def _drive(
+    driven: _Environment,
+    robot: Robot,
+    periods: int,
+    held: int,
+    seed: int,
+    options: dict[str, Any] | None,
+    advance: Advance,
+) -> list[Trajectory]:
+    """Drive episodes until they have so many periods. Raises BadData: every episode ends at once."""
+    trajectories: list[Trajectory] = []
+    empty_episodes = number = recorded = 0
+    while recorded < periods:
+        inputs, left = excitation(robot, np.random.default_rng((seed, number)), held), periods - recorded
+        episode = driven.episode(inputs, min(LONGEST, left), None if number else seed, options)
+        new = [t for t in episode if len(t.inputs) >= min(FEWEST, left)]
+        number += 1
+        empty_episodes = 0 if new else empty_episodes + 1
+        if empty_episodes >= MAX_EMPTY:
+            raise BadData(f"{MAX_EMPTY} episodes in a row ended before period {FEWEST}: check why the environment ends")
+        trajectories += new
+        added = sum(len(t.inputs) for t in new)
+        recorded += added
+        advance(added)
+    return trajectories
+
+
+def _chord_deviation(robot: Robot, trajectories: list[Trajectory]) -> float:
+    """Return 0 if positions within periods are recorded; otherwise twice a·T²/8 [m].
+
+    A path with acceleration a leaves its chord by a·T²/8 within a period T. The second differences of the positions
+    are a·T².
+    """
+    sampled = any(t.paths.shape[1] > 1 for t in trajectories)
+    sizes = [bends(robot, t.states) for t in trajectories if len(t.inputs) > 1]
+    return 0.0 if sampled else max((float(size.max()) for size in sizes), default=0.0) / 4.0
 
 
 def _ignore(by: int = 1, what: str | None = None) -> None:

@@ -56,7 +56,8 @@ def ratio(
     if crossed and len({len(a) for a, _ in pairs}) > 1:
         raise ValueError("seeds with the same episodes have the same number of them")
     shared = _drawn(len(pairs[0][0]), rng) if crossed else None
-    resampled = np.stack([_resampled(a, b, _drawn(len(a), rng) if shared is None else shared) for a, b in pairs])
+    counts = [_drawn(len(a), rng) if shared is None else shared for a, _ in pairs]  # how often each episode was drawn
+    resampled = np.stack([(drawn @ a) / (drawn @ b) for (a, b), drawn in zip(pairs, counts, strict=True)])
     shape = len(pairs), RESAMPLES  # of the seeds drawn
     # Without common episodes, draw them independently for each seed, also if a seed is drawn twice.
     columns = np.arange(RESAMPLES) if crossed else rng.integers(RESAMPLES, size=shape)
@@ -87,8 +88,3 @@ def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimat
 def _drawn(episodes: int, rng: np.random.Generator) -> Array:
     """Return how often each episode is drawn, (RESAMPLES, episodes)."""
     return np.asarray(rng.multinomial(episodes, np.full(episodes, 1.0 / episodes), size=RESAMPLES), float)
-
-
-def _resampled(above: Array, below: Array, counts: Array) -> Array:
-    """Return Σ above / Σ below (RESAMPLES,) of episodes that were drawn `counts` times."""
-    return np.asarray((counts @ above) / (counts @ below))

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
@@ -25,7 +24,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
-from brakeline.sim.navigation_env import OBSERVED_LIMIT
+from brakeline.sim.navigation_env import action_and_observation_space
 
 CAPACITY = 200_000  # steps of the replay buffer, as our learner's
 
@@ -39,10 +38,9 @@ class RobotsAsVecEnv(VecEnv):
     def __init__(
         self, robot: RobotWithTask, robots: BatchRobots, reward_scale: float, take: Take, begin: Begin
     ) -> None:
-        limit = np.full(robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
-        bounds = robot.low().astype(np.float32), robot.high().astype(np.float32)
+        action_space, observation_space = action_and_observation_space(robot)
         self.render_mode = None
-        super().__init__(len(robots.names), Box(-limit, limit), Box(*bounds))
+        super().__init__(len(robots.names), observation_space, action_space)
         self._robots, self._reward_scale, self._take, self._begin = robots, reward_scale, take, begin
 
     def reset(self) -> NDArray[np.float32]:

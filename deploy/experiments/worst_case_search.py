@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,13 @@ from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.scripted_policies import Policy
 
 MOVED = 6  # obstacles that a candidate moves
-PIECES = 10  # of the proposed inputs
+PIECES = 10  # constant inputs that the policy proposes one after the other
 PERIODS = 60  # of an episode
-AN_ARENA = 300  # episodes that are spent on one drawn arena
-MOST_ARENAS = 10  # without a single episode that counts
+EPISODES_OF_AN_ARENA = 300  # candidates in one drawn arena, before the next one is drawn
+MOST_ARENAS = 10  # arenas without an episode that counts, after which the search ends
 SPREAD = 0.5  # first standard deviation of a candidate's numbers, which are used within -1 and 1
-FAR = 4.0  # footprints, by which an obstacle is moved at most
-TOUCHED = 1.0  # m, by which a candidate with a contact is better than any without one
+MOST_SHIFT = 4.0  # largest shift of an obstacle, in radii of the robot's footprint
+CONTACT_BONUS = 1.0  # m, subtracted from the score of a candidate with a contact, so that it is below all others
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SearchedEpisode:
     def arena(self, drawn: Arena, robot: Robot) -> Arena:
         """Return the drawn arena with its moved obstacles and a shorter time limit."""
         dim = drawn.dim
-        shifts = FAR * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
+        shifts = MOST_SHIFT * robot.footprint * self.values[: MOVED * dim].reshape(MOVED, dim)
         inside = [o for o in drawn.obstacles if o.kind != WALL and len(o.position) == dim and _movable(o, drawn)]
         inside.sort(key=lambda o: float(np.linalg.norm(np.subtract(o.position, drawn.start[:dim]))))
         moved = {
@@ -90,76 +90,85 @@ def search(
     """
     import cma
 
-    drawn: list[Arena] = []
-
-    def draw(name: str, generator: np.random.Generator, robot: RobotWithTask) -> Arena:
-        return drawn[-1]
-
-    env = environment(robot, what.arena, FRESH + what.seed, what.conditions, draw=draw)
-    driver = replace(CampaignDriver.of(robot, what), env=env)
-
-    def drive(candidate: SearchedEpisode, log: TrialLog | None = None) -> Row:
-        base = draw_arena(what.arena, np.random.default_rng((what.seed, candidate.number)), robot)
-        drawn[:] = [candidate.arena(base, robot)]
-        return driver.row(candidate.number, log, candidate.policy(robot))
-
-    found = _Found()
-
-    def score(candidate: SearchedEpisode) -> float:
-        """Drive a candidate and return what CMA-ES makes small."""
-        row = drive(candidate)
-        (arena,) = drawn
-        start = np.asarray(arena.start[: arena.dim])
-        free = float(arena.shapes.distance(start).min()) - robot.footprint
-        if free < robot.footprint:  # it began too near to something: no fault of the filter
-            return 10.0 - free
-        found.episodes, found.steps = found.episodes + 1, found.steps + int(row["steps"])
-        touched = bool(row["collision"] or row["contact_moving"])
-        found.collisions += touched
-        value = float(row["closest"]) - TOUCHED * touched
-        if value < found.score:
-            found.score, found.closest, found.worst = value, float(row["closest"]), candidate
-        found.history.append(round(found.closest, 5))
-        return value
-
+    found = _Search(robot, what)
     size = MOVED * robot.position_dim + PIECES * robot.action_dim
     number = 0
     while found.episodes < episodes:
-        options = {"bounds": [-1.0, 1.0], "seed": what.seed + number + 1, "verbose": -9, "maxfevals": AN_ARENA}
+        options = {
+            "bounds": [-1.0, 1.0],
+            "seed": what.seed + number + 1,
+            "verbose": -9,
+            "maxfevals": EPISODES_OF_AN_ARENA,
+        }
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
         while not strategy.stop() and found.episodes < episodes:
             candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
-            strategy.tell([one.values for one in candidates], list(map(score, candidates)))
+            strategy.tell([one.values for one in candidates], list(map(found.score, candidates)))
             say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
         number += 1
         if not found.episodes and number == MOST_ARENAS:
             raise NoArena(f"every candidate in {number} arenas {what.arena!r} began too near to something")
-    worst = found.worst
-    if worst is not None:
-        with driver.log(path, episode=str(worst.number), policy="worst-case search") as log:
-            drive(worst, log)
-    return {
-        "episodes": found.episodes,
-        "collisions": found.collisions,
-        "steps": found.steps,
-        "closest": found.closest,
-        "number": None if worst is None else worst.number,
-        "values": [] if worst is None else worst.values.round(6).tolist(),
-        "history": found.history,
-    }
+    found.write_worst(path)
+    return found.figures()
 
 
-@dataclass
-class _Found:
-    """What the search has seen so far."""
+class _Search:
+    """Drives candidates, and remembers the worst one."""
 
-    episodes: int = 0
-    collisions: int = 0
-    steps: int = 0
-    score: float = math.inf
-    closest: float = math.inf  # m, of the candidate with the least score
-    worst: SearchedEpisode | None = None
-    history: list[float] = field(default_factory=list)
+    def __init__(self, robot: RobotWithTask, what: Evaluation) -> None:
+        self.episodes = 0
+        self.closest = math.inf  # m, of the worst candidate
+        self._robot, self._what = robot, what
+        self._collisions = self._steps = 0
+        self._least = math.inf  # the worst candidate's score
+        self._worst: SearchedEpisode | None = None
+        self._history: list[float] = []
+        self._arena: Arena | None = None  # of the candidate that is driven
+        env = environment(robot, what.arena, FRESH + what.seed, what.conditions, draw=self._draw)
+        self._driver = replace(CampaignDriver.of(robot, what), env=env)
+
+    def _draw(self, name: str, generator: np.random.Generator, robot: RobotWithTask) -> Arena:
+        assert self._arena is not None
+        return self._arena
+
+    def _drive(self, candidate: SearchedEpisode, log: TrialLog | None = None) -> tuple[Row, Arena]:
+        generator = np.random.default_rng((self._what.seed, candidate.number))
+        self._arena = arena = candidate.arena(draw_arena(self._what.arena, generator, self._robot), self._robot)
+        return self._driver.row(candidate.number, log, candidate.policy(self._robot)), arena
+
+    def score(self, candidate: SearchedEpisode) -> float:
+        """Drive a candidate and return what CMA-ES makes small."""
+        row, arena = self._drive(candidate)
+        free = float(arena.shapes.distance(np.asarray(arena.start[: arena.dim])).min()) - self._robot.footprint
+        if free < self._robot.footprint:  # it began too near to something: no fault of the filter
+            return 10.0 - free
+        self.episodes, self._steps = self.episodes + 1, self._steps + int(row["steps"])
+        touched = bool(row["collision"] or row["contact_moving"])
+        self._collisions += touched
+        value = float(row["closest"]) - CONTACT_BONUS * touched
+        if value < self._least:
+            self._least, self.closest, self._worst = value, float(row["closest"]), candidate
+        self._history.append(round(self.closest, 5))
+        return value
+
+    def write_worst(self, path: Path) -> None:
+        """Drive the worst candidate again, and write its log."""
+        if self._worst is not None:
+            with self._driver.log(path, episode=str(self._worst.number), policy="worst-case search") as log:
+                self._drive(self._worst, log)
+
+    def figures(self) -> dict[str, Any]:
+        """Return what `search` returns."""
+        worst = self._worst
+        return {
+            "episodes": self.episodes,
+            "collisions": self._collisions,
+            "steps": self._steps,
+            "closest": self.closest,
+            "number": None if worst is None else worst.number,
+            "values": [] if worst is None else worst.values.round(6).tolist(),
+            "history": self._history,
+        }
 
 
 def _movable(obstacle: Obstacle, arena: Arena) -> bool:

@@ -7,6 +7,7 @@ would take more time than the step. So `replay` has nothing to compare, and `ana
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 from brakeline.deploy.run.batch_trainer import BatchTrainer
@@ -20,7 +21,7 @@ from brakeline.learner.learner_output import LearnerOutput
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.process_runtime import Process
-from brakeline.messaging.task import robot_with_task
+from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import EPISODE, STEP
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.methods import load
@@ -45,36 +46,19 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
         Unreachable: no router answers.
     """
     robot = robot_with_task(spec.robot)
-    safety = None
-    if config.filtered:
-        trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
-        model = load(model_in_run(config, folder, robot, trust))
-        if not isinstance(model, ModelSet):
-            raise BadModel(f"the model of {robot.name} is no model set, which --backend batch needs")
-        safety = Filter(model)
+    safety = _filter(bus, config, folder, robot) if config.filtered else None
     with Process(bus, spec.name) as process:
         learner = Learner(robot, config.learning(), incarnation=process.bus.run)
         if resume:
             learner.restore(folder / spec.name / CHECKPOINT)
             log.info("resumed at step %d, update %d", learner.steps, learner.updates)
-        publishers = [
-            {
-                topic.message: process.bus.publisher(topic, robot=robot.name, source=f"{spec.name}.{i}")
-                for topic in PUBLISHED
-            }
-            for i in range(config.robots_per_actor)
-        ]
-
-        def publish(number: int, message: pb.Step | pb.Episode) -> None:
-            publishers[number][type(message)].put(message)
-
         output = LearnerOutput(process, learner, folder / spec.name)
         trainer = BatchTrainer(
             learner,
             safety,
             config.robots_per_actor,
             spec.name,
-            publish,
+            _publish_for_robots(process, robot, spec.name, config.robots_per_actor),
             arena=config.arena,
             seed=config.seed,
             penalty=config.penalty,
@@ -94,3 +78,27 @@ def main(bus: BusSettings, config: RunConfig, folder: Path, spec: ProcessSpec, r
         output.save()
         output.publish()
         return learner.done
+
+
+def _filter(bus: BusSettings, config: RunConfig, folder: Path, robot: RobotWithTask) -> Filter:
+    """Return the filter with the run's model set. Raises BadModel: the run has no model set of this robot."""
+    trust = None if bus.keys is None else TrustedSigners.load(bus.keys)
+    model = load(model_in_run(config, folder, robot, trust))
+    if not isinstance(model, ModelSet):
+        raise BadModel(f"the model of {robot.name} is no model set, which --backend batch needs")
+    return Filter(model)
+
+
+def _publish_for_robots(
+    process: Process, robot: RobotWithTask, name: str, robots: int
+) -> Callable[[int, pb.Step | pb.Episode], None]:
+    """Return a function that publishes a message of the robot with a number, which is a source of its own."""
+    publishers = [
+        {topic.message: process.bus.publisher(topic, robot=robot.name, source=f"{name}.{i}") for topic in PUBLISHED}
+        for i in range(robots)
+    ]
+
+    def publish(number: int, message: pb.Step | pb.Episode) -> None:
+        publishers[number][type(message)].put(message)
+
+    return publish

@@ -1,4 +1,4 @@
-"""Encode and decode ROS 2 messages (CDR), and return their type hashes and definitions, by `rosbags` and without ROS.
+"""Encode and decode ROS 2 messages (CDR), and return their type hashes and definitions. This needs no ROS installation.
 
 The types are those of Jazzy. The types that we use have the same hashes in Kilted (a test compares them).
 """

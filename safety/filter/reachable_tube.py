@@ -268,6 +268,26 @@ def stack_recursive(
         centers.append(y[coordinates])
         spreads.append(generators[coordinates])
     total = generators.shape[1]
+    W, M, m_0 = _generator_lengths(atoms, K_rows, start, total)
+    directions = np.zeros((len(steps), len(coordinates), total))
+    for i, spread in enumerate(spreads):
+        directions[i, :, : spread.shape[1]] = spread
+    extra = [_atoms(c) for c in (chord_deviations, stopping_distance) if c is not None]
+    if not extra:
+        extra = [(np.zeros((0, nz)), np.zeros((len(steps) + 1, 0)), np.zeros(len(steps) + 1))]
+    W = np.vstack([W, *(w for w, _, _ in extra)])
+    M = _block_diagonal([M, *(m for _, m, _ in extra)])
+    W, M = _merged(W, M)
+    return _tube(np.stack(centers), directions, W, M, np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), position_dim)
+
+
+def _generator_lengths(
+    atoms: Sequence[tuple[Array, Array, Array]], K_rows: Sequence[Array], start: int, total: int
+) -> tuple[Array, Array, Array]:
+    """Solve m = w + t(z) + r + K m for (W, M, m_0), so that m = M |W z| + m_0.
+
+    atoms: `_atoms` of each step; K_rows: the rows of K by step. The first `start` of `total` generators have length 1.
+    """
     K = np.zeros((total - start, total))
     at = 0
     for row in K_rows:
@@ -277,19 +297,7 @@ def stack_recursive(
     W = np.vstack([a for a, _, _ in atoms])
     M = inverse @ _block_diagonal([m for _, m, _ in atoms])
     m_0 = inverse @ (np.concatenate([w for _, _, w in atoms]) + K[:, :start].sum(1))
-    directions = np.zeros((len(steps), len(coordinates), total))
-    for i, spread in enumerate(spreads):
-        directions[i, :, : spread.shape[1]] = spread
-    M = np.vstack([np.zeros((start, M.shape[1])), M])
-    m_0 = np.concatenate([np.ones(start), m_0])
-    extra = [_atoms(c) for c in (chord_deviations, stopping_distance) if c is not None]
-    if not extra:
-        extra = [(np.zeros((0, nz)), np.zeros((len(steps) + 1, 0)), np.zeros(len(steps) + 1))]
-    W = np.vstack([W, *(w for w, _, _ in extra)])
-    M = _block_diagonal([M, *(m for _, m, _ in extra)])
-    W, M = _merged(W, M)
-    m_0, stack_rows, d = np.concatenate([m_0, *(m0 for _, _, m0 in extra)]), np.stack(centers), position_dim
-    return _tube(stack_rows, directions, W, M, m_0, d)
+    return W, np.vstack([np.zeros((start, M.shape[1])), M]), np.concatenate([np.ones(start), m_0])
 
 
 def _atoms(step: ErrorBound) -> tuple[Array, Array, Array]:

@@ -207,52 +207,11 @@ class Dataset:
         missing = {"states", "inputs", "paths", "turned", "before", "lengths"} - tensors.keys()
         if missing or "robot" not in about:
             raise BadData(f"{path} is no data set: {', '.join(sorted(missing)) or 'its robot'} is missing")
-        try:
-            name = str(about["robot"])
-            described = about.get("description")
-            robot = (
-                robot_named(name)
-                if described is None
-                else refuse_shipped_name(robot_from_description(parse_json(described), name))
-            )
-        except (UnknownRobot, ValueError, TypeError) as error:
-            raise BadData(f"{path}: {error}") from error
-        if robot.name != name:
-            raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
-        if not robot.accepts_layout(about.get("layout")):
-            raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
-        lengths = tensors.pop("lengths")
-        tensors = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items()}
-        if lengths.ndim != 1 or lengths.dtype.kind != "i" or (lengths <= 0).any():
-            raise BadData(f"{path}: the trajectories' lengths are no lengths")
-        total = lengths.sum()
-        wanted = {
-            "states": total + len(lengths),
-            "inputs": total,
-            "paths": total,
-            "turned": total,
-            "before": len(lengths),
-        }
-        if "headings" in tensors:
-            wanted["headings"] = total
-        if any(len(tensors[name]) != count for name, count in wanted.items()):
-            raise BadData(f"{path}: the trajectories' lengths do not add up")
-        ends = np.cumsum(lengths)
-        trajectories = tuple(
-            Trajectory(
-                tensors["states"][start + i : end + i + 1],
-                tensors["inputs"][start:end],
-                tensors["paths"][start:end],
-                tensors["turned"][start:end],
-                tensors["before"][i],
-                tensors["headings"][start:end] if "headings" in tensors else None,
-            )
-            for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
-        )
+        robot = _recorded_robot(path, about)
         chord_deviation = about.get("bulge", 0.0)
         if not isinstance(chord_deviation, int | float) or not 0.0 <= chord_deviation < math.inf:
             raise BadData(f"{path}: the chord deviation {chord_deviation!r} is no length")
-        data = Dataset(robot, trajectories, about_data, float(chord_deviation))
+        data = Dataset(robot, _separated(path, tensors), about_data, float(chord_deviation))
         data.check()
         return data
 
@@ -295,3 +254,47 @@ def _jump(robot: Robot, t: Trajectory) -> Array:
     way = np.linalg.norm(steps, axis=2).sum(1)
     noise = 2.0 * np.linalg.norm(robot.measurement_bound[: robot.position_dim])
     return np.asarray(moved - 2.0 * (way + noise))  # factor 2: detect gross errors, not slipping wheels
+
+
+def _recorded_robot(path: Path | str, about: dict[str, Any]) -> Robot:
+    """Return the robot of a data set. Raises BadData: there is no such robot, or its layout has changed."""
+    name, described = str(about["robot"]), about.get("description")
+    try:
+        robot = (
+            robot_named(name)
+            if described is None
+            else refuse_shipped_name(robot_from_description(parse_json(described), name))
+        )
+    except (UnknownRobot, ValueError, TypeError) as error:
+        raise BadData(f"{path}: {error}") from error
+    if robot.name != name:
+        raise BadData(f"{path} is of robot {name!r}, its description of {robot.name!r}")
+    if not robot.accepts_layout(about.get("layout")):
+        raise BadData(f"{path} was recorded for another layout of {robot.name}: record it again")
+    return robot
+
+
+def _separated(path: Path | str, tensors: dict[str, Array]) -> tuple[Trajectory, ...]:
+    """Separate the trajectories that `Dataset.save` concatenated. Raises BadData: their lengths do not fit."""
+    lengths = tensors["lengths"]
+    parts = {name: np.atleast_1d(tensor).astype(float) for name, tensor in tensors.items() if name != "lengths"}
+    if lengths.ndim != 1 or lengths.dtype.kind != "i" or (lengths <= 0).any():
+        raise BadData(f"{path}: the trajectories' lengths are no lengths")
+    total, count = lengths.sum(), len(lengths)
+    wanted = {"states": total + count, "inputs": total, "paths": total, "turned": total, "before": count}
+    if "headings" in parts:
+        wanted["headings"] = total
+    if any(len(parts[name]) != rows for name, rows in wanted.items()):
+        raise BadData(f"{path}: the trajectories' lengths do not add up")
+    ends = np.cumsum(lengths)
+    return tuple(
+        Trajectory(
+            parts["states"][start + i : end + i + 1],
+            parts["inputs"][start:end],
+            parts["paths"][start:end],
+            parts["turned"][start:end],
+            parts["before"][i],
+            parts["headings"][start:end] if "headings" in parts else None,
+        )
+        for i, (start, end) in enumerate(zip(ends - lengths, ends, strict=True))
+    )

@@ -58,12 +58,7 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         ErrorBoundError: the data do not support this kind of error bound.
     """
     robot, kind = data.robot, model_config.windows
-    if not robot.position_dim:
-        raise ErrorBoundError(f"{robot.name} has no position, so this mode predicts nothing of it: use mode one-step")
-    if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):
-        raise ErrorBoundError("the recursion knows no body of discs beside the regressed position: use mode direct")
-    if kind == FREE and robot.feedback:
-        raise ErrorBoundError("what a feedback makes of the state has to be recorded: drive plans, not freely")
+    _check_mode(robot, model_config)
     fit, bound = data.split((0.5, 0.5))
     steps, chord_deviations = [], []
     horizon = robot.horizon
@@ -98,6 +93,16 @@ def fit_model_set(data: Dataset, model_config: ModelConfig) -> ModelSet:
         stands=periods_until_standing(whole, data, kind),
         in_place=_in_place(fit, bound, model_config),
     )
+
+
+def _check_mode(robot: Robot, model_config: ModelConfig) -> None:
+    """Raise ErrorBoundError if no model set of this mode and these windows predicts the robot."""
+    if not robot.position_dim:
+        raise ErrorBoundError(f"{robot.name} has no position, so this mode predicts nothing of it: use mode one-step")
+    if model_config.mode == RECURSION and any(disc.arm for disc in robot.body):
+        raise ErrorBoundError("the recursion knows no body of discs beside the regressed position: use mode direct")
+    if model_config.windows == FREE and robot.feedback:
+        raise ErrorBoundError("what a feedback makes of the state has to be recorded: drive plans, not freely")
 
 
 def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlace | None:

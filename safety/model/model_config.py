@@ -17,7 +17,7 @@ PLAN, FREE = "plan", "free"
 WINDOWS = (PLAN, FREE)
 DDPC, SECAS, SAILR, CBF, PSF = "ddpc", "secas", "sailr", "cbf", "psf"
 METHODS = (DDPC, SECAS, SAILR, CBF, PSF)  # of a safety service
-MOST_OUTSIDE = 0.1  # of the windows: sets that more leave promise nothing
+MOST_OUTSIDE = 0.1  # share of the windows: sets that more of them may leave are of no use
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,9 @@ class ModelConfig:
         if self.windows not in WINDOWS:
             raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < math.inf:
-            raise ValueError(f"an envelope scaled by {self.inflation} bounds nothing")
+            raise ValueError(
+                f"an envelope scaled by {self.inflation} bounds nothing: inflation is a number of 1 or more"
+            )
         if not 0.0 < self.outside <= MOST_OUTSIDE:
             raise ValueError(f"a share of {self.outside:g} of windows outside is not between 0 and {MOST_OUTSIDE:g}")
 
@@ -60,4 +62,6 @@ def check_reservations(method: str) -> None:
         ValueError: the method makes no reservations.
     """
     if method not in (DDPC, "none"):
-        raise ValueError(f"{method} predicts nothing, so it makes no promises: a fleet's method is {DDPC} or none")
+        raise ValueError(
+            f"{method} predicts no tube, so it reserves no space for a robot: a fleet's method is {DDPC} or none"
+        )

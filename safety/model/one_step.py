@@ -34,8 +34,8 @@ class Features:
     Attributes:
         scale (v,): units of the variables v = [s; u; input of the period before].
         saturations (E, 3): [a, b, width] of each primitive tanh((v_a - v_b) / width), with b = -1 for no v_b.
-        terms (F, 4): indices of the primitives in each product. Index 0 is the constant 1. Files of before have
-            products of three (F, 3).
+        terms (F, 4): indices of the primitives in each product. Index 0 is the constant 1. Files of earlier
+            versions have products of three (F, 3).
     """
 
     scale: Array
@@ -53,17 +53,19 @@ class Features:
             products *= p[factor]
         return np.asarray(products.T)
 
-    def some(self, used: Index) -> Features:
-        """Return these features alone."""
+    def subset(self, used: Index) -> Features:
+        """Return the features with these indices."""
         return replace(self, terms=self.terms[used])
 
 
 def features_for(robot: Robot, v: Array, degree: int, lags: int) -> Features:
     """Return the features from which the fit selects.
 
-    These are all monomials up to a degree, and two kinds that no monomial follows: an autopilot that limits its
-    acceleration answers with the tanh of the difference of an input and the speed that follows it, and what slips or
-    drags depends on the absolute value of a speed, |s| = s · sign s, also as a factor of one more variable.
+    These are all monomials up to a degree, and two kinds of features that monomials cannot represent:
+
+    - the tanh of the difference of an input and the speed that follows it: so an autopilot that limits its acceleration
+      answers;
+    - the absolute value of a speed, |s| = s · sign s, alone or times one more variable: slip and drag depend on it.
 
     Args:
         robot: the robot.
@@ -117,7 +119,7 @@ class OneStep:
         f = self.features
         named = {"C": self.C, "scale": f.scale, "saturations": f.saturations, "terms": f.terms.astype(float)}
         named |= {"root": self.root, "weight": np.array([self.weight])}
-        if self.start != 1.0:  # files of before have none, and a version is a hash of the content
+        if self.start != 1.0:  # files of earlier versions have none, and a version is a hash of the content
             named["start"] = np.array([self.start])
         return {TENSOR + name: value for name, value in named.items()}
 

@@ -66,7 +66,7 @@ class Regression:
         chosen = [path.best(candidate.penalty) for path in self._paths_without(without, gram, cross)]
         used = np.unique(np.concatenate([[0], *chosen]))  # the constant, for an output without features
         places = [np.searchsorted(used, one) for one in chosen]
-        features, gram, cross = self._features.some(used), gram[np.ix_(used, used)], cross[used]
+        features, gram, cross = self._features.subset(used), gram[np.ix_(used, used)], cross[used]
         gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12 * gram[0, 0])
         C = _solved(places, gram, cross)
         if candidate.instruments:

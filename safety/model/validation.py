@@ -5,6 +5,7 @@ The resulting statement holds for the recorded distribution only.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -181,35 +182,12 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
     figures: RegressorQuality = check_regressors(made_of.z, "plan windows", model.model_config.fewest)
     whole = windows(held_out, robot.horizon, kind)
     plans = non_overlapping(whole.take(~np.isnan(whole.stopping_distance)) if kind == PLAN else whole, robot.horizon)
-    ends = {tuple(start): row for row, start in enumerate(plans.start)}
     in_place = np.zeros(len(plans), dtype=bool)
     if model.in_place is not None:
         in_place = inside(plans.z, model.in_place.domain(plans.z.shape[1], robot.regressor_dim))
     groups = [(model, ~in_place)] + ([] if turning is None else [(turning, in_place)])
-    tubes = [of.tube_of_windows() for of, _ in groups]
-    excess, first = np.zeros(len(plans)), np.zeros(len(plans))
-    parts = [""] * len(plans)
-
-    def take(places: NDArray[np.intp], shares: Array, names: list[str]) -> None:
-        """Update the largest ratio, and the part with it, for the plans `places`; shares (places, names)."""
-        worst, largest = shares.argmax(1), shares.max(1)
-        for row in np.flatnonzero(largest > excess[places]):
-            parts[places[row]] = names[worst[row]]
-        excess[places] = np.maximum(excess[places], largest)
-
-    for k in range(1, robot.horizon + 1):
-        seen = windows(held_out, k, kind)
-        rows = [i for i, start in enumerate(seen.start) if tuple(start) in ends]
-        part = seen.take(np.isin(np.arange(len(seen)), rows))
-        for (of, members), tube in zip(groups, tubes, strict=True):
-            if not members.any():
-                continue
-            group, places = part.take(members), np.flatnonzero(members)
-            if k == 1:
-                shares = _first_excess(of, group)
-                first[members] = shares.max(1)
-                take(places, shares, state_parts(robot, shares.shape[1] - robot.state_dim))
-            take(places, *_excess(of, tube, group, k))
+    largest, first = _excess_of_plans(held_out, plans, groups)
+    excess = largest.excess
     outside, steps_outside = int((~(excess <= 1.0)).sum()), int((~(first <= 1.0)).sum())
     turns, turns_outside = int(in_place.sum()), int((~(excess[in_place] <= 1.0)).sum())
     statement = _statement(
@@ -225,9 +203,50 @@ def validate_plans(model: ModelSet, fitted: Dataset, held_out: Dataset) -> tuple
         in_place_violations=turns_outside,
         bound_in_place=upper_bound(turns_outside, turns),
         inflation=model.model_config.inflation,
-        leaving=group_violations(excess, parts, regimes(robot, plans.z)),
+        leaving=group_violations(excess, largest.parts, regimes(robot, plans.z)),
     )
     return statement, excess
+
+
+class _LargestExcess:
+    """The largest ratio of an error to its bound of each plan, and the part of the tube with that ratio."""
+
+    def __init__(self, plans: int) -> None:
+        self.excess, self.parts = np.zeros(plans), [""] * plans
+
+    def update(self, places: NDArray[np.intp], shares: Array, names: list[str]) -> None:
+        """Take in the ratios `shares` (places, names) of the plans `places`."""
+        worst, largest = shares.argmax(1), shares.max(1)
+        for row in np.flatnonzero(largest > self.excess[places]):
+            self.parts[places[row]] = names[worst[row]]
+        self.excess[places] = np.maximum(self.excess[places], largest)
+
+
+def _excess_of_plans(
+    held_out: Dataset, plans: Windows, groups: Sequence[tuple[ModelSet, NDArray[np.bool_]]]
+) -> tuple[_LargestExcess, Array]:
+    """Return the largest ratio of error to bound of each plan, and the ratios (plans,) after the first period.
+
+    groups: each model set, and the plans (plans,) whose sets it predicts.
+    """
+    model = groups[0][0]
+    robot, kind = model.robot, model.model_config.windows
+    starts = {tuple(start) for start in plans.start}
+    tubes = [of.tube_of_windows() for of, _ in groups]
+    largest, first = _LargestExcess(len(plans)), np.zeros(len(plans))
+    for k in range(1, robot.horizon + 1):
+        seen = windows(held_out, k, kind)
+        part = seen.take(np.array([tuple(start) in starts for start in seen.start], dtype=bool))
+        for (of, members), tube in zip(groups, tubes, strict=True):
+            if not members.any():
+                continue
+            group, places = part.take(members), np.flatnonzero(members)
+            if k == 1:
+                shares = _first_excess(of, group)
+                first[members] = shares.max(1)
+                largest.update(places, shares, state_parts(robot, shares.shape[1] - robot.state_dim))
+            largest.update(places, *_excess(of, tube, group, k))
+    return largest, first
 
 
 def validate_one_step(model: ModelSet, calibration: Calibration) -> ValidationReport:

@@ -1,8 +1,8 @@
 """Free space from a range image: everything that the image does not show to be free is a shadow (docs/method.md §10).
 
-The shadow of a patch is all of it beyond its free range F (`image_coverage.py`). A few half-spaces for each period keep
-the plan off thousands of shadows. The first supports the nearest shadow. The next supports the nearest shadow that is
-not beyond the first, and so on until every shadow is beyond one.
+A patch is a group of neighbouring beams. Its shadow is the space beyond its free range F (`image_coverage.py`). A few
+half-spaces for each period keep the plan off thousands of shadows. The first half-space touches the nearest shadow. The
+next touches the nearest shadow that is not beyond the first, and so on until every shadow is beyond one.
 """
 
 from __future__ import annotations

@@ -84,18 +84,23 @@ def request_message(
         fleet=fleet,
         widening=backup_plan.widening.factor,
     )
+    set_measurement(message, scan_in(scan))
+    _set_history(message, backup_plan)
+    return message
+
+
+def _set_history(message: pb.Request, backup_plan: BackupPlan) -> None:
+    """Set what the robot committed to before: its past states and inputs, its prediction and its reservation."""
     if (past := backup_plan.past) is not None:
         message.past_states.extend(past.states.ravel().tolist())
         message.past_inputs.extend(past.inputs.ravel().tolist())
         message.past_from_start = past.from_start
-    set_measurement(message, scan_in(scan))
     if backup_plan.predicted is not None:
         message.predicted_center.extend(backup_plan.predicted.center.tolist())
         message.predicted_half_width.extend(backup_plan.predicted.half_width.tolist())
         message.predicted_heading = backup_plan.predicted.heading
     if message.fleet and backup_plan.reservation is not None:
         message.reservation.CopyFrom(reservation_message(backup_plan.reservation))
-    return message
 
 
 def read_reply(reply: pb.Reply, request: pb.Request, robot: Robot) -> Answer:

@@ -9,15 +9,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from brakeline.errors import BadInput
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import ArenaKind, Reward, RobotWithTask, arena_kind, robot_with_task
+from brakeline.messaging.task import Reward, RobotWithTask, arena_kind, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.batch.batch_support import check_batch
@@ -27,7 +27,13 @@ from brakeline.sim.batch.observation_batch import GroundObservationBatch, Observ
 from brakeline.sim.batch.quadrotor_batch import QuadrotorBatch
 from brakeline.sim.batch.vehicle_batch import PeriodBatch, VehicleBatch
 from brakeline.sim.ground_estimator import wrap
-from brakeline.sim.navigation_env import OBSERVED_LIMIT, check_observation, check_options, episode_seed
+from brakeline.sim.navigation_env import (
+    OBSERVED_LIMIT,
+    action_and_observation_space,
+    check_observation,
+    check_options,
+    episode_seed,
+)
 from brakeline.sim.sim_conditions import Conditions
 
 Infos = dict[str, Any]
@@ -94,10 +100,7 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self.reward, self.seed_key = reward or self.robot.task.reward, seed_key
         self.autoreset_mode = autoreset_mode
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
-        low, high = self.robot.low().astype(np.float32), self.robot.high().astype(np.float32)
-        self.single_action_space = Box(low, high, dtype=np.float32)
-        limit = np.full(self.robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
-        self.single_observation_space = Box(-limit, limit, dtype=np.float32)
+        self.single_action_space, self.single_observation_space = action_and_observation_space(self.robot)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]

@@ -15,8 +15,8 @@ import numpy as np
 from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.ground_estimator_batch import GroundEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams, Rows

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.normal_streams import Rows
 from brakeline.sim.kernels.arena_kernels import distances_in_arenas

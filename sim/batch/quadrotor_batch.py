@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.flight_estimator_batch import FlightEstimatorBatch
 from brakeline.sim.batch.normal_streams import NormalStreams, Rows

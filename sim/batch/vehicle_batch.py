@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.messaging.arena_kinds import ArenaKind
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
-from brakeline.messaging.task import ArenaKind
 from brakeline.sim.arena import Arena
 from brakeline.sim.batch.normal_streams import Rows
 from brakeline.sim.batch.obstacle_batch import ObstacleBatch

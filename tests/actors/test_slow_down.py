@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 from brakeline.actors.episode_runner import RobotGroup, run_episode
-from brakeline.actors.slow_down import SLOW, SlowDown, at_least
+from brakeline.actors.slow_down import SLOW, SlowDown, probability_of_at_least
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import data_for
 from brakeline.deploy.experiments.evaluate import Evaluation, in_process, prepare_evaluation
@@ -29,7 +29,9 @@ BOUND = 0.01
     ("outside", "plans", "bound"), [(1, 200, 0.0002), (7, 200, 0.01), (200, 200, 0.5), (3, 40, 1.0)]
 )
 def test_the_probability_of_so_many_plans_outside_is_the_binomial_tail(outside, plans, bound):
-    assert at_least(outside, plans, bound) == pytest.approx(binom.sf(outside - 1, plans, bound), abs=1e-12)
+    assert probability_of_at_least(outside, plans, bound) == pytest.approx(
+        binom.sf(outside - 1, plans, bound), abs=1e-12
+    )
 
 
 def test_the_limit_begins_with_confidence_and_ends_when_the_share_is_back(caplog):

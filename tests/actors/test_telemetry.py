@@ -29,9 +29,9 @@ from brakeline.actors.mavlink.telemetry import (
     SOURCES,
     TRUTH,
     GeoPosition,
-    missing,
     mode_name,
     rotate,
+    unknown_quantities,
 )
 from brakeline.errors import MavlinkError, TelemetryMissing
 from tests.robots import QUADROTOR
@@ -250,10 +250,10 @@ def test_parameters_below_the_robots_bounds_are_found() -> None:
 
 
 def test_missing_quantities_of_the_estimator_have_names() -> None:
-    assert missing(sum({1, 2, 4, 16, 32})) == [] and missing(sum({1, 2, 4, 8, 32})) == []
+    assert unknown_quantities(sum({1, 2, 4, 16, 32})) == [] and unknown_quantities(sum({1, 2, 4, 8, 32})) == []
     still = "anything except that the vehicle stands still"
-    assert missing(165) == ["horizontal velocity", "horizontal position", still]
-    assert missing(0) == list(ESTIMATED)
+    assert unknown_quantities(165) == ["horizontal velocity", "horizontal position", still]
+    assert unknown_quantities(0) == list(ESTIMATED)
 
 
 def test_modes_have_names() -> None:

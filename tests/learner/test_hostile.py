@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from brakeline.errors import BadStep
-from brakeline.learner.learner import AHEAD, MOST_ACTORS, MOST_ACTORS_OF_ONE, Learner
+from brakeline.learner.actor_permissions import AHEAD, MOST_ACTORS, MOST_ACTORS_OF_ONE
+from brakeline.learner.learner import Learner
 from brakeline.learner.transition_reader import LATEST, MOST_OBSERVED, StepReader
 from tests.learner.test_core import joining, started, step
 from tests.learner.toy import CONFIG, TOY
@@ -89,7 +90,7 @@ def test_an_actor_that_does_not_fit_is_refused(learner: Learner, fields: dict, w
 
 
 def test_there_is_an_end_of_actors(learner: Learner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("brakeline.learner.learner.MOST_ACTORS", 10)
+    monkeypatch.setattr("brakeline.learner.actor_permissions.MOST_ACTORS", 10)
     assert MOST_ACTORS > 1000
     errors = [learner.join(joining(f"a{n}")).error.field for n in range(12)]
     assert errors == [""] * 9 + ["actor"] * 3

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.errors import BadDescription, UnknownRobot, UnknownTask
+from brakeline.messaging.description_model import UNITS
 from brakeline.messaging.robot import Disc, Robot, refuse_shipped_name, robot_named
-from brakeline.messaging.robot_description import UNITS, describe, read_robot, robot_from_description
+from brakeline.messaging.robot_description import describe, read_robot, robot_from_description
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
 from brakeline.messaging.task import needs_task, read_task, robot_maybe_with_task, robot_with_task
 from tests.robots import GROUND, ROBOTS

@@ -63,7 +63,7 @@ def test_tubes_hold_the_rollouts_of_every_consistent_model(fit):
     draw = np.random.default_rng(4)
     v = draw.uniform(-1.0, 1.0, (150, 6)) * [0.6, 1.5, 0.6, 1.5, 0.6, 1.5]
     features = features_for(DIFF, v, 2, 0)
-    features = features.some(np.flatnonzero((features.terms <= v.shape[1]).all(1)))  # monomials alone
+    features = features.subset(np.flatnonzero((features.terms <= v.shape[1]).all(1)))  # monomials alone
     noise, truth = Noise(np.full((5, 6), 0.001), np.full(5, 0.002)), 0.1 * draw.normal(size=(5, len(features.terms)))
     sizes = noise.sizes(v)
     models = fit(features(v), features(v) @ truth.T + draw.uniform(-sizes, sizes), sizes)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
 from brakeline.safety.perception.image_coverage import patch_free_ranges
-from brakeline.safety.perception.kernels.occlusion_kernels import group_gaps, supporting_planes
+from brakeline.safety.perception.kernels.group_kernels import group_gaps
+from brakeline.safety.perception.kernels.occlusion_kernels import supporting_planes
 from brakeline.safety.perception.kernels.shadow_kernels import (
     FAR_RADIUS,
     LENGTH,
@@ -232,7 +233,7 @@ def test_prepare_loads_every_kernel_that_reads_images():
     """In an interpreter of its own, because other tests have loaded the kernels here."""
     code = (
         "import sys; from brakeline.safety.perception.occluded_regions import prepare; prepare();"
-        " names = ('proximity_kernels', 'shadow_kernels', 'occlusion_kernels');"
+        " names = ('proximity_kernels', 'shadow_kernels', 'group_kernels', 'occlusion_kernels');"
         " assert {f'brakeline.safety.perception.kernels.{name}' for name in names} <= set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

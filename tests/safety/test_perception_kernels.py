@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.safety.perception.image_coverage import BeamGrid
-from brakeline.safety.perception.kernels import occlusion_kernels, proximity_kernels, shadow_kernels
+from brakeline.safety.perception.kernels import group_kernels, occlusion_kernels, proximity_kernels, shadow_kernels
 from brakeline.safety.perception.kernels.shadow_kernels import AXIS_X, EXTENT, LENGTH, NEAR_RADIUS, NEAR_X, ROWS, TAPER
 from tests.safety import perception_twins as twins
 
@@ -89,9 +89,9 @@ def test_half_spaces_of_a_path(seed, periods, n):
     capsules, origin = capsules_around(rng, n), rng.normal(size=3)
     ends = origin + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     half = 0.1 + np.cumsum(rng.uniform(0.0, 0.2, (periods + 1, 3)), axis=0)
-    boxes, first = np.stack([ends - half, ends + half]), occlusion_kernels.group_periods(ends, 0.6)
+    boxes, first = np.stack([ends - half, ends + half]), group_kernels.group_periods(ends, 0.6)
     reached = ends, first, int(rng.integers(1, len(first) + 1)), boxes, np.cumsum(rng.random(periods)), 0.3
-    assert np.allclose(occlusion_kernels.group_reach(*reached), twins.group_reach(*reached))
+    assert np.allclose(group_kernels.group_reach(*reached), twins.group_reach(*reached))
     plan, motion = (ends[0], ends[1:], boxes), (0.05, 0.02)
     arguments = capsules, origin, plan, motion, (0.1, np.full(3, 0.01)), (40, 0.05)
     normals, levels = occlusion_kernels.path_planes(*arguments)

@@ -17,11 +17,12 @@ from gymnasium.utils.env_checker import check_env
 from brakeline.deploy.data.collect import record
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import BadWeights, UnknownName, UnknownRobot, UnknownTask
+from brakeline.messaging.arena_kinds import MoverKind
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.policy_weights import MLP, decode
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.robot_files import ROBOTS_FOLDER
-from brakeline.messaging.task import MoverKind, RobotWithTask, address, read_task, robot_with_task, with_task
+from brakeline.messaging.task import RobotWithTask, address, read_task, robot_with_task, with_task
 from brakeline.sim.arena import same_room
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
 from brakeline.sim.lidar import Lidar

@@ -1,4 +1,7 @@
-"""Decide the rows of a batch that need no `Filter.decide`, in lanes; the batch is last."""
+"""Decide many rows of a batch at once. Each row is a *lane*, a place on the last axis of every array.
+
+`Filter.decide` decides the other rows one by one: those that need a search which lanes do not make.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,9 @@ from brakeline.safety.filter.batch.qp_batch import ROUNDING
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.batch.score_batch import ScoreBatch
 from brakeline.safety.filter.batch.search_batch import LaneBatch, SearchBatch
+from brakeline.safety.filter.batch.set_batch import SetBatch
 from brakeline.safety.filter.halfspaces import rows_per_obstacle
-from brakeline.safety.filter.reachable_tube import Tube
 from brakeline.safety.filter.request import ADJUSTED, FAILSAFE, FastRequestCheck
-from brakeline.safety.model.model_set import ModelSet
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -38,7 +40,7 @@ PLAN_ROWS, ROWS = 1 << 14, 1 << 17
 FEWEST = 32  # lanes at once, whatever the number of obstacles
 MANY = 4  # times the lanes: rows whose near obstacles are found at once, and which are then sorted by their number
 LANES_ON_DEVICE, ROWS_ON_DEVICE = 1 << 18, 1 << 26
-HUGE = 1e100  # a larger number is left to the single path
+HUGE = 1e100  # `Filter.decide` decides rows with larger numbers
 
 
 class LaneDecisions:
@@ -60,13 +62,13 @@ class LaneDecisions:
         ends = robot.low(), robot.high(), safety.inputs.low, safety.inputs.high
         self._recorded = tuple(constant(end[None]) for end in ends) if safety.inputs.narrower else ()
         self._schedule = constant(safety.inputs.schedule)
-        self._general = _Sets(self._constraints, safety.model, safety.tube, constant, xp)
+        self._general = SetBatch(self._constraints, safety.model, safety.tube, constant, xp)
         self._box, self._turning = None, self._general
         turning = safety.model.turning()
         if safety.in_place is not None and turning is not None:
             box, own = safety.in_place
             self._box = constant(box[:, :, None])
-            self._turning = _Sets(ConstraintBatch(own, constant, xp), turning, own.tube, constant, xp)
+            self._turning = SetBatch(ConstraintBatch(own, constant, xp), turning, own.tube, constant, xp)
         rollout = self._constraints.tube.rollout
         self._score = None if rollout is None else ScoreBatch(safety.model, rollout, constant, xp)
         self._lanes, self._rows = LANES_ON_DEVICE, ROWS_ON_DEVICE
@@ -270,7 +272,7 @@ class LaneDecisions:
 
     def _write(
         self,
-        sets: _Sets,
+        sets: SetBatch,
         requests: RequestArrays,
         scene: SceneBatch,
         plan: PlanBatch,
@@ -365,34 +367,6 @@ class LaneDecisions:
             "normal": xp.permute_dims(xp.where(gone, xp.nan, normal), (1, 0)),
             "at": xp.permute_dims(xp.where(gone, xp.nan, at), (1, 0)),
         }
-
-
-class _Sets:
-    """The sets of plans of one kind: of all plans, or of those that turn in place."""
-
-    def __init__(self, constraints: ConstraintBatch, model: ModelSet, tube: Tube, constant: Any, xp: Any) -> None:
-        self.constraints = constraints
-        robot, nz, first = model.robot, tube.position.shape[2], model.first
-        n = robot.state_dim
-        self._xp, self._d, self._heading = xp, robot.position_dim, robot.heading
-        self._regressor = constant(model.first_regressor(np.eye(nz)).T)
-        self._C, self._W, self._M = constant(first.C[:n]), constant(first.W), constant(first.M)
-        self._kappa, self._w = constant(first.kappa), constant(first.w[:, None])
-        self._widths = constant(np.abs(first.generators[:n]))
-
-    def of_next_state(self, scene: SceneBatch, plan: PlanBatch) -> tuple[Array, Array]:
-        """Return the predicted sets of the next measured states: `TubeConstraints.predict` for a batch.
-
-        They are centers and half-widths (n, B), the position in the world; the heading is the change of heading.
-        """
-        xp, d = self._xp, self._d
-        window = self._regressor @ plan.z
-        sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
-        half = (self._widths @ sizes) * (scene.asked * plan.path.stretch[0])
-        center = plan.path.first + self._C @ window
-        moved = scene.turn.to_world([center[i] for i in range(d)])
-        center[:d] = xp.stack([a + b for a, b in zip(scene.start, moved, strict=True)])
-        return center, half
 
 
 def as_constant(xp: Any, device: Any) -> Any:

@@ -1,0 +1,146 @@
+"""The obstacles of a scan contain everything that a beam may have hit."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
+from brakeline.actors.ros2.sensor_frames import PlanarPose
+from brakeline.errors import BadScan
+from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.ray_directions import LidarRays
+from brakeline.sim.arena_generator import draw_arena
+from brakeline.sim.ground_realtime import SpinningLidar
+from brakeline.sim.lidar import Lidar
+from tests.actors.ros2.test_ros_inputs import BEAMS, scan_of
+from tests.robots import GROUND
+
+MOUNT = PlanarPose(-0.032, 0.0, 0.0)
+ERRORS = HitErrors.of(GROUND, 0.02)
+NEAR = 0.6  # m: closer than this there is no gap between two hits on one wall that the body fits through
+EDGE = 0.15  # m: neighbouring beams that differ by more are on both sides of an edge
+
+
+def obstacles_of(scan, at=(0.0, 0.0, 0.0), mount=MOUNT, **more):
+    """Return the obstacles of a scan that a robot makes while it stands."""
+    beams = read(scan, **more)
+    poses = np.tile(at, (len(beams.times), 1))
+    return obstacles(beams, poses, mount, GROUND, ERRORS, np.asarray(at[:2], float))
+
+
+def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
+    """Compare exact dense beams with a scan whose ranges and pose have the largest errors."""
+    rng, positions = np.random.default_rng(0), 0
+    angles = np.linspace(0.0, 2.0 * math.pi, 3600, endpoint=False)
+    dense = LidarRays(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3.5)
+    while positions < 40:
+        arena = draw_arena("dense", rng, GROUND)
+        close = Lidar(arena, dense)
+        lidar = SpinningLidar(arena, rng, 0.0, nearest=0.0)
+        for _ in range(30):
+            place = rng.uniform(-2.3, 2.3, 2)
+            clear = float(arena.shapes.distance(place).min()) - GROUND.footprint
+            if not 0.02 < clear < 0.3:
+                continue
+            positions += 1
+            true = np.array([*place, rng.uniform(-math.pi, math.pi), 0.0, 0.0])
+            ranges = None
+            while ranges is None:
+                ranges = lidar.measure_sector(true)
+            ranges = np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 0.0)
+            wrong = true[:3] + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3]
+            shapes = Shapes.of(obstacles_of(scan_of(ranges, range_min=0.0), wrong), dim=2)
+            sensor = place + MOUNT.x * np.array([math.cos(true[2]), math.sin(true[2])])
+            true_ranges = close.cast(sensor, float(true[2]))
+            turned = true[2] + angles
+            points = sensor + true_ranges[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+            jumps = np.abs(np.diff(true_ranges[::10], append=true_ranges[0]))
+            beside = jumps < EDGE  # a beam and the next one hit one surface
+            points = points[(true_ranges < NEAR) & np.repeat(beside, 10)]
+            assert len(points) > 0
+            assert shapes.distance(points).min(axis=0).max() <= 1e-9
+
+
+def test_a_room_is_few_obstacles_and_its_middle_is_free():
+    angles = 2.0 * math.pi * np.arange(BEAMS) / BEAMS
+    square = 0.8 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    boxes = obstacles_of(scan_of(square), mount=PlanarPose())
+    assert 4 <= len(boxes) <= 12
+    assert Shapes.of(boxes, dim=2).distance(np.zeros((1, 2))).min() > 0.7
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=40), st.floats(1e-3, 0.1))
+@settings(deadline=None)
+def test_the_boxes_contain_all_discs_that_they_replace(points, radius):
+    points = np.array(points)
+    radii = radius * np.linspace(1.0, 2.0, len(points))
+    shapes = Shapes.of(_joined(points, radii, 0.2), dim=2)
+    around = np.linspace(0.0, 2.0 * math.pi, 24)
+    rims = points[:, None] + radii[:, None, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
+    assert shapes.distance(rims.reshape(-1, 2)).min(axis=0).max() <= 1e-9
+
+
+def test_a_gap_that_the_body_cannot_pass_is_occupied():
+    shapes = Shapes.of(_joined(np.array([[0.5, -0.1], [0.5, 0.1]]), np.full(2, 0.01), 0.21), dim=2)
+    assert shapes.distance(np.array([[0.5, 0.0]])).min() == 0.0
+    apart = Shapes.of(_joined(np.array([[0.5, -0.2], [0.5, 0.2]]), np.full(2, 0.01), 0.21), dim=2)
+    assert apart.distance(np.array([[0.5, 0.0]])).min() > 0.1
+
+
+@pytest.mark.parametrize("blind", [math.nan, 0.0, 0.05, -math.inf, -1.0])
+def test_a_blind_beam_makes_an_obstacle_at_the_body(blind):
+    ranges = np.full(BEAMS, math.inf)
+    assert obstacles_of(scan_of(ranges)) == ()
+    ranges[90] = blind
+    shapes = Shapes.of(obstacles_of(scan_of(ranges)), dim=2)
+    assert shapes.distance(np.array([[0.0, GROUND.footprint + 0.005]])).min() == 0.0
+    assert shapes.distance(np.zeros((1, 2))).min() >= GROUND.footprint - 1e-9
+
+
+def test_zero_is_free_only_if_the_settings_say_so():
+    assert obstacles_of(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
+    assert obstacles_of(scan_of(np.zeros(BEAMS))) != ()
+
+
+def test_a_direction_without_a_beam_is_occupied():
+    fan = scan_of(np.full(180, math.inf), angle_min=-0.5 * math.pi, angle_increment=math.pi / 179)
+    shapes = Shapes.of(obstacles_of(fan), dim=2)
+    assert shapes.distance(np.array([[-0.12, 0.0]])).min() == 0.0
+    assert shapes.distance(np.array([[0.3, 0.0]])).min() > 0.1
+
+
+def test_space_beyond_a_short_range_sensor_is_occupied():
+    shapes = Shapes.of(obstacles_of(scan_of(np.full(BEAMS, math.inf), range_max=0.5)), dim=2)
+    assert shapes.distance(np.array([[0.47, 0.0]])).min() == 0.0
+
+
+def test_each_beam_starts_where_the_robot_was_at_its_time():
+    ranges = np.full(BEAMS, math.inf)
+    ranges[0] = ranges[180] = 0.5
+    beams = read(scan_of(ranges, time_increment=0.2 / BEAMS))
+    poses = np.zeros((BEAMS, 3))
+    poses[:, 0] = 0.25 * (beams.times - 10.0)  # driving at 0.25 m/s
+    hits = obstacles(beams, poses, PlanarPose(), GROUND, ERRORS, poses[-1, :2])
+    assert sorted(o.position[0] for o in hits) == pytest.approx([-0.475, 0.5])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"ranges": np.zeros(1, np.float32)},
+        {"ranges": np.zeros(20_000, np.float32)},
+        {"angle_increment": 0.0},
+        {"angle_increment": 1e-9},
+        {"angle_increment": math.nan},
+        {"angle_min": math.inf},
+        {"range_min": -1.0},
+        {"range_max": 0.0},
+        {"time_increment": math.nan},
+    ],
+)
+def test_an_invalid_scan_is_refused(wrong):
+    with pytest.raises(BadScan):
+        read(scan_of(np.full(BEAMS, 1.0), **wrong))
