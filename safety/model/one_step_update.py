@@ -106,7 +106,7 @@ class Trial:
 
 
 def update_one_step(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, Calibration]:
-    """Update a model set to new driving. Its domain stays, and no half-width is below that of the model set.
+    """Update a model set to new driving. It keeps at least the domain of the model set, and no set is scaled down.
 
     outside: the share of the new windows that may leave their sets, in every kind of driving.
 
