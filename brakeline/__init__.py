@@ -35,6 +35,7 @@ from brakeline.errors import (
 if TYPE_CHECKING:
     from brakeline.deploy.data.certification import certify
     from brakeline.deploy.data.environment_episodes import collect
+    from brakeline.deploy.run.recorded_client import RecordedClient
     from brakeline.messaging.bus import BusSettings
     from brakeline.messaging.obstacle import Obstacle, Shapes
     from brakeline.messaging.obstacle_motion import Motion
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
 PLACES = {
     "brakeline.deploy.data.certification": ("certify",),
     "brakeline.deploy.data.environment_episodes": ("collect",),
+    "brakeline.deploy.run.recorded_client": ("RecordedClient",),
     "brakeline.messaging.bus": ("BusSettings",),
     "brakeline.messaging.obstacle": ("Obstacle", "Shapes"),
     "brakeline.messaging.obstacle_motion": ("Motion",),
@@ -98,11 +100,11 @@ __all__ = [
     "ActionMapping", "Answer", "BackupPlan", "BadData", "BadDescription", "BadModel", "BadRequest", "BadScan",
     "BadShape", "BusError", "BusSettings", "Dataset", "Decision", "DecisionArrays", "Disc", "ErrorBoundError",
     "Filter", "FilterClient", "FleetClient", "InProcess", "Late", "Limit", "ModelConfig", "ModelSet", "Motion",
-    "NoReply", "Obstacle", "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage", "Refused",
-    "Request", "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError", "SafetyWrapper", "Scan",
-    "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport", "__version__", "certify",
-    "collect", "filled", "fit_model_set", "memory_of", "normalised", "robot_from_description", "robot_named",
-    "robot_with_task", "validate",
+    "NoReply", "Obstacle", "ObstacleArrays", "PastArrays", "Prediction", "PredictionArrays", "RangeImage",
+    "RecordedClient", "Refused", "Request", "RequestArrays", "Robot", "RobotWithTask", "SafetyClient", "SafetyError",
+    "SafetyWrapper", "Scan", "Shapes", "Task", "Trajectory", "UnknownRobot", "Unreachable", "ValidationReport",
+    "__version__", "certify", "collect", "filled", "fit_model_set", "memory_of", "normalised",
+    "robot_from_description", "robot_named", "robot_with_task", "validate",
 ]
 # fmt: on
 

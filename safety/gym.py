@@ -114,7 +114,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
-        self.backup_plan.reset()
+        self.client.reset()
         self._memory.reset()
         self._remember()
         return self._now

@@ -20,12 +20,13 @@ MODULES = {value.__module__ for value in PUBLIC.values()}
 
 
 @pytest.fixture(scope="module")
-def surroundings(data_folder):
-    """Return what the examples name and cannot make: the endpoint of a running service, and a recording."""
+def surroundings(data_folder, tmp_path_factory):
+    """Return what the examples name and cannot make: the endpoint of a running service, a recording, and a folder."""
     endpoint = free_endpoint()
     with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
         bus.serve(DECIDE, Service(ModelSet.load("ground")).answer)
-        yield {"ENDPOINT": endpoint, "RECORDING": record_path(GROUND)}
+        folder = tmp_path_factory.mktemp("examples")
+        yield {"ENDPOINT": endpoint, "RECORDING": record_path(GROUND), "FOLDER": folder}
 
 
 @pytest.mark.parametrize("module", sorted(MODULES | {"brakeline.envs", "brakeline.extras"}))

@@ -182,6 +182,16 @@ print("all")
     assert printed(BLOCKER + code).endswith("all")
 
 
+def test_a_log_of_ones_own_names_its_extra():
+    code = """
+from brakeline import Filter, InProcess, RecordedClient
+RecordedClient(InProcess(Filter.load("ground")), "nowhere")
+"""
+    with pytest.raises(AssertionError, match=r"pip install 'brakeline\[logs\]'"):
+        printed(BLOCKER + code, env=os.environ | NOT_COMPILED)
+    assert not Path("nowhere").exists()
+
+
 def test_a_missing_extra_is_named_with_its_command():
     code = BLOCKER + "from brakeline.deploy.cli import main\nsys.exit(main(['collect', 'ground']))"
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, cwd=ROOT)

@@ -1,0 +1,140 @@
+"""The log of a program of one's own: every request and step is in it, and it says how the robot followed its sets."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from brakeline.deploy.run.recorded_client import RecordedClient
+from brakeline.errors import BadRequest, BusError
+from brakeline.logs.reader import open_log
+from brakeline.messaging.bus import Bus, BusSettings
+from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.obstacle import Obstacle
+from brakeline.messaging.topics import DECIDE
+from brakeline.safety.filter.filter import Filter
+from brakeline.safety.gym import SafetyWrapper
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.client import SafetyClient
+from brakeline.safety.service.in_process import InProcess
+from tests.faults.failing_calls import full
+from tests.safety.served import Service
+
+AHEAD = [Obstacle("cylinder", (0.6, 0.0), (0.1,))]
+PERIODS = 12
+
+
+@pytest.fixture(scope="module")
+def method() -> Filter:
+    return Filter.load("ground")
+
+
+def after(state, action):
+    """Return the state of a robot that follows its inputs at once."""
+    v, w = action
+    return np.array([state[0] + 0.2 * v * np.cos(state[2]), state[1] + 0.2 * v * np.sin(state[2]), state[2], v, w])
+
+
+def drive(safety, periods=PERIODS, state=(0.0,) * 5, obstacles=AHEAD):
+    """Drive straight at an obstacle, and return the state after each decision."""
+    states = []
+    for _ in range(periods):
+        answer = safety.decide(state, [0.25, 0.0], iter(obstacles), known_free=True)
+        state = after(state, answer.action)
+        states.append(state)
+    return np.array(states)
+
+
+def messages(log: Path, kind: str) -> list:
+    return [record.message for record in open_log(log) if record.topic == kind]
+
+
+def test_the_log_has_every_request_and_the_step_to_the_next_one(method, tmp_path, figures) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        states = drive(safety)
+        safety.reset(goal=True)
+        drive(safety)
+    steps, exchanges = messages(safety.path, "step"), messages(safety.path, "exchange")
+    assert [(e.request.episode, e.request.step) for e in exchanges] == [(k, i) for k in (0, 1) for i in range(PERIODS)]
+    assert [(s.episode, s.step) for s in steps] == [(k, i) for k in (0, 1) for i in range(PERIODS - 1)]
+    first = steps[: PERIODS - 1]
+    assert np.array([s.state for s in first]).tolist() == states[:-1].tolist()
+    executed = np.array([e.reply.decision.plan[:2] for e in exchanges[: PERIODS - 1]], np.float32)
+    assert np.array([s.action for s in first], np.float32).tolist() == executed.tolist()
+    assert [(s.episode, s.goal, s.terminated, s.truncated) for s in steps if s.terminated or s.truncated] == [
+        (0, True, True, False),
+        (1, False, False, True),
+    ]
+    nearest = 0.6 - 0.1 - max(s.state[0] for s in first) - method.robot.footprint
+    assert min(s.closest for s in first) == pytest.approx(nearest)
+    again = figures("replay", safety.path)
+    assert (again["requests"], again["identical"] + again["equal"]) == (2 * PERIODS, 2 * PERIODS)
+
+
+def test_the_log_says_when_a_state_left_its_predicted_set(method, tmp_path) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        for x in (0.0, 0.001, 0.0, 0.3, 0.301, 0.3):  # it stands, and its position jumps once
+            safety.decide([x, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0], known_free=True)
+    steps = messages(safety.path, "step")
+    assert [s.compared and s.contained for s in steps] == [True, True, False, True, True]
+    assert not any(np.isfinite(s.closest) for s in steps), "nobody named an obstacle"
+
+
+def test_a_period_without_a_decision_is_a_fallback(method, tmp_path) -> None:
+    endpoint = free_endpoint()
+    with Bus(BusSettings(listen=(endpoint,)), "safety") as bus:
+        serving = bus.serve(DECIDE, Service(ModelSet.load("ground")).answer)
+        with SafetyClient.open(endpoint, "ground", 5.0) as client, RecordedClient(client, tmp_path / "mine") as safety:
+            state = drive(safety, 3)[-1]
+            serving.close()
+            with pytest.raises(BusError):
+                safety.decide(state, [0.25, 0.0], AHEAD)
+            braking = safety.fallback()
+            bus.serve(DECIDE, Service(ModelSet.load("ground")).answer)
+            safety.decide(after(state, braking), [0.25, 0.0], AHEAD)
+    steps, exchanges = messages(safety.path, "step"), messages(safety.path, "exchange")
+    assert [s.fallback for s in steps] == [False, False, False, True]
+    assert np.array(steps[-1].action, np.float32).tolist() == braking.astype(np.float32).tolist()
+    assert [bool(e.failure) for e in exchanges] == [False, False, False, True, False]
+
+
+def test_a_bad_request_is_recorded_only_if_a_message_can_hold_it(method, tmp_path) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        with pytest.raises(BadRequest, match="known_free"):
+            safety.decide([0] * 5, [0.2, 0.0])
+        with pytest.raises(BadRequest, match="state"):
+            safety.decide("here", [0.2, 0.0], known_free=True)
+        assert safety.decide([0] * 5, [0.2, 0.0], known_free=True).kind == "allowed"
+    assert [bool(e.failure) for e in messages(safety.path, "exchange")] == [True, False]
+
+
+def test_a_log_is_never_written_over(method, tmp_path) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        drive(safety, 2)
+    before = safety.path.read_bytes()
+    with pytest.raises(FileExistsError, match="folder of its own"):
+        RecordedClient(InProcess(method), tmp_path / "mine")
+    assert safety.path.read_bytes() == before
+
+
+def test_a_full_disk_does_not_stop_the_robot_and_is_reported_at_the_end(method, tmp_path, monkeypatch) -> None:
+    def save(*_):
+        raise full()
+
+    safety = RecordedClient(InProcess(method), tmp_path / "mine")
+    monkeypatch.setattr("brakeline.logs.segment.Segment.save", save)
+    assert len(drive(safety, 3)) == 3
+    with pytest.raises(OSError, match="messages are lost"):
+        safety.close()
+
+
+def test_a_wrapped_environment_ends_episodes(method, tmp_path) -> None:
+    env = gymnasium.make("brakeline.envs:brakeline/Ground-v0")
+    with RecordedClient(InProcess(method), tmp_path / "mine") as client:
+        wrapped = SafetyWrapper(env, client)
+        for seed in range(2):
+            wrapped.reset(seed=seed)
+            for _ in range(4):
+                wrapped.step(np.array([0.2, 0.0]))
+    assert [(s.episode, s.step) for s in messages(client.path, "step")] == [(k, i) for k in range(2) for i in range(3)]
