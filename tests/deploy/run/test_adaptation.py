@@ -296,7 +296,7 @@ def test_what_cannot_state_the_accepted_bound_is_not_tried():
 
 
 def test_a_set_that_states_more_than_is_accepted_is_refused(kind, monkeypatch):
-    monkeypatch.setattr(adaptation, "SPARE", 0.1)
+    monkeypatch.setattr(Adaptation, "plans_needed", 10)
     kind.accept_bound = 0.005
     (attempt,) = drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
     assert attempt.model is None and "states only that at most" in attempt.text
