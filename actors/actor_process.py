@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -95,29 +96,29 @@ class StopPractice:
     """Stops that a robot makes from time to time by following its committed plan to the end.
 
     Such a stop is safe, since the plan was verified. It is the only way to go on recording real stops, which
-    `brakeline certify ROBOT --data LOG` needs.
+    `brakeline certify ROBOT --data LOG` needs. The proposals are the inputs of the plan with which the stop began. An
+    answer that allows one commits a new plan, which again brakes over as many periods as any: a robot that followed it
+    would become slower in each period, but would not stop.
     """
 
     def __init__(self, probability: float) -> None:
         """probability: of beginning a stop, at each step."""
-        self.probability, self._left = probability, 0
+        self.probability, self._inputs = probability, deque[Array]()
         self.running = False  # whether the last proposal was part of a stop
 
     def proposal(self, runner: EpisodeRunner, proposal: Array) -> Array:
-        """Return the committed plan's next input during a stop, otherwise the proposal."""
-        if self._left == 0 and self.probability > 0.0 and runner.rng.random() < self.probability:
-            self._left = runner.robot.horizon - 1 + STANDSTILL
-        self.running = self._left > 0
-        if not self.running:
-            return proposal
-        self._left -= 1
-        return np.asarray(runner.backup_plan.plan[runner.robot.committed_steps])
+        """Return the next input of the stop during a stop, otherwise the proposal."""
+        if not self._inputs and self.probability > 0.0 and runner.rng.random() < self.probability:
+            plan = runner.backup_plan.plan
+            self._inputs.extend([*plan[runner.robot.committed_steps :].copy(), *[plan[-1].copy()] * STANDSTILL])
+        self.running = bool(self._inputs)
+        return self._inputs.popleft() if self.running else proposal
 
     def outcome(self, runner: EpisodeRunner, outcome: DecisionOutcome) -> DecisionOutcome:
         """Return the outcome to act on: during a stop, one without an answer, so that the committed plan goes on.
 
         The filter may prefer another input during a stop, to keep more clearance than the plan needs. Its answer
-        counts only if it allows the plan's input, or if the verification of the plan does not hold any more.
+        counts only if it allows the input, or if the verification of the plan does not hold any more.
         """
         answer = outcome.answer
         if not self.running or answer is None or answer.kind == ALLOWED or not runner.backup_plan.still_verified:

@@ -12,6 +12,7 @@ from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.one_step_fitting import Progress, fit_one_step, unheard
+from brakeline.safety.model.one_step_update import update_one_step
 from brakeline.safety.model.validation import (
     Array,
     ValidationReport,
@@ -76,6 +77,16 @@ def certify(
         model_config = replace(model_config, inflation=model_config.inflation * factor * (1.0 + ROUNDING))
         model = fit_model_set(fitted, model_config)
         report, scores = validate_plans(model, fitted, held_out)
+    return _stated(model, report, data), report
+
+
+def certify_update(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
+    """Update a model set of mode one-step to new driving, and validate it there (docs/method.md §15).
+
+    Arguments and errors are those of `update_one_step`; the results those of `certify`.
+    """
+    model, calibration = update_one_step(in_use, data, outside)
+    report = validate_one_step(model, calibration)
     return _stated(model, report, data), report
 
 

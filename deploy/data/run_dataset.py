@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 
@@ -50,16 +50,21 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
     return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"
 
 
-def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterable[Trajectory]:
-    """Yield a trajectory for each run of consecutive steps in one episode of one actor; a step counts once."""
+def trajectories_of(steps: Iterable[pb.Step], robot: Robot) -> Iterator[Trajectory]:
+    """Yield a trajectory for each run of consecutive steps in one episode of one actor."""
+    for run in runs_of(steps):
+        if len(run) > FEWEST_STEPS and run[0].path:
+            yield _trajectory(run, robot)
+
+
+def runs_of(steps: Iterable[pb.Step]) -> Iterator[list[pb.Step]]:
+    """Yield the runs of consecutive steps in one episode of one actor; a step counts once."""
     # A folder may have a copy of a log. A vehicle that does not follow its inputs shows nothing about them.
     unique = {(s.actor, s.header.run, s.episode, s.step): s for s in steps if not s.lost}
     ordered = [unique[place] for place in sorted(unique)]
     numbered = ((s.actor, s.header.run, s.episode, s.step - i) for i, s in enumerate(ordered))
     for _, group in groupby(zip(numbered, ordered, strict=True), key=lambda pair: pair[0]):
-        run = [step for _, step in group]
-        if len(run) > FEWEST_STEPS and run[0].path:
-            yield _trajectory(run, robot)
+        yield [step for _, step in group]
 
 
 def _trajectory(run: list[pb.Step], robot: Robot) -> Trajectory:

@@ -9,33 +9,38 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from brakeline.deploy.data.certification import certify
-from brakeline.deploy.data.run_dataset import trajectories_of
+from brakeline.deploy.data.certification import certify, certify_update
+from brakeline.deploy.data.run_dataset import runs_of, trajectories_of
 from brakeline.errors import BadData, BadModel, BadStep, ErrorBoundError, Implausible
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.filter.widening import RESERVE
+from brakeline.safety.model.calibration_samples import FOLDS
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
 from brakeline.safety.model.repeated_driving import without_repeats
 from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.stated_bound import accepted_bound, plans_needed, refusal
-from brakeline.safety.model.windows import FREE, PLAN, windows
+from brakeline.safety.model.validation import ValidationReport, most_violations
+from brakeline.safety.model.windows import FREE, PLAN, recorded_domain, windows
 
-WIDENING, REQUESTS = 1.3, 100  # a robot has changed if its last 100 requests, or more, were widened by more than 1.3
+# A robot has changed if 100 requests without a break were widened by more than 1.3, until the stated sets hold again.
+WIDENING, REQUESTS = 1.3, 100
 FEWEST_MINUTES = 4.0  # of driving after the change
 AGAIN = 15.0  # minutes of driving after which a model set may be replaced without a change
 MEMORY = 20.0  # minutes of driving, of all robots of the kind together
 PAUSE = 1.0  # minutes of driving from one attempt to the next
 SPARE = 1.2  # factor on the driving that the accepted bound needs: windows must not cross the ends of trajectories
 TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
-DOMAIN = 0.75  # least ratio of the recorded range of a speed or an input to that of the model set in use
+DOMAIN = 0.75  # of a fit to the recent driving alone: least ratio of a recorded range to that of the set in use
 MOST_ROBOTS = 10_000
+WAITING = "waiting"  # the first word of `Adaptation.progress`
 SILENT = 30.0  # s after which a robot counts as gone
 
 
@@ -56,6 +61,7 @@ class RobotState:
         version: model set of the last decision.
         since: first period under this version.
         widened: first period of the requests that were widened without a break up to now; None: the last one was not.
+            Once the robot has changed, a request counts as long as it asks for more than the stated sets.
         requests: number of these requests.
         widening: of the last request.
         heard: when its last exchange arrived [s].
@@ -80,7 +86,8 @@ class Recertification:
 
     Attributes:
         text: why the model set is published, or why there is none.
-        model, data: the model set to publish, and its data; None if it may not be used.
+        model: the model set to publish; None if it may not be used.
+        data: the data whose domain it has; None if it has that of the set in use, as an update does.
         replaces: version of the set in use with which it was compared.
     """
 
@@ -118,10 +125,14 @@ class Adaptation:
         return periods * self.robot.period / 60.0
 
     @property
+    def plans_needed(self) -> int:
+        """Plans that do not overlap from which a model set can state the accepted bound; the folds cut a few."""
+        return plans_needed(accepted_bound(self.robot, self.accept_bound)) + FOLDS
+
+    @property
     def needed(self) -> int:
-        """Periods of driving from which a model set can state the accepted bound."""
-        plans = plans_needed(accepted_bound(self.robot, self.accept_bound))
-        return max(self._periods(FEWEST_MINUTES), math.ceil(SPARE * plans * self.robot.horizon))
+        """Periods of driving from which a model set can state the accepted bound, about."""
+        return max(self._periods(FEWEST_MINUTES), math.ceil(SPARE * self.plans_needed * self.robot.horizon))
 
     def step(self, step: pb.Step) -> None:
         """Add a step, without the fields that no data set needs. Raises BadStep."""
@@ -158,7 +169,7 @@ class Adaptation:
         elif decision.model != state.version:
             state.version, state.since = decision.model, now
         state.widening, state.heard = (request.widening if 1.0 <= request.widening < math.inf else 1.0), heard
-        if state.widening > WIDENING:
+        if state.widening > (RESERVE if state.changed else WIDENING):
             state.widened, state.requests = state.widened or now, state.requests + 1
         else:
             state.widened, state.requests = None, 0
@@ -177,6 +188,28 @@ class Adaptation:
     def since_change(self) -> float:
         """Minutes of driving since all robots have changed; 0 if one of them has not."""
         return self._minutes(len(self._since_change())) if self._changed() else 0.0
+
+    @property
+    def plans_since_change(self) -> int:
+        """Plans that do not overlap since all robots have changed; 0 if one of them has not."""
+        return self._plans(self._since_change()) if self._changed() else 0
+
+    @property
+    def progress(self) -> str:
+        """What is missing until a model set can be fitted to the driving since the change; empty if nothing is."""
+        plans, needed, minutes = self.plans_since_change, self.plans_needed, self.since_change
+        if not self._changed() or (plans >= needed and minutes >= FEWEST_MINUTES):
+            return ""
+        each = minutes / plans if plans else SPARE * self.robot.horizon * self.robot.period / 60.0
+        left = max((needed - plans) * each, FEWEST_MINUTES - minutes)
+        bound = percent(accepted_bound(self.robot, self.accept_bound))
+        return f"{WAITING}: {plans} of the {needed} plans since the change that state {bound}, {left:.1f} minutes left"
+
+    def _plans(self, steps: list[pb.Step]) -> int:
+        """Return how many plans that do not overlap these steps hold. A trajectory begins with its second step."""
+        robot = self.robot
+        runs = map(len, runs_of(steps))
+        return sum(max(0, periods - 1 - robot.committed_steps) // robot.horizon for periods in runs)
 
     def _driving_robots(self) -> dict[str, RobotState]:
         """Return the robots that are not silent."""
@@ -214,27 +247,58 @@ class Adaptation:
             why = f"after {self._minutes(len(steps)):.1f} minutes without a new one"
             if len(steps) < again:
                 return None
-        if len(steps) < self.needed:
+        if len(steps) < self._periods(FEWEST_MINUTES) or self._plans(steps) < self.plans_needed:
             return None
         self._driven = 0
         return self._certified(steps, why)
 
     def _certified(self, steps: list[pb.Step], why: str) -> Recertification:
-        """Return the model set of these steps, or why it may not be used."""
-        widening, version = self.widening, self.version
+        """Return the narrowest model set of these steps that may be used, or why there is none."""
+        widening, version, robot = self.widening, self.version, self.robot
         try:
-            trajectories, _ = without_repeats(self.robot, tuple(trajectories_of(steps, self.robot)))
-            data = Dataset(self.robot, trajectories, {"origin": "adaptation", "why": why})
+            trajectories, _ = without_repeats(robot, tuple(trajectories_of(steps, robot)))
+            data = Dataset(robot, trajectories, {"origin": "adaptation", "why": why})
             data.check()
-            model, report = certify(data, ModelConfig(mode=ONE_STEP))
-            looser = _looser(model, self.in_use(version), widening, data)
-        except (BadData, BadModel, ErrorBoundError, ValueError) as error:
+            in_use = self.in_use(version)
+        except (BadData, BadModel) as error:
             return Recertification(f"none {why}: {error}")
-        if refused := refusal(self.robot, model.about, self.accept_bound) or looser:
-            return Recertification(f"none {why}: {refused}")
-        width, bound = f"±{1e3 * report.half_width_full:.0f} mm", percent(report.bound_plan)
-        stated = f"{width} after a full stop, at most {bound} outside"
-        return Recertification(f"{model.version} {why}: {stated}", model, data, version)
+        most = _largest_half_width(in_use, widening, data)
+        ways = (_fitted, _updated) if in_use.model_config.mode == ONE_STEP else (_fitted,)
+        tried = [self._tried(way, in_use, data, most) for way in ways]
+        if all(result.model is None for _, result in tried):
+            return Recertification(f"none {why}: {'; '.join(result.text for _, result in tried)}")
+        _, best = min(tried, key=lambda pair: pair[0])
+        assert best.model is not None
+        return replace(best, text=f"{best.model.version} {why}, {best.text}", replaces=version)
+
+    def _tried(self, way: Way, in_use: ModelSet, data: Dataset, most: float) -> tuple[float, Recertification]:
+        """Return the mean half-width of a new model set [m], infinite if it may not be used, and the set or the reason.
+
+        most: the largest mean half-width that may replace the set in use [m].
+        """
+        try:
+            model, report = way(in_use, data, self._outside(in_use, data))
+            width = _mean_half_width(model, data)
+        except (BadData, ErrorBoundError, ValueError) as error:
+            return math.inf, Recertification(f"{NAMES[way]}: {error}")
+        refused = refusal(self.robot, model.about, self.accept_bound)
+        if not refused and not width <= most:  # NaN too
+            refused = f"its sets are {TIGHTER * width / most:.2g} times as wide as those in use, as widened"
+        if refused:
+            return math.inf, Recertification(f"{NAMES[way]}: {refused}")
+        stated = (
+            f"±{1e3 * report.half_width_full:.0f} mm after a full stop, at most {percent(report.bound_plan)} outside"
+        )
+        return width, Recertification(f"{NAMES[way]}: {stated}", model, data=None if way is _updated else data)
+
+    def _outside(self, in_use: ModelSet, data: Dataset) -> float:
+        """Return the share of the windows that may leave the new sets: that of the set in use, or less.
+
+        It follows from the number of plans alone: with so many outside, the bound is still accepted.
+        """
+        plans = sum(len(t.inputs) // self.robot.horizon for t in data.joined().trajectories)
+        allowed = most_violations(plans, accepted_bound(self.robot, self.accept_bound)) / plans
+        return max(ModelConfig.outside, min(in_use.model_config.outside, allowed))
 
     def confirmed(self, attempt: Recertification) -> Recertification:
         """Return an attempt as it stands after a fit of minutes: without its set, if another one came into use."""
@@ -243,17 +307,27 @@ class Adaptation:
         return Recertification(f"none: {self.version} came into use during the fit; it was compared with another set")
 
 
-def _looser(model: ModelSet, in_use: ModelSet, widening: float, data: Dataset) -> str:
-    """Return why a model set must not replace the one in use, which the robots widen; empty if it may."""
-    ranges = np.ptp(in_use.domain, axis=0)
-    covered = float((np.ptp(model.domain, axis=0) / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
+def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
+    """Fit a model set to the recent driving alone. Raises BadData, also if the driving is too narrow."""
+    ranges, recorded = np.ptp(in_use.domain, axis=0), np.ptp(recorded_domain(data), axis=0)
+    covered = float((recorded / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
     if covered < DOMAIN:
-        return f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}"
-    new, old = (_mean_half_width(m, data) for m in (model, in_use))
-    old *= Filter(in_use).constraints.plan_widening(widening)
-    if not new <= TIGHTER * old:  # NaN too
-        return f"its sets are {new / old:.2g} times as wide as those in use, as widened"
-    return ""
+        raise BadData(f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}")
+    return certify(data, ModelConfig(mode=ONE_STEP, outside=outside))
+
+
+def _updated(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
+    """Update the set in use to the recent driving. It keeps its domain."""
+    return certify_update(in_use, data, outside)
+
+
+Way = Callable[[ModelSet, Dataset, float], tuple[ModelSet, ValidationReport]]
+NAMES: dict[Way, str] = {_fitted: "a fit to this driving", _updated: "an update of the set in use"}
+
+
+def _largest_half_width(in_use: ModelSet, widening: float, data: Dataset) -> float:
+    """Return the largest mean half-width that may replace a set in use that the robots widen [m]."""
+    return TIGHTER * Filter(in_use).constraints.plan_widening(widening) * _mean_half_width(in_use, data)
 
 
 def _mean_half_width(model: ModelSet, data: Dataset) -> float:

@@ -15,7 +15,7 @@ from multiprocessing import connection
 from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
-from brakeline.deploy.run.adaptation import Adaptation, Recertification
+from brakeline.deploy.run.adaptation import WAITING, Adaptation, Recertification
 from brakeline.deploy.run.processes import CERTIFIER
 from brakeline.errors import BadModel, BrakelineError
 from brakeline.messaging import brakeline_pb2 as pb
@@ -113,11 +113,26 @@ def _follow(kind: Adaptation, take_in: Callable[[], None], signer: ModelSigner, 
         if (attempt := kind.attempt()) is not None:
             take_in()
             _settle(kind.confirmed(attempt), kind.robot, signer, process)
+        _report_progress(kind, process)
         process.figures[f"widening {name}"] = kind.widening
         process.figures[f"minutes since the change {name}"] = kind.since_change
     except Exception as error:
         process.notes[f"{NOTE} {name}"] = f"none: {type(error).__name__}: {error}"
         log.exception("%s: no new model set, because of an error", name)
+
+
+def _report_progress(kind: Adaptation, process: Process) -> None:
+    """Say how much driving since a change is missing, in place of the last attempt's note; log begin and end."""
+    note, progress, name = f"{NOTE} {kind.robot.name}", kind.progress, kind.robot.name
+    waited = process.notes.get(note, "").startswith(WAITING)
+    if progress:
+        process.notes[note] = progress
+    elif waited:
+        del process.notes[note]
+    if bool(progress) != waited:
+        log.info("%s: %s", name, progress or "no longer waiting for driving after a change")
+    process.figures[f"plans since the change {name}"] = float(kind.plans_since_change)
+    process.figures[f"plans needed {name}"] = float(kind.plans_needed)
 
 
 def _settle(attempt: Recertification, robot: Robot, signer: ModelSigner, process: Process) -> None:

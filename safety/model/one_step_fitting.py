@@ -261,8 +261,7 @@ def _scores(
         The largest ratio of positions, coordinates that a limit needs and chord deviations; the same for the positions
         after one period; and that of the other coordinates after one period.
     """
-    d, scores = robot.position_dim, np.zeros((3, len(s.z)))
-    for_plan = [*range(d), *extra_coordinates(robot), -1]
+    scores = np.zeros((3, len(s.z)))
     for i in regression.folds:
         progress(CHOSEN + (SCORED - CHOSEN) * i / len(regression.folds))
         held = s.fold == i
@@ -270,8 +269,13 @@ def _scores(
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
         shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.level)
         widths = shape.widths(spread_features(robot, s.z[held]))
-        used = shares(np.concatenate([np.abs(errors[held]), s.chords[held, :, None]], axis=2), widths)
-        scores[0, held] = used[..., for_plan].max((1, 2))
-        scores[1, held] = used[:, 0, :d].max(1, initial=0.0)
-        scores[2, held] = used[:, 0, d:-1].max(1, initial=0.0)
+        scores[:, held] = window_scores(robot, errors[held], s.chords[held], widths)
     return scores[0], scores[1], scores[2]
+
+
+def window_scores(robot: Robot, errors: Array, chords: Array, widths: Array) -> Array:
+    """Return the scores (3, T) of `_scores` from errors (T, N, n'), chords (T, N) and half-widths (T, N, n' + 1)."""
+    d = robot.position_dim
+    used = shares(np.concatenate([np.abs(errors), chords[..., None]], axis=2), widths)
+    whole = used[..., [*range(d), *extra_coordinates(robot), -1]].max((1, 2))
+    return np.stack([whole, used[:, 0, :d].max(1, initial=0.0), used[:, 0, d:-1].max(1, initial=0.0)])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from brakeline.actors import actor_process
-from brakeline.actors.actor_process import STOP_PRACTICE, ActorRunner, ActorSettings, StopPractice, run
+from brakeline.actors.actor_process import STANDSTILL, STOP_PRACTICE, ActorRunner, ActorSettings, StopPractice, run
 from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.actors.decision_guard import DecisionOutcome
 from brakeline.actors.learner_client import LearnerClient
@@ -23,9 +23,11 @@ from brakeline.errors import BadRequest, BusError, RefusedByLearner
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.robot import robot_named
 from brakeline.messaging.topics import DECIDE, EXCHANGE, FLOW, JOIN, STEP, WEIGHTS
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.model.model_set import ModelConfig
+from brakeline.safety.model.windows import resting_periods_at_end
 from brakeline.safety.service.server import BatchHandler, ModelRegistry, ServiceCounts
 from tests.robots import GROUND
 from tests.waiting import until
@@ -309,6 +311,29 @@ def test_a_practised_stop_follows_its_plan_as_long_as_the_plan_holds():
     assert all(never.outcome(runner, outcome) is outcome for outcome in outcomes.values())
     runner.backup_plan.accept(np.full((GROUND.horizon, 2), 0.2), "a model", None, False)
     assert all(practice.outcome(runner, outcome) is outcome for outcome in outcomes.values())
+
+
+@pytest.mark.parametrize("kind", ["allowed", "adjusted"])
+def test_a_practised_stop_ends_although_each_answer_commits_a_new_plan(kind):
+    """A quadrotor brakes over seven periods: it followed the newest plan, became slower, and never stood."""
+    robot = robot_named("quadrotor")
+    runner = SimpleNamespace(robot=robot, backup_plan=BackupPlan(robot), rng=np.random.default_rng(0))
+
+    def decided(proposal):
+        plan = robot.stop_profile() * proposal
+        return DecisionOutcome(pb.Request(), pb.Reply(), SimpleNamespace(kind=kind, plan=plan), "", 1.0)
+
+    practice = StopPractice(1.0)
+    runner.backup_plan.accept(robot.stop_profile() * [2.0, -1.0, 0.0], "a model", None, True)
+    executed = []
+    for _ in range(robot.horizon + STANDSTILL):
+        proposal = practice.proposal(runner, np.full(3, 5.0))
+        outcome = practice.outcome(runner, decided(proposal))
+        if outcome.answer is None:
+            executed.append(runner.backup_plan.fallback())
+        else:
+            executed.append(runner.backup_plan.accept(outcome.answer.plan, "a model", None, True))
+    assert practice.running and not np.array(executed)[-resting_periods_at_end(robot) - STANDSTILL :].any()
 
 
 def test_one_question_is_about_all_robots_of_a_process(scene):
