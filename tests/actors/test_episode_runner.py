@@ -39,7 +39,8 @@ IN_REAL_TIME = QUADROTOR.in_real_time()
 
 
 def decision(plan=PLAN, **fields):
-    values = {"kind": pb.ALLOWED, "plan": np.ravel(plan), "model": "abc", "verified": True}
+    values = {"kind": pb.ALLOWED, "plan": np.ravel(plan), "model": "abc", "verified": True, "bound": 0.01}
+    values |= {"tube_center": [0.0] * 6, "tube_half_width": [0.1] * 6}
     predicted = {"predicted_center": [0.0] * 5, "predicted_half_width": [1.0] * 5}
     return pb.Reply(robot="ground", decision=pb.Decision(**(values | predicted | fields)))
 

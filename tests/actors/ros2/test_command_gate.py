@@ -23,7 +23,9 @@ def allow(requests):
         plan = [*request.plan[: ROBOT.action_dim], *action]
         for k in range(ROBOT.horizon - 2):
             plan += list(action * max(0.0, 1.0 - (k + 1) / ROBOT.brake_steps))
-        decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True)
+        decision = pb.Decision(kind=pb.ALLOWED, plan=plan, model="m", verified=True, contained=True, bound=0.01)
+        decision.predicted_center.extend(request.state)
+        decision.predicted_half_width.extend([1.0] * ROBOT.state_dim)
         if not np.isfinite(request.action).all():
             decision.kind, decision.plan[:], decision.reason = pb.FAILSAFE, request.plan, NOT_FINITE
         decision.tube_center.extend([0.0] * 2 * ROBOT.horizon)
