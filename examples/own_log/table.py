@@ -233,11 +233,11 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         cells = [row["robot"], f"{row['minutes']:g} min"]
         cells += [f"{1e3 * row[k]['set']:.0f} ({1e3 * row[k]['truth']:.0f}) mm" for k in ("straight", "turning")]
-        cells += [f"{1e3 * row['clearance']:.0f} mm", f"≤ {percent(row['bound'])}", f"{row['fresh']['outside']:.2%}"]
+        cells += [f"{1e3 * row['clearance']:.0f} mm", f"≤ {percent(row['bound'])}", f"{100.0 * row['fresh']['outside']:.2f} %"]
         kinds = row["fresh"]["kinds"]
         worst = max(kinds, key=lambda name: kinds[name]["outside"], default="")
         stated = row["kinds"].get(worst, {}).get("bound")
-        said = "–" if stated is None else f"{worst}: {kinds[worst]['outside']:.2%} (≤ {percent(stated)})"
+        said = "–" if stated is None else f"{worst}: {100.0 * kinds[worst]['outside']:.2f} % (≤ {percent(stated)})"
         run = row["adversary"], row["planner"]
         cells += [said, f"{1e2 * run[0]['nearest']:.1f} cm ({run[0]['episodes']})"]
         cells += [f"{run[0]['collisions']} and {run[1]['collisions']}", f"{run[1]['goals']} of {run[1]['episodes']}"]
