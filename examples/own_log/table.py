@@ -233,7 +233,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         cells = [row["robot"], f"{row['minutes']:g} min"]
         cells += [f"{1e3 * row[k]['set']:.0f} ({1e3 * row[k]['truth']:.0f}) mm" for k in ("straight", "turning")]
-        cells += [f"{1e3 * row['clearance']:.0f} mm", f"≤ {percent(row['bound'])}", f"{100.0 * row['fresh']['outside']:.2f} %"]
+        cells += [f"{1e3 * row['clearance']:.0f} mm", f"≤ {percent(row['bound'])}"]
+        cells += [f"{100.0 * row['fresh']['outside']:.2f} %"]
         kinds = row["fresh"]["kinds"]
         worst = max(kinds, key=lambda name: kinds[name]["outside"], default="")
         stated = row["kinds"].get(worst, {}).get("bound")
