@@ -201,13 +201,15 @@ class VehicleServer:
         return failure if isinstance(failure, CommandLost) else None
 
     def refusal(self, request: FlightRequest) -> Exception | None:
-        """Return why the vehicle can't be handed over for this request; None: it can."""
+        """Return why the vehicle can't be handed over for this request; None: it can.
+
+        A vehicle that a pilot has is handed over as it is: the next actor waits until the pilot gives it back.
+        """
         if self.command_lost is not None:
             return self.command_lost
         if request != self.request:
             return HandoverRefused("it was flown with other settings until now")
-        lost = self._vehicle.current_period.lost
-        return HandoverRefused(lost) if lost else None
+        return None
 
     def close(self) -> None:
         """Brake unless the vehicle hovers, give it up, and send the last update."""
