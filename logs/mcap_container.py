@@ -149,6 +149,7 @@ class _Tables:
         self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
         self.summary: Callable[[], bytes] | None = summary
         self.topics = dict[int, str]()  # as the metadata say, by the channel's number
+        self.chunked = False  # the file has chunks
 
     def channel(self, number: int) -> LogChannel | None:
         """Return the channel of a message; None if nothing declares it."""
@@ -226,6 +227,7 @@ def records(file: IO[bytes], size: int, make: MakeChannel = raw_channel) -> Iter
             yield changed
         try:
             if opcode == Opcode.CHUNK:
+                tables.chunked = True
                 yield from _unpacked(_uncompressed(content), tables)
             elif opcode == Opcode.FOOTER:
                 if file.read(len(MAGIC)) != MAGIC:
@@ -275,6 +277,8 @@ def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
     if opcode in (SCHEMA, CHANNEL):
         tables.add(opcode, content)
     elif opcode == MESSAGE:
+        if tables.chunked and len(content) == _MESSAGE.size:  # one changed bit makes it of the index of a chunk
+            raise ValueError("a message without content between chunks")
         yield from _unpacked(_HEAD.pack(opcode, len(content)) + content, tables)
     elif opcode == Opcode.HEADER:
         yield Header.read(ReadDataStream(BytesIO(content)))

@@ -4,6 +4,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -34,9 +35,11 @@ def test_each_flipped_bit_is_named(path: Path) -> None:
     path.write_bytes(flipped(whole, chunk + 40, 3))
     log = open_log(path)
     assert len(list(log)) == log.segments[0].messages == 29 and log.cuts[0].lost > 0, "only that chunk is lost"
+    index = whole.index(bytes([Opcode.MESSAGE_INDEX]) + (22).to_bytes(8, "little"))  # of a chunk with one message
+    assert Opcode.MESSAGE_INDEX ^ Opcode.MESSAGE == 1 << 1, "one bit makes it a message"
     places = [*(random.randrange(len(whole)) for _ in range(150)), whole.index(b"seed"), len(whole) - 1]
-    for place in places:
-        path.write_bytes(flipped(whole, place, random.randrange(8)))
+    for place, bit in [(index, 1), *((place, random.randrange(8)) for place in places)]:
+        path.write_bytes(flipped(whole, place, bit))
         log = open_log(path)
         try:
             read = len(list(log))

@@ -48,8 +48,8 @@ def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeyp
         ({"policy": "astar", "backend": "batch"}, "driven by a network"),
         ({"fleet": 3, "backend": "batch"}, "robots of a fleet"),
         ({"arena": "walkers", "method": "none", "backend": "batch"}, "moving obstacles"),
-        ({"arena": "crossing", "method": "secas", "fleet": 2}, "promises"),
-        ({"arena": "crossing", "method": "sailr", "fleet": 2}, "promises"),
+        ({"arena": "crossing", "method": "secas", "fleet": 2}, "reserves no space"),
+        ({"arena": "crossing", "method": "sailr", "fleet": 2}, "reserves no space"),
     ],
 )
 def test_what_no_batch_and_no_fleet_does_is_refused(monkeypatch, change, said):
