@@ -20,6 +20,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks import (
+    adaptation_in_flight,
     askers,
     autopilot_conformance,
     batch_decide,
@@ -128,6 +129,7 @@ BENCHMARKS = {
     ),
     "groups": Benchmark(driving_groups, lambda given: driving_groups.run(given.plans), named=True),
     "widths": Benchmark(set_widths, lambda _: set_widths.run(), named=True),
+    "adaptation": Benchmark(adaptation_in_flight, lambda _: adaptation_in_flight.run(), named=True),
     "changed": Benchmark(changed_robots, lambda _: changed_robots.run(), named=True),
     "widening": Benchmark(widening_share, lambda _: widening_share.run(), named=True),
     "costs": Benchmark(costs, lambda _: costs.run(), named=True),

@@ -278,7 +278,7 @@ class Adaptation:
         """
         try:
             model, report = way(in_use, data, self._outside(in_use, data))
-            width = _mean_half_width(model, data)
+            width = mean_half_width(model, data)
         except (BadData, ErrorBoundError, ValueError) as error:
             return math.inf, Recertification(f"{NAMES[way]}: {error}")
         refused = refusal(self.robot, model.about, self.accept_bound)
@@ -327,10 +327,10 @@ NAMES: dict[Way, str] = {_fitted: "a fit to this driving", _updated: "an update 
 
 def _largest_half_width(in_use: ModelSet, widening: float, data: Dataset) -> float:
     """Return the largest mean half-width that may replace a set in use that the robots widen [m]."""
-    return TIGHTER * Filter(in_use).constraints.plan_widening(widening) * _mean_half_width(in_use, data)
+    return TIGHTER * Filter(in_use).constraints.plan_widening(widening) * mean_half_width(in_use, data)
 
 
-def _mean_half_width(model: ModelSet, data: Dataset) -> float:
+def mean_half_width(model: ModelSet, data: Dataset) -> float:
     """Return the mean half-width of the position at the end of plans that begin as the windows in the data do [m]."""
     robot = data.robot
     z = plans_from(robot, windows(data, robot.horizon, FREE).z)

@@ -126,10 +126,10 @@ def test_a_set_that_predicts_plans_only_is_compared_on_plans_as_they_are_widened
     )
     begun = plans_from(ROBOT, windows(data, ROBOT.horizon, FREE).z)
     expected = free.steps[-1].half_widths(begun)[:, :2].mean()
-    assert adaptation._mean_half_width(plans, data) == pytest.approx(expected)
+    assert adaptation.mean_half_width(plans, data) == pytest.approx(expected)
     new = replace(in_use(), steps=tuple(_wider(step, 4.0) for step in in_use().steps))
     growth = Filter(plans).constraints.growth
-    width = adaptation._mean_half_width(new, data)
+    width = adaptation.mean_half_width(new, data)
     even = width / (adaptation.TIGHTER * expected * growth)
     assert growth > 1.1 and even > 1.0, "sets of plans widen by more than a request asks for"
     assert adaptation._largest_half_width(plans, even, data) == pytest.approx(width)
