@@ -87,10 +87,11 @@ def flight(robot: RobotWithTask, model: ModelSet, change: Conditions) -> list[Fl
     policy, practice = policy_named("astar", robot, 0), StopPractice(PRACTICE)
     for stage in stages:
         policy.prepare(stage)  # type: ignore[attr-defined]
-    periods: list[FlightPeriod] = []
+    periods, episode = list[FlightPeriod](), 0
     while len(periods) < round(60.0 * MINUTES / robot.period):
         if not runner.running:
-            runner.begin(len(periods))
+            runner.begin(episode)
+            episode += 1
         proposal = runner.slow_down.proposal(np.asarray(policy(runner.observation, runner.info), float))
         proposal = practice.proposal(runner, proposal)
         decided = runner.decide(proposal, ask)

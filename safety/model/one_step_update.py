@@ -168,7 +168,10 @@ def _scores(robot: Robot, s: Samples, correction: Correction, choice: tuple[floa
     scores = np.zeros((3, len(s.z)))
     for i in range(len(correction.gram)):
         held, one_step = s.fold == i, correction.fit(*choice, without=i)
-        errors = (s.after[held] - one_step.rollouts(robot, s.z[held])) / one_step.stretches(robot, s.z[held])[..., None]
+        with np.errstate(invalid="ignore"):
+            errors = s.after[held] - one_step.rollouts(robot, s.z[held])
+            errors /= one_step.stretches(robot, s.z[held])[..., None]
+        errors[np.isnan(errors)] = np.inf  # a rollout that diverges is outside every set
         scores[:, held] = window_scores(robot, errors, s.chords[held], widths[held])
     return scores
 
