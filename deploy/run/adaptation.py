@@ -260,6 +260,7 @@ class Adaptation:
             data = Dataset(robot, trajectories, {"origin": "adaptation", "why": why})
             data.check()
             in_use = self.in_use(version)
+            _check_coverage(in_use, data)
         except (BadData, BadModel) as error:
             return Recertification(f"none {why}: {error}")
         most = _largest_half_width(in_use, widening, data)
@@ -307,12 +308,20 @@ class Adaptation:
         return Recertification(f"none: {self.version} came into use during the fit; it was compared with another set")
 
 
-def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
-    """Fit a model set to the recent driving alone. Raises BadData, also if the driving is too narrow."""
+def _check_coverage(in_use: ModelSet, data: Dataset) -> None:
+    """Raise BadData if the recent driving is too narrow.
+
+    A fit to it would brake the robot outside its range. An update keeps the range, but its statement does not hold
+    there: of the windows of a quadrotor with a payload that flew faster again, 15 % left sets that stated 2.9 %.
+    """
     ranges, recorded = np.ptp(in_use.domain, axis=0), np.ptp(recorded_domain(data), axis=0)
     covered = float((recorded / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
     if covered < DOMAIN:
         raise BadData(f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}")
+
+
+def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
+    """Fit a model set to the recent driving alone. Raises BadData."""
     return certify(data, ModelConfig(mode=ONE_STEP, outside=outside))
 
 

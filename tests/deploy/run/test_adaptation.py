@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.certification import certify, certify_update
 from brakeline.deploy.run import adaptation, adaptation_process
 from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
 from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
@@ -224,17 +224,20 @@ def test_a_looser_or_an_unproven_set_is_refused_with_the_reason(kind, why, widen
     assert attempt.model is None and attempt.data is None and why in attempt.text
 
 
-def test_driving_too_narrow_for_a_fit_updates_the_set_in_use(kind):
-    """In the air no set was ever published: flights between obstacles do not cover the recorded speeds."""
+def test_driving_that_is_too_narrow_makes_no_set(kind):
+    """An update would keep the range of the set in use, where the new driving shows nothing."""
     (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.5), widening=8.0)
-    model = attempt.model
-    assert model is not None and "an update of the set in use" in attempt.text and attempt.data is None
-    assert (model.domain[0] <= in_use().domain[0]).all() and (model.domain[1] >= in_use().domain[1]).all()
-    assert float(model.about["bound_plan"]) <= ACCEPTED and model.about["updates"] == in_use().version
-    signed = ModelSet.decode(model.encode())
-    assert signed.version == model.version
+    assert attempt.model is None and "of the speeds and inputs of the set in use, not 75%" in attempt.text
+
+
+def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
+    new, report = certify_update(in_use(), Dataset(ROBOT, driven(2, 7, slip=-0.15, share=0.5)), ModelConfig.outside)
+    assert (new.domain[0] <= in_use().domain[0]).all() and (new.domain[1] >= in_use().domain[1]).all()
+    assert float(new.about["bound_plan"]) == pytest.approx(report.bound_plan, rel=1e-5)
+    assert report.bound_plan <= ACCEPTED and new.about["updates"] == in_use().version
+    assert ModelSet.decode(new.encode()).version == new.version
     fresh = Dataset(ROBOT, driven(3, 6, slip=-0.15, share=0.5))
-    assert share_outside(in_use(), fresh) > 0.2 > ACCEPTED > share_outside(model, fresh)
+    assert share_outside(in_use(), fresh) > 0.2 > ACCEPTED > share_outside(new, fresh)
 
 
 def share_outside(model, data):
@@ -243,14 +246,6 @@ def share_outside(model, data):
     errors = (s.after - model.one_step.rollouts(ROBOT, s.z)) / model.one_step.stretches(ROBOT, s.z)[..., None]
     half_widths = np.stack([step.half_widths(s.z) for step in model.steps], 1)
     return float((np.abs(errors) > half_widths)[..., : ROBOT.position_dim].any((1, 2)).mean())
-
-
-def test_driving_too_narrow_for_a_fit_updates_no_set_of_mode_direct():
-    linear = certify(record(1, 6), ModelConfig(mode=DIRECT, windows=FREE))[0]
-    attempt = drive(
-        Adaptation(ROBOT, lambda version: linear, ACCEPTED), driven(2, 7, slip=-0.15, share=0.5), widening=8.0
-    )
-    assert attempt[0].model is None and "of the speeds and inputs of the set in use, not 75%" in attempt[0].text
 
 
 def test_the_certifier_says_how_much_driving_is_missing(kind):
