@@ -40,7 +40,7 @@ from brakeline.sim.navigation_env import NavigationEnv
 from brakeline.sim.sim_conditions import Conditions, Wind
 from brakeline.sim.vehicle import Vehicle
 
-TRAJECTORIES, RESTLESS, OUTSIDE, RECORDING_SEED = 60, 30, 0.012, 5
+TRAJECTORIES, RESTLESS, OUTSIDE, RECORDING_SEED = 12, 6, 0.012, 5
 ACCEPTED = 0.03  # `--accept-bound`
 MINUTES, PRACTICE, GOALS, ARENA_KEY = 14.0, 0.01, 12, 4242
 EVERY = 25  # periods between two attempts of the certifier
