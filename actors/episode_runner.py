@@ -24,7 +24,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.client import request_message
-from brakeline.safety.service.wire import KIND_NUMBERS
+from brakeline.safety.service.wire import set_decision
 from brakeline.sim.scripted_policies import Policy
 
 StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # the result of an environment's `step`
@@ -252,9 +252,7 @@ class EpisodeRunner:
             step.fallback = True
             step.decision = pb.FAILSAFE
             return
-        step.decision, step.decide_ms, step.broken = KIND_NUMBERS[answer.kind], answer.time_ms, answer.broken
-        if answer.for_clearance is not None:
-            step.for_clearance = answer.for_clearance
+        set_decision(step, answer)
         if self.ends_on_intervention:
             self._end_on_intervention(step)
         if self.backup_plan.predicted is not None:

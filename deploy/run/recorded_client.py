@@ -36,7 +36,7 @@ from brakeline.messaging.topics import EXCHANGE, STEP, Topic
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.filter_client import Answer, FilterClient, obstacles_in
-from brakeline.safety.service.wire import KIND_NUMBERS, decision_reply
+from brakeline.safety.service.wire import decision_reply, set_decision
 
 if TYPE_CHECKING:
     from brakeline.logs.recorder import Recording
@@ -151,10 +151,10 @@ class RecordedClient:
     def record_outcome(self, reward: float, *, goal: bool = False, collision: bool = False) -> None:
         """Record a period's reward, after its `decide` or `fallback`; after the last one also how the episode ended.
 
-        A reward that is not finite, or above 1e9, counts as zero, because a log with it has no sums.
+        A reward that is not finite, or 1e9 and more, counts as zero, because a log with it has no sums.
         """
         if self._pending is not None:
-            self._pending.reward = reward if abs(reward) <= MAX_VALUE else 0.0
+            self._pending.reward = reward if abs(reward) < MAX_VALUE else 0.0
             self._pending.goal, self._pending.collision = goal, collision
 
     def reset(self, *, goal: bool = False, collision: bool = False) -> None:
@@ -196,9 +196,7 @@ class RecordedClient:
             fallback=answer is None,
         )
         if answer is not None:
-            step.decision, step.decide_ms, step.broken = KIND_NUMBERS[answer.kind], answer.time_ms, answer.broken
-            if answer.for_clearance is not None:
-                step.for_clearance = answer.for_clearance
+            set_decision(step, answer)
         self._pending = step
         self._step += 1
 

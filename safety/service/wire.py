@@ -233,6 +233,13 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
     return pb.Reply(decision=message)
 
 
+def set_decision(step: pb.Step, decision: Decision) -> None:
+    """Set what a step says of its decision."""
+    step.decision, step.decide_ms, step.broken = KIND_NUMBERS[decision.kind], decision.time_ms, decision.broken
+    if decision.for_clearance is not None:
+        step.for_clearance = decision.for_clearance
+
+
 def decision_of(m: pb.Decision, robot: Robot) -> Decision:
     """Return the decision in a message. The caller has checked the size of its plan.
 
