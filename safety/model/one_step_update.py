@@ -168,10 +168,9 @@ def _scores(robot: Robot, s: Samples, correction: Correction, choice: tuple[floa
     scores = np.zeros((3, len(s.z)))
     for i in range(len(correction.gram)):
         held, one_step = s.fold == i, correction.fit(*choice, without=i)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore"):  # a rollout may diverge: `shares` takes NaN for infinity
             errors = s.after[held] - one_step.rollouts(robot, s.z[held])
             errors /= one_step.stretches(robot, s.z[held])[..., None]
-        errors[np.isnan(errors)] = np.inf  # a rollout that diverges is outside every set
         scores[:, held] = window_scores(robot, errors, s.chords[held], widths[held])
     return scores
 

@@ -21,6 +21,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
 from brakeline.messaging.topics import MODEL
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model import one_step_update
 from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
@@ -238,6 +239,18 @@ def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
     assert ModelSet.decode(new.encode()).version == new.version
     fresh = Dataset(ROBOT, driven(3, 6, slip=-0.15, share=0.5))
     assert share_outside(in_use(), fresh) > 0.2 > ACCEPTED > share_outside(new, fresh)
+
+
+def test_an_update_whose_rollouts_diverge_leaves_every_set():
+    """Infinity divided by infinity is no number, and no number is above 1."""
+    s = samples_of(Dataset(ROBOT, driven(2, 2)).joined())
+    without_end = SimpleNamespace(
+        rollouts=lambda robot, z: np.full((len(z), *s.after.shape[1:]), np.inf),
+        stretches=lambda robot, z: np.full((len(z), s.after.shape[1]), np.inf),
+    )
+    correction = SimpleNamespace(gram=range(int(s.fold.max()) + 1), fit=lambda *choice, without: without_end)
+    widths = np.ones((*s.after.shape[:2], s.after.shape[2] + 1))
+    assert np.isinf(one_step_update._scores(ROBOT, s, correction, (1.0, False), widths)[0]).all()
 
 
 def share_outside(model, data):
