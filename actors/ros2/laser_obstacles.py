@@ -1,11 +1,14 @@
 """Convert a laser scan to obstacles that contain everything the scan may have hit (docs/method.md §10).
 
-A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`.
-The first part covers the gap to the next beam, since an edge may be anywhere in it; the others cover the error of the
-hit's position. Neighbouring hits that the body cannot pass between are joined to boxes, so that a wall is one obstacle
-and not a hundred. A beam without a hit is free up to the sensor's range. A beam without information (too near, NaN),
-and a direction without a beam, may have an obstacle right at the body: there the space at the body counts as occupied.
-Earlier scans do not count.
+A beam that hits at range r becomes a disc of radius
+
+    increment r + range error + heading error (r + m) + position error
+
+with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
+may be anywhere in it; the others cover the error of the hit's position. Neighbouring hits that the body cannot pass
+between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
+sensor's range. A beam without information (too near, NaN), and a direction without a beam, may have an obstacle right
+at the body: there the space at the body counts as occupied. Earlier scans do not count.
 
 Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
 (7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come
@@ -111,9 +114,10 @@ def obstacles(
     sensor = poses[:, :2] + np.stack([cos * mount.x - sin * mount.y, sin * mount.x + cos * mount.y], axis=1)
     angles = poses[:, 2] + mount.yaw + beams.angles
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    swing = errors.heading * math.hypot(mount.x, mount.y)  # a wrong heading also moves the sensor about the robot
     with np.errstate(invalid="ignore"):
         points = sensor + beams.ranges[:, None] * directions
-        radii = (beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
+        radii = (beams.gap + errors.heading) * beams.ranges + swing + errors.range + errors.position
         near = np.linalg.norm(points - around, axis=1) <= robot.sight + EXTRA_SIGHT + radii
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]

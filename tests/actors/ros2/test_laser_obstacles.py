@@ -1,5 +1,6 @@
 """The obstacles of a scan contain everything that a beam may have hit."""
 
+import itertools
 import math
 
 import numpy as np
@@ -10,13 +11,14 @@ from hypothesis import strategies as st
 from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadScan
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import SpinningLidar
 from brakeline.sim.lidar import Lidar
 from tests.actors.ros2.test_ros_inputs import BEAMS, scan_of
 from tests.robots import GROUND
+from tests.safety.ray_casting import cast
 
 MOUNT = PlanarPose(-0.032, 0.0, 0.0)
 ERRORS = HitErrors.of(GROUND, 0.02)
@@ -62,6 +64,21 @@ def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
             points = points[(true_ranges < NEAR) & np.repeat(beside, 10)]
             assert len(points) > 0
             assert shapes.distance(points).min(axis=0).max() <= 1e-9
+
+
+@pytest.mark.parametrize("signs", list(itertools.product((-1.0, 1.0), repeat=4)))
+def test_obstacles_contain_the_hits_of_a_lidar_off_centre_with_the_largest_errors(signs):
+    """An error of the heading also moves a lidar that is mounted away from the robot's position."""
+    mount, angles, *off = PlanarPose(0.6, -0.5), 2.0 * math.pi * np.arange(BEAMS) / BEAMS, *signs
+    heading, place = off[2] * GROUND.measurement_bound[2], np.array(off[:2]) * GROUND.measurement_bound[:2]
+    directions = rotate(np.stack([np.cos(angles), np.sin(angles)], axis=1), heading)
+    sensor = place + rotate(np.array([mount.x, mount.y]), heading)
+    around = 2.0 * math.pi * np.arange(24) / 24
+    posts = [Obstacle(CYLINDER, tuple(sensor + 0.25 * np.array([math.cos(a), math.sin(a)])), (0.02,)) for a in around]
+    ranges = cast(posts, sensor, directions, 3.5)
+    shapes = Shapes.of(obstacles_of(scan_of(ranges + off[3] * ERRORS.range), mount=mount), dim=2)
+    hits = (sensor + ranges[:, None] * directions)[ranges < 3.5]
+    assert len(hits) > 100 and shapes.distance(hits).min(axis=0).max() <= 1e-9
 
 
 def test_a_room_is_few_obstacles_and_its_middle_is_free():
