@@ -107,26 +107,47 @@ def test_a_gap_that_the_body_cannot_pass_is_occupied():
     assert apart.distance(np.array([[0.5, 0.0]])).min() > 0.1
 
 
-@pytest.mark.parametrize("blind", [math.nan, 0.0, 0.05, -math.inf, -1.0])
-def test_a_blind_beam_makes_an_obstacle_at_the_body(blind):
+@pytest.mark.parametrize("near", [0.05, -math.inf])
+@pytest.mark.parametrize("mount", [PlanarPose(), PlanarPose(0.05, 0.08)])
+def test_what_is_too_near_to_be_measured_touches_the_body_where_the_beam_leaves_it(near, mount):
     ranges = np.full(BEAMS, math.inf)
-    assert obstacles_of(scan_of(ranges)) == ()
-    ranges[90] = blind
-    shapes = Shapes.of(obstacles_of(scan_of(ranges)), dim=2)
-    assert shapes.distance(np.array([[0.0, GROUND.footprint + 0.005]])).min() == 0.0
+    assert obstacles_of(scan_of(ranges), mount=mount) == ()
+    ranges[90] = near
+    shapes = Shapes.of(obstacles_of(scan_of(ranges), mount=mount), dim=2)
+    leaves = np.array([mount.x, math.sqrt(GROUND.footprint**2 - mount.x**2)])
+    assert shapes.distance(leaves * (1.0 + 0.005 / GROUND.footprint)) == 0.0
     assert shapes.distance(np.zeros((1, 2))).min() >= GROUND.footprint - 1e-9
+
+
+def test_what_a_lidar_outside_the_body_is_too_near_to_is_at_the_lidar():
+    ranges = np.full(BEAMS, math.inf)
+    ranges[180] = -math.inf
+    (touching,) = obstacles_of(scan_of(ranges), mount=PlanarPose(0.0, 0.2))
+    assert touching.position[0] == pytest.approx(0.0) and touching.position[1] > GROUND.footprint
+
+
+@pytest.mark.parametrize("blind", [math.nan, 0.0, -1.0])
+def test_a_beam_without_information_is_refused(blind):
+    """Anything may be there, and an obstacle in its place would have the filter lead the robot away from it."""
+    ranges = np.full(BEAMS, math.inf)
+    ranges[[90, 200]] = blind
+    with pytest.raises(BadScan, match=f"no information in 2 of {BEAMS} directions"):
+        read(scan_of(ranges))
 
 
 def test_zero_is_free_only_if_the_settings_say_so():
     assert obstacles_of(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
-    assert obstacles_of(scan_of(np.zeros(BEAMS))) != ()
+    with pytest.raises(BadScan, match="no information"):
+        obstacles_of(scan_of(np.zeros(BEAMS)))
 
 
-def test_a_direction_without_a_beam_is_occupied():
-    fan = scan_of(np.full(180, math.inf), angle_min=-0.5 * math.pi, angle_increment=math.pi / 179)
-    shapes = Shapes.of(obstacles_of(fan), dim=2)
-    assert shapes.distance(np.array([[-0.12, 0.0]])).min() == 0.0
-    assert shapes.distance(np.array([[0.3, 0.0]])).min() > 0.1
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_scan_that_leaves_out_directions_is_refused(sign):
+    step = sign * math.pi / 180
+    with pytest.raises(BadScan, match="no information in 90 of 360 directions"):
+        read(scan_of(np.full(270, math.inf), angle_min=-135.0 * step, angle_increment=step))
+    for beams in (359, 360, 361):  # rounding, and beams that repeat the first
+        read(scan_of(np.full(beams, math.inf), angle_min=0.0, angle_increment=sign * 2.0 * math.pi / 359.4))
 
 
 def test_space_beyond_a_short_range_sensor_is_occupied():
