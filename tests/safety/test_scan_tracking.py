@@ -230,6 +230,20 @@ def test_the_tracker_separates_standing_surfaces_from_moving_groups():
     assert np.linalg.norm(ways[moved - 1, :2] - velocity) < 0.15 and ways[moved - 1, 2] < 0.5
 
 
+def test_a_group_that_comes_into_the_field_of_view_has_no_velocity_yet():
+    """The middle of what is seen of it is slower than the group itself."""
+    memory, rng, across = FanMemory(GROUND.footprint), np.random.default_rng(0), np.array([1.0, 0.0])
+    ahead, tracked = np.abs(FAN) < math.radians(135.5), 0
+    for k in range(12):
+        at = np.array([-1.6, 0.8]) + k * DT * across
+        whole = taken([*ROOM, Obstacle("cylinder", tuple(at), (0.38,))], np.zeros(2), rng)
+        scan = memory.fill(replace(whole, ranges=whole.ranges[ahead], angles=whole.angles[ahead]), DT)
+        for motion in scan.tracks.motions[np.abs(scan.tracks.motions[:, 0]) > 0.1]:
+            tracked += 1
+            assert np.linalg.norm(motion[:2] - across) <= motion[2] + 0.1  # the pose has errors, too
+    assert tracked > 0
+
+
 def test_an_ambiguous_group_is_not_tracked():
     """The group ahead may have been either of the two before. The group behind was too far from the other."""
     velocity, legs = np.array([0.5, 0.0]), [np.array([-0.5, 0.8]), np.array([-0.25, 0.8])]
