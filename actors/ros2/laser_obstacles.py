@@ -1,11 +1,14 @@
 """Convert a laser scan to obstacles that contain everything the scan may have hit (docs/method.md §10).
 
-A beam that hits at range r becomes a disc of radius `increment r + range error + heading error r + position error`.
-The first part covers the gap to the next beam, since an edge may be anywhere in it; the others cover the error of the
-hit's position. Neighbouring hits that the body cannot pass between are joined to boxes, so that a wall is one obstacle
-and not a hundred. A beam without a hit is free up to the sensor's range. A beam without information (too near, NaN),
-and a direction without a beam, may have an obstacle right at the body: there the space at the body counts as occupied.
-Earlier scans do not count.
+A beam that hits at range r becomes a disc of radius
+
+    increment r + range error + heading error (r + m) + position error
+
+with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
+may be anywhere in it; the others cover the error of the hit's position. Neighbouring hits that the body cannot pass
+between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
+sensor's range. Something too near to be measured touches the body where the beam leaves it. A scan with a direction
+without information is refused: earlier scans do not count, so nobody knows what is there.
 
 Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
 (7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come
@@ -49,17 +52,17 @@ class HitErrors:
 
 @dataclass(frozen=True)
 class LaserBeams:
-    """The n beams of a scan, with one for each direction that the scan leaves out."""
+    """The n beams of a scan of a whole turn."""
 
     times: Array  # (n,) s
     angles: Array  # (n,) rad, in the sensor's frame
-    ranges: Array  # (n,) m of free space: up to the hit or the sensor's range; NaN for a blind beam
-    blind: NDArray[np.bool_]  # (n,) whether the beam has no information
+    ranges: Array  # (n,) m of free space: up to the hit or the sensor's range; NaN for a hit that is too near
+    too_near: NDArray[np.bool_]  # (n,) whether the beam hit something nearer than the sensor can measure
     gap: float  # rad between two neighbours
 
 
 def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
-    """Return the beams of a scan. Raises BadScan: its angles or ranges are not valid.
+    """Return the beams of a scan. Raises BadScan: its angles or ranges are not valid, or do not show all directions.
 
     zero_is_free: the driver reports 0 where nothing is within range, as some do (REP 117 demands inf).
     """
@@ -76,24 +79,12 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     free = ranges > scan.range_max
     if zero_is_free:
         free |= ranges == 0.0
+    too_near = ((ranges > 0.0) & (ranges < scan.range_min)) | np.isneginf(ranges)  # REP 117
+    left_out = max(math.ceil(2.0 * math.pi / abs(gap) - n - 0.5), 0)  # less than half a gap is rounding
+    if unknown := left_out + int(np.count_nonzero(~(hit | free | too_near))):
+        raise BadScan(f"it has no information in {unknown} of {n + left_out} directions, where anything may be")
     lengths = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
-    unseen = _unseen(float(scan.angle_min), gap, n)
-    lengths = np.concatenate([lengths, np.full(len(unseen), np.nan)])
-    times = np.concatenate([times, np.full(len(unseen), times[-1])])
-    return LaserBeams(
-        np.asarray(times, float),
-        np.concatenate([angles, unseen]),
-        np.asarray(lengths, float),
-        np.isnan(lengths),
-        abs(gap),
-    )
-
-
-def _unseen(first: float, gap: float, count: int) -> Array:
-    """Return angles [rad] in the directions that a scan leaves out, with the gap of its beams between them."""
-    left = 2.0 * math.pi - abs(gap) * count
-    more = math.ceil(left / abs(gap) - 0.5)  # less than half a gap is rounding
-    return np.asarray(first + gap * (count + np.arange(max(more, 0))))
+    return LaserBeams(np.asarray(times, float), np.asarray(angles, float), lengths, too_near, abs(gap))
 
 
 def obstacles(
@@ -105,23 +96,36 @@ def obstacles(
         beams: the n beams of a scan.
         poses: (n, ≥ 3) x, y [m], heading [rad] of the robot at the beams' times.
         mount: the sensor's pose on the robot.
-        around: (2,) m, the position, in the frame of the poses. At a blind beam, an obstacle touches the body there.
+        around: (2,) m, the position, in the frame of the poses. What is too near to be measured touches the body there.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     sensor = poses[:, :2] + np.stack([cos * mount.x - sin * mount.y, sin * mount.x + cos * mount.y], axis=1)
     angles = poses[:, 2] + mount.yaw + beams.angles
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    swing = errors.heading * math.hypot(mount.x, mount.y)  # a wrong heading also moves the sensor about the robot
     with np.errstate(invalid="ignore"):
         points = sensor + beams.ranges[:, None] * directions
-        radii = (beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
+        radii = (beams.gap + errors.heading) * beams.ranges + swing + errors.range + errors.position
         near = np.linalg.norm(points - around, axis=1) <= robot.sight + EXTRA_SIGHT + radii
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]
     hits = _joined(points[order], radii[order], 2.0 * robot.footprint)
-    blind = directions[beams.blind]
     size = max(0.5 * beams.gap, 1e-3) * robot.footprint + errors.position
-    touching = around + (robot.footprint + size) * blind
+    leaves = _leaving(sensor[beams.too_near] - around, directions[beams.too_near], robot.footprint)
+    touching = around + (robot.footprint + size) * leaves
     return (*hits, *_joined(touching, np.full(len(touching), size), 2.0 * robot.footprint))
+
+
+def _leaving(sensor: Array, directions: Array, body: float) -> Array:
+    """Return the directions (n, 2), from the middle of a body of a radius [m], to where beams leave it.
+
+    sensor: (n, 2) m from the middle, where each beam begins; one outside the body leaves it there.
+    """
+    along = np.einsum("nd,nd->n", sensor, directions)
+    inside = np.maximum(body * body - np.einsum("nd,nd->n", sensor, sensor), 0.0)
+    length = np.where(inside > 0.0, np.sqrt(along * along + inside) - along, 0.0)
+    points = sensor + length[:, None] * directions
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
 
 
 def _joined(points: Array, radii: Array, body: float) -> list[Obstacle]:

@@ -17,7 +17,8 @@ from brakeline.safety.filter.plan_search import PlanCandidate
 from brakeline.safety.filter.qp import ConstraintRows
 from brakeline.safety.filter.recovery import SLOW, harmless, least_violating, slow_inputs, turn_towards
 from brakeline.safety.filter.request import RECOVERING, Request
-from brakeline.safety.perception.scan_free_space import shows_free
+from brakeline.safety.perception.image_coverage import has_blind_directions
+from brakeline.safety.perception.scan_free_space import blind_near, shows_free
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.filter import Filter
@@ -72,8 +73,17 @@ class RecoverySearch:
         if not self.moves:
             seeming = 2.0 * safety.constraints.measurement_error
             seeming += safety.clearance_margin if safety.constraints.stays else 0.0
-        margin = safety.constraints_for(stand, local_map.widening).margin_in(local_map.parked, stand)
-        return margin < -seeming
+        constraints = safety.constraints_for(stand, local_map.widening)
+        return constraints.margin_in(local_map.parked, stand) < -seeming and not self._is_blind(
+            constraints.extent(stand)
+        )
+
+    def _is_blind(self, within: float) -> bool:
+        """Return whether the scan has no information about space within a distance [m]: no way leads out of that."""
+        scan = self.request.scan
+        if isinstance(scan, Scan):
+            return blind_near(scan, self.local_map.start, within)
+        return scan is not None and has_blind_directions(scan)
 
     def _slow_input(self, rows: ConstraintRows, planes: list[Planes], stand: Array, standing: Array) -> Array | None:
         """Return the regressors (nz,) of the slow input that violates least, or None if none is better than standing.

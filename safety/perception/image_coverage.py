@@ -94,6 +94,11 @@ def patch_free_ranges(image: RangeImage) -> tuple[BeamGrid, Single]:
     return grid, free
 
 
+def has_blind_directions(image: RangeImage) -> bool:
+    """Return whether an image has directions without information, or with something that touches the sensor."""
+    return bool((patch_free_ranges(image)[1] <= 0.0).any())
+
+
 def by_mesh(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
     """Combine the values (E, A) of each beam, its left neighbour and the two above them; in the last ring, of two."""
     meshes = of(values, np.roll(values, -1, axis=1))

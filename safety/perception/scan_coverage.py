@@ -51,10 +51,13 @@ def gaps_and_motions(scan: Scan) -> tuple[Array, Array, Array, NDArray[np.uint8]
     width = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     doubt = min(scan.doubt, len(ranges))
     least = _neighbour_minimum(ranges, range(-doubt, doubt + 2))
-    free = _free_range(least, np.maximum(*_spans(width, doubt)), scan.least_width)
+    wide = np.maximum(*_spans(width, doubt))
+    free = _free_range(least, wide, scan.least_width)
     if scan.tracks is None:
         return angles, width, free, np.zeros(len(free), np.uint8)
-    return angles, width, free, _gap_motions(scan.tracks.track_index[beams], ranges, width, doubt)
+    motion = _gap_motions(scan.tracks.track_index[beams], ranges, width, doubt)
+    motion[free >= _hiding_range(wide, scan.least_width)] = 0  # what no beam hit may be before the surfaces
+    return angles, width, free, motion
 
 
 def _gap_motions(which: NDArray[np.uint8], ranges: Array, width: Array, doubt: int) -> NDArray[np.uint8]:
@@ -96,10 +99,13 @@ def _neighbour_minimum(ranges: Array, offsets: range) -> Array:
 def _free_range(least: Array, width: Array, least_width: float) -> Array:
     """Return F [m] of gaps of a width [rad] between beams that are free up to `least` [m]."""
     steep = np.minimum(0.25 * math.pi + width, STEEPEST)
-    free = np.minimum(
-        least / (np.cos(width) + np.sin(width) * np.tan(steep)), least_width * np.cos(steep) / np.sin(width)
-    )
-    return np.where(steep < STEEPEST, free, 0.0)
+    seen = least / (np.cos(width) + np.sin(width) * np.tan(steep))
+    return np.where(steep < STEEPEST, np.minimum(seen, _hiding_range(width, least_width)), 0.0)
+
+
+def _hiding_range(width: Array, least_width: float) -> Array:
+    """Return the range [m] from which on an obstacle may lie unseen between the beams of gaps of a width [rad]."""
+    return least_width * np.cos(np.minimum(0.25 * math.pi + width, STEEPEST)) / np.sin(width)
 
 
 def _ghosts(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from brakeline.messaging.scan import Scan
 from brakeline.safety.filter.halfspaces import TOUCHING, viewpoints
 from brakeline.safety.perception.occlusion_exits import occlusion_exits
-from brakeline.safety.perception.scan_coverage import gaps, gaps_and_motions
+from brakeline.safety.perception.scan_coverage import WIDE, gaps, gaps_and_motions
 
 Array = NDArray[np.float64]
 
@@ -129,6 +129,21 @@ def shows_free(scan: Scan, position: Array) -> bool:
     angles, width, free = gaps(scan)
     here = (math.atan2(north, east) - heading - angles) % math.tau <= width
     return bool(math.hypot(east, north) <= free[here].min(initial=math.inf))
+
+
+def blind_near(scan: Scan, position: Array, within: float) -> bool:
+    """Return whether a direction without information may come within a distance [m] of a position (2,), world."""
+    at, heading = scan.sensor()
+    angles, width, free = gaps(scan)
+    wide = np.flatnonzero(width > WIDE)
+    if not len(wide):
+        return False
+    rays = [np.linspace(angles[i], angles[i] + width[i], math.ceil(width[i] / WIDE) + 1) for i in wide]
+    side = heading + np.concatenate(rays)
+    towards = np.stack([np.cos(side), np.sin(side)], axis=1)
+    reach = np.maximum(towards @ (position - at), np.repeat(free[wide], [len(ray) for ray in rays]))
+    away = np.linalg.norm(at + reach[:, None] * towards - position, axis=1)
+    return bool((away - _corner_error(scan, reach) <= within).any())
 
 
 def half_spaces(

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import FARTHEST
 from brakeline.messaging.range_image import RangeImage
-from brakeline.messaging.scan import Scan
+from brakeline.messaging.scan import MAX_BEAMS, Scan
 from brakeline.safety.perception.occlusion_exits import minimum_by_sector
-from brakeline.safety.perception.scan_coverage import gaps
+from brakeline.safety.perception.scan_coverage import WIDE, gaps
 from brakeline.safety.perception.scan_tracking import ScanTracker
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ SPACING = 0.04  # m, or a quarter of it in rad: smallest motion between two stor
 REACH = 1.0  # m along a beam that the memory is asked about
 STEP = 0.01  # m between the tested points of a beam
 SECTORS = 360  # of a turn
+LEFT_OUT = math.radians(15.0)  # between two beams: in a wider gap, the memory adds beams
 VERY_OLD = FARTHEST  # s: the largest age that a scan can have
 
 
@@ -176,7 +177,8 @@ class FanMemory(VisibilityMemory[Scan]):
         self._tracker.reset()  # a longer time would make motions look slower
 
     def fill(self, scan: Scan | None, elapsed: float) -> Scan:
-        """Fill in the scan, and add the motions that `ScanTracker` knows."""
+        """Fill in the scan, also where it has no beams, and add the motions that `ScanTracker` knows."""
+        scan = None if scan is None else _whole_turn(scan)
         filled = super().fill(scan, elapsed)
         if scan is None:
             return filled
@@ -226,6 +228,20 @@ class FanMemory(VisibilityMemory[Scan]):
         low = stored.minima[level, first % SECTORS]
         high = stored.minima[level, (first + count - (1 << level)) % SECTORS]
         return np.asarray(far + drift < np.minimum(low, high))
+
+
+def _whole_turn(scan: Scan) -> Scan:
+    """Return the scan with beams without information where it has no beams, as behind a sensor of 270°."""
+    if not len(scan.angles) or scan.tracks is not None:
+        return scan
+    gap = np.diff(scan.angles, append=scan.angles[0] + math.tau)
+    parts = np.where(gap > LEFT_OUT, np.ceil(gap / WIDE), 1.0).astype(int)
+    if not len(scan.angles) < parts.sum() <= MAX_BEAMS:
+        return scan
+    beam = np.repeat(np.arange(len(gap)), parts)
+    number = np.arange(len(beam)) - np.repeat(np.cumsum(parts) - parts, parts)
+    angles = scan.angles[beam] + number * (gap / parts)[beam]
+    return replace(scan, ranges=np.where(number == 0, scan.ranges[beam], 0.0), angles=angles)
 
 
 def _range_minima(least: Array) -> Array:

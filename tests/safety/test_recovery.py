@@ -8,13 +8,14 @@ import pytest
 
 from brakeline.deploy.data.environment_episodes import collect
 from brakeline.messaging.obstacle import Obstacle, Shapes
+from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Disc
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.scan import Scan
 from brakeline.safety.action_mapping import normalised
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.recovery import least_violating, lexicographically_less, slow_inputs
-from brakeline.safety.filter.request import RECOVERING
+from brakeline.safety.filter.request import FAILSAFE, RECOVERING
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
@@ -121,6 +122,25 @@ def test_no_way_out_is_known_where_a_scan_shows_nothing(ready, ranges, least):
                 assert decision.kind != RECOVERING or distance < least, (at, decision.plan)
                 if distance > least:
                     assert decision.kind == "failsafe" and not decision.plan.any()
+
+
+@pytest.mark.parametrize("ahead", [-0.05, -0.02, 0.05])
+@pytest.mark.parametrize("degrees", [90, 135])
+def test_no_way_leads_out_of_space_about_which_a_scan_has_no_information(ready, ahead, degrees):
+    """A robot whose sensor does not see behind it once crept ahead without end, and without a proposal to drive."""
+    fan = np.radians(np.arange(-degrees, degrees + 1.0))
+    free = Scan(np.full(len(fan), 3.5), fan, pose=(0.0, 0.0, 0.0), mount=(ahead, 0.0))
+    decision = ready.decide(request((0, 0, 0, 0, 0), (0.0, 0.0), scan=free))
+    assert decision.margin < 0.0 and decision.kind == FAILSAFE and not decision.plan.any()
+
+
+def test_no_way_leads_out_of_space_about_which_a_range_image_has_no_information():
+    """An image without beams down once had a hovering aircraft climb."""
+    rings = np.radians(np.arange(-12.0, 91.0, 2.0))
+    known = {"low": rings[0], "high": rings[-1], "mount": (0.0, 0.0, -0.1)}
+    blind = RangeImage(np.full((len(rings), 180), 20.0), (0.0, 0.0, 5.0), **known)
+    answer = InProcess(Filter.load("quadrotor")).decide([0.0, 0.0, 5.0, *[0.0] * 6], np.zeros(3), scan=blind)
+    assert answer.margin < 0.0 and answer.kind == FAILSAFE and not answer.plan.any()
 
 
 @pytest.fixture(scope="module")

@@ -175,6 +175,22 @@ def test_a_mutated_bound_loses_the_person(monkeypatch, kind, name, mutant):
     assert any(outside(np.random.default_rng(seed), kind) > 0.02 for seed in range(25))
 
 
+def test_what_no_beam_hits_may_be_faster_than_the_surfaces_behind_it():
+    """Between two beams 2.9° apart, a box of the least width comes unseen to within 2 m, and stays in the cells."""
+    fan = np.linspace(-math.pi, math.pi, 124, endpoint=False)
+    between, memory = 0.5 * (fan[62] + fan[63]), FanMemory(GROUND.footprint)
+    way = np.array([math.cos(between), math.sin(between)])
+    known = {"far": FAR, "range_error": 0.0, "least_width": WIDTH, "speed": 2.0, "acceleration": PUSH}
+    for now in DT * np.arange(4):
+        at = (2.9 - 1.1 * now - 0.5 * PUSH * now**2) * way
+        ranges = cast([Obstacle("box", tuple(at), (WIDTH, WIDTH), between)], np.zeros(2), fan, 3.0)
+        assert (ranges == 3.0).all(), "of the wall behind it"
+        scan = memory.fill(Scan(ranges, fan, (0.0, 0.0, 0.0), **known), DT)
+    assert scan.tracks.track_index.all()
+    gone = 1.7 * 0.3 + 0.5 * PUSH * 0.3**2 + 2.0 * 0.3  # in 0.6 s, from 1.7 m/s on
+    assert away((at - (gone + 0.5 * WIDTH) * way)[None], occupied_cells(scan, 2.5), 0.6)[0] <= 0.0
+
+
 # --- tracks ----------------------------------------------------------------------------------
 
 
@@ -212,6 +228,20 @@ def test_the_tracker_separates_standing_surfaces_from_moving_groups():
     at = np.column_stack([np.cos(FAN), np.sin(FAN)]) * scan.ranges[:, None]
     (moved,) = set(which[np.linalg.norm(at - there, axis=1) < SIZE + 0.05]) - {0, stood}
     assert np.linalg.norm(ways[moved - 1, :2] - velocity) < 0.15 and ways[moved - 1, 2] < 0.5
+
+
+def test_a_group_that_comes_into_the_field_of_view_has_no_velocity_yet():
+    """The middle of what is seen of it is slower than the group itself."""
+    memory, rng, across = FanMemory(GROUND.footprint), np.random.default_rng(0), np.array([1.0, 0.0])
+    ahead, tracked = np.abs(FAN) < math.radians(135.5), 0
+    for k in range(12):
+        at = np.array([-1.6, 0.8]) + k * DT * across
+        whole = taken([*ROOM, Obstacle("cylinder", tuple(at), (0.38,))], np.zeros(2), rng)
+        scan = memory.fill(replace(whole, ranges=whole.ranges[ahead], angles=whole.angles[ahead]), DT)
+        for motion in scan.tracks.motions[np.abs(scan.tracks.motions[:, 0]) > 0.1]:
+            tracked += 1
+            assert np.linalg.norm(motion[:2] - across) <= motion[2] + 0.1  # the pose has errors, too
+    assert tracked > 0
 
 
 def test_an_ambiguous_group_is_not_tracked():

@@ -34,26 +34,39 @@ def taken(obstacles, pose, rng, error=0.01, turn=0.02, speed=0.0):
     return Scan(ranges, FAN, seen, far=FAR, least_width=WIDTH, speed=speed, **known)
 
 
+def without_beams_behind(scan):
+    """Return the scan of a sensor that has no beams where this one's measure nothing."""
+    return replace(scan, ranges=scan.ranges[~BEHIND], angles=scan.angles[~BEHIND])
+
+
 @settings(max_examples=8, deadline=None)
-@given(st.integers(0, 100_000))
-def test_space_that_memory_shows_to_be_free_is_free(seed):
+@given(st.integers(0, 100_000), st.booleans())
+def test_space_that_memory_shows_to_be_free_is_free(seed, cut):
     rng = np.random.default_rng(seed)
     obstacles = scene(rng, 8)
     shapes = Shapes.of(obstacles, 2)
     memory, pose, remembered = FanMemory(BODY), np.array([0.0, 0.0, rng.uniform(-3, 3)]), 0
     for _ in range(12):
-        scan = taken(obstacles, pose, rng)
+        scan = without_beams_behind(taken(obstacles, pose, rng)) if cut else taken(obstacles, pose, rng)
         filled = memory.fill(scan, 0.2)
-        new = ~scan.valid_beams & filled.valid_beams
+        measured = np.isin(filled.angles, scan.angles[scan.valid_beams])
+        new = ~measured & filled.valid_beams
         remembered += int(new.sum())
-        true = cast(obstacles, pose[:2], FAN[new] + pose[2])
+        true = cast(obstacles, pose[:2], filled.angles[new] + pose[2])
         assert (filled.ranges[new] - scan.range_error <= true + 1e-9).all()
-        assert np.array_equal(filled.ranges[scan.valid_beams], scan.ranges[scan.valid_beams])
+        assert np.array_equal(filled.ranges[measured], scan.ranges[scan.valid_beams])
         ahead = pose + 0.05 * np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
         if shapes.distance(ahead[:2]).min() > BODY:
             pose = ahead
         pose[2] += rng.uniform(-0.3, 0.3)
     assert remembered > 0
+
+
+def test_a_scan_keeps_its_beams_where_they_leave_nothing_out():
+    for angles in (FAN[::10], np.radians([0.0, 10.0, 350.0]), np.linspace(0.0, 6.0, 1000)):
+        scan = Scan(np.ones(len(angles)), angles, (0.0, 0.0, 0.0))
+        added = len(FanMemory(BODY).fill(scan, 0.2).angles) - len(angles)
+        assert added == (340 // 3 if len(angles) == 3 else 0), "at most 3° apart, and 1000 beams in all"
 
 
 def empty(x=0.0, speed=0.0):
@@ -62,12 +75,14 @@ def empty(x=0.0, speed=0.0):
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.6])
-def test_memory_fills_a_blind_sector_after_driving_ahead_and_fades_in_a_moving_world(speed):
+@pytest.mark.parametrize("cut", [False, True])
+def test_memory_fills_a_blind_sector_after_driving_ahead_and_fades_in_a_moving_world(speed, cut):
     memory = FanMemory(0.105)
     for k in range(20):
-        filled = memory.fill(empty(0.05 * k, speed), 0.2)
+        scan = empty(0.05 * k, speed)
+        filled = memory.fill(without_beams_behind(scan) if cut else scan, 0.2)
     if speed:
-        assert not filled.valid_beams[BEHIND].any()
+        assert not filled.valid_beams[np.abs(filled.angles) > math.radians(150.5)].any()
     else:
         angles, _, free = gaps(filled)
         assert free[np.abs(angles) > math.pi - 0.3].min() > 0.3

@@ -1,5 +1,6 @@
 """The obstacles of a scan contain everything that a beam may have hit."""
 
+import itertools
 import math
 
 import numpy as np
@@ -10,13 +11,14 @@ from hypothesis import strategies as st
 from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadScan
-from brakeline.messaging.obstacle import Shapes
+from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.ground_realtime import SpinningLidar
 from brakeline.sim.lidar import Lidar
 from tests.actors.ros2.test_ros_inputs import BEAMS, scan_of
 from tests.robots import GROUND
+from tests.safety.ray_casting import cast
 
 MOUNT = PlanarPose(-0.032, 0.0, 0.0)
 ERRORS = HitErrors.of(GROUND, 0.02)
@@ -64,6 +66,21 @@ def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():
             assert shapes.distance(points).min(axis=0).max() <= 1e-9
 
 
+@pytest.mark.parametrize("signs", list(itertools.product((-1.0, 1.0), repeat=4)))
+def test_obstacles_contain_the_hits_of_a_lidar_off_centre_with_the_largest_errors(signs):
+    """An error of the heading also moves a lidar that is mounted away from the robot's position."""
+    mount, angles, *off = PlanarPose(0.6, -0.5), 2.0 * math.pi * np.arange(BEAMS) / BEAMS, *signs
+    heading, place = off[2] * GROUND.measurement_bound[2], np.array(off[:2]) * GROUND.measurement_bound[:2]
+    directions = rotate(np.stack([np.cos(angles), np.sin(angles)], axis=1), heading)
+    sensor = place + rotate(np.array([mount.x, mount.y]), heading)
+    around = 2.0 * math.pi * np.arange(24) / 24
+    posts = [Obstacle(CYLINDER, tuple(sensor + 0.25 * np.array([math.cos(a), math.sin(a)])), (0.02,)) for a in around]
+    ranges = cast(posts, sensor, directions, 3.5)
+    shapes = Shapes.of(obstacles_of(scan_of(ranges + off[3] * ERRORS.range), mount=mount), dim=2)
+    hits = (sensor + ranges[:, None] * directions)[ranges < 3.5]
+    assert len(hits) > 100 and shapes.distance(hits).min(axis=0).max() <= 1e-9
+
+
 def test_a_room_is_few_obstacles_and_its_middle_is_free():
     angles = 2.0 * math.pi * np.arange(BEAMS) / BEAMS
     square = 0.8 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
@@ -90,26 +107,47 @@ def test_a_gap_that_the_body_cannot_pass_is_occupied():
     assert apart.distance(np.array([[0.5, 0.0]])).min() > 0.1
 
 
-@pytest.mark.parametrize("blind", [math.nan, 0.0, 0.05, -math.inf, -1.0])
-def test_a_blind_beam_makes_an_obstacle_at_the_body(blind):
+@pytest.mark.parametrize("near", [0.05, -math.inf])
+@pytest.mark.parametrize("mount", [PlanarPose(), PlanarPose(0.05, 0.08)])
+def test_what_is_too_near_to_be_measured_touches_the_body_where_the_beam_leaves_it(near, mount):
     ranges = np.full(BEAMS, math.inf)
-    assert obstacles_of(scan_of(ranges)) == ()
-    ranges[90] = blind
-    shapes = Shapes.of(obstacles_of(scan_of(ranges)), dim=2)
-    assert shapes.distance(np.array([[0.0, GROUND.footprint + 0.005]])).min() == 0.0
+    assert obstacles_of(scan_of(ranges), mount=mount) == ()
+    ranges[90] = near
+    shapes = Shapes.of(obstacles_of(scan_of(ranges), mount=mount), dim=2)
+    leaves = np.array([mount.x, math.sqrt(GROUND.footprint**2 - mount.x**2)])
+    assert shapes.distance(leaves * (1.0 + 0.005 / GROUND.footprint)) == 0.0
     assert shapes.distance(np.zeros((1, 2))).min() >= GROUND.footprint - 1e-9
+
+
+def test_what_a_lidar_outside_the_body_is_too_near_to_is_at_the_lidar():
+    ranges = np.full(BEAMS, math.inf)
+    ranges[180] = -math.inf
+    (touching,) = obstacles_of(scan_of(ranges), mount=PlanarPose(0.0, 0.2))
+    assert touching.position[0] == pytest.approx(0.0) and touching.position[1] > GROUND.footprint
+
+
+@pytest.mark.parametrize("blind", [math.nan, 0.0, -1.0])
+def test_a_beam_without_information_is_refused(blind):
+    """Anything may be there, and an obstacle in its place would have the filter lead the robot away from it."""
+    ranges = np.full(BEAMS, math.inf)
+    ranges[[90, 200]] = blind
+    with pytest.raises(BadScan, match=f"no information in 2 of {BEAMS} directions"):
+        read(scan_of(ranges))
 
 
 def test_zero_is_free_only_if_the_settings_say_so():
     assert obstacles_of(scan_of(np.zeros(BEAMS)), zero_is_free=True) == ()
-    assert obstacles_of(scan_of(np.zeros(BEAMS))) != ()
+    with pytest.raises(BadScan, match="no information"):
+        obstacles_of(scan_of(np.zeros(BEAMS)))
 
 
-def test_a_direction_without_a_beam_is_occupied():
-    fan = scan_of(np.full(180, math.inf), angle_min=-0.5 * math.pi, angle_increment=math.pi / 179)
-    shapes = Shapes.of(obstacles_of(fan), dim=2)
-    assert shapes.distance(np.array([[-0.12, 0.0]])).min() == 0.0
-    assert shapes.distance(np.array([[0.3, 0.0]])).min() > 0.1
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_scan_that_leaves_out_directions_is_refused(sign):
+    step = sign * math.pi / 180
+    with pytest.raises(BadScan, match="no information in 90 of 360 directions"):
+        read(scan_of(np.full(270, math.inf), angle_min=-135.0 * step, angle_increment=step))
+    for beams in (359, 360, 361):  # rounding, and beams that repeat the first
+        read(scan_of(np.full(beams, math.inf), angle_min=0.0, angle_increment=sign * 2.0 * math.pi / 359.4))
 
 
 def test_space_beyond_a_short_range_sensor_is_occupied():

@@ -259,6 +259,17 @@ def test_the_message_names_the_missing_input():
         bare.obstacles(np.zeros(2), 10.1)
 
 
+def test_a_scan_that_does_not_show_all_directions_counts_as_missing(inputs):
+    """The robot then brakes. Obstacles in their places once led it away from them, at 0.075 m/s and without end."""
+    fan = {"angle_min": -0.75 * math.pi, "angle_increment": math.pi / 180}
+    for scan, unknown in ((scan_of(np.full(270, math.inf), **fan), 90), (scan_of(np.full(BEAMS, math.nan)), BEAMS)):
+        inputs.on_scan(scan)
+        with pytest.raises(InputMissing, match=f"no valid scan: it has no information in {unknown} of 360 directions"):
+            inputs.obstacles(np.zeros(2), 10.05)
+    inputs.on_scan(scan_of(np.full(BEAMS, math.inf)))
+    assert inputs.obstacles(np.zeros(2), 10.05) == ()
+
+
 def test_without_a_child_frame_the_lidar_has_no_place():
     """A lidar that looks backwards would show a wall ahead as one behind if its place counted as the robot's centre."""
     bare = RosInputs(ROBOT, SensorSettings(), AgeLimits())
