@@ -1,6 +1,7 @@
 """When the certifier makes a new model set of a robot that has changed, from which driving, and when it refuses."""
 
 import os
+import subprocess
 import threading
 from dataclasses import replace
 from functools import cache
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.certification import certify, certify_update
+from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run import adaptation, adaptation_process
 from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
 from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
+from brakeline.deploy.run.processes import UNFINISHED
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
 from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
@@ -365,6 +368,32 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     assert TrustedSigners.load(tmp_path).open(signed, ROBOT.name).version == message.version
     assert process.figures[f"published {ROBOT.name}"] == process.figures[f"refused {ROBOT.name}"] == 1.0
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
+
+
+FITTING = """
+import threading
+import numpy as np
+from proxsuite import proxqp
+from brakeline.deploy.run.adaptation_process import _leave
+
+def fit():
+    while True:
+        qp = proxqp.dense.QP(40, 0, 40)
+        qp.init(np.eye(40), np.ones(40), None, None, np.eye(40), -np.ones(40), np.ones(40))
+        qp.solve()
+        begun.set()
+
+begun, worker = threading.Event(), threading.Thread(target=fit, daemon=True)
+worker.start()
+begun.wait()
+_leave(worker)
+"""
+
+
+def test_a_certifier_that_is_asked_to_end_in_a_fit_ends_without_an_abort():
+    """A real one printed "terminate called without an active exception", or what the solver leaked."""
+    done = subprocess.run([*PYTHON, "-c", FITTING], check=False, capture_output=True, text=True, timeout=60.0)
+    assert (done.returncode, done.stderr) == (UNFINISHED, "")
 
 
 @pytest.mark.parametrize("leaves", [False, True])
