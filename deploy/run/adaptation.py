@@ -315,9 +315,13 @@ def _check_coverage(in_use: ModelSet, data: Dataset) -> None:
     there: of the windows of a quadrotor with a payload that flew faster again, 15 % left sets that stated 2.9 %.
     """
     ranges, recorded = np.ptp(in_use.domain, axis=0), np.ptp(recorded_domain(data), axis=0)
-    covered = float((recorded / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
-    if covered < DOMAIN:
-        raise BadData(f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}")
+    shares = np.divide(recorded, ranges, out=np.full(len(ranges), np.inf), where=ranges > 0.0)
+    if shares.min() < DOMAIN:
+        robot, narrowest = in_use.robot, int(shares.argmin())
+        name = [*(robot.state[k] for k in robot.regressor), *robot.action][narrowest]
+        raise BadData(
+            f"the driving covers {shares.min():.0%} of the range of {name} in the set in use, not {DOMAIN:.0%}"
+        )
 
 
 def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:
