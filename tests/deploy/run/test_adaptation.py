@@ -16,7 +16,7 @@ import pytest
 from brakeline.deploy.data.certification import certify, certify_update
 from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run import adaptation, adaptation_process
-from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
+from brakeline.deploy.run.adaptation import NARROWER, REQUESTS, UPDATED, Adaptation, Recertification
 from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
 from brakeline.deploy.run.processes import UNFINISHED
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
@@ -230,9 +230,22 @@ def test_a_looser_or_an_unproven_set_is_refused_with_the_reason(kind, why, widen
 
 
 def test_driving_that_is_too_narrow_makes_no_set(kind):
+    (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.4), widening=8.0)
+    assert attempt.model is None and re.search(r"of the range of \w+ .*\[.+\] in the set in use, not 50%", attempt.text)
+
+
+def test_narrow_driving_makes_a_set_that_keeps_the_robot_within_it():
     """An update would keep the range of the set in use, where the new driving shows nothing."""
-    (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.5), widening=8.0)
-    assert attempt.model is None and re.search(r"of the range of \w+ .*\[.+\] in the set in use, not 75%", attempt.text)
+    sets = {"old": in_use()}
+    (attempt,) = drive(Adaptation(ROBOT, sets.__getitem__, ACCEPTED), driven(2, 7, slip=-0.15, share=0.6), widening=8.0)
+    new = attempt.model
+    assert new.about[NARROWER] and "a fit to this driving" in attempt.text and "of its range" in attempt.text
+    assert (np.ptp(new.domain, axis=0) < UPDATED * np.ptp(in_use().domain, axis=0)).any()
+    assert share_outside(new, Dataset(ROBOT, driven(3, 6, slip=-0.15, share=0.6))) <= float(new.about["bound_plan"])
+    sets["new"] = new
+    kind = Adaptation(ROBOT, sets.__getitem__, ACCEPTED)
+    (again,) = drive(kind, driven(4, 7, slip=-0.3, share=0.4), widening=8.0, version="new")
+    assert again.model is None and "not 75%" in again.text, "it would become slower with each set"
 
 
 def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
