@@ -29,15 +29,24 @@ class Motion:
 
     >>> Motion(velocity=(0.5, 0.0), position_error=0.03, velocity_error=0.05, acceleration=2.0).radius(0.0)
     0.03
+
+    Attributes:
+        velocity: (d,) measured [m/s].
+        position_error: δ_p, largest error of the measured position [m].
+        velocity_error: δ_v, largest error of the measured velocity [m/s].
+        acceleration: a, largest acceleration [m/s²].
+        speed: s, largest speed in any direction [m/s].
+        age: time since the measurement [s].
+        before: the previous measurement; None: this is the first one.
     """
 
-    velocity: tuple[float, ...]  # measured [m/s]
-    position_error: float  # δ_p [m]
-    velocity_error: float = 0.0  # δ_v [m/s]
-    acceleration: float | None = None  # a [m/s²]
-    speed: float | None = None  # s [m/s]
-    age: float = 0.0  # time since the measurement [s]
-    before: Sighting | None = None  # None: this is the first measurement
+    velocity: tuple[float, ...]
+    position_error: float
+    velocity_error: float = 0.0
+    acceleration: float | None = None
+    speed: float | None = None
+    age: float = 0.0
+    before: Sighting | None = None
 
     def problem(self, dim: int) -> str:
         """Return the reason why this is no valid motion of an obstacle with `dim` coordinates; empty if it is valid."""

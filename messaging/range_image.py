@@ -40,22 +40,38 @@ class RangeImage:
     >>> image = RangeImage(ranges=np.full((45, 90), 20.0), at=(0.0, 0.0, 1.0))
     >>> [round(math.degrees(angle), 2) for angle in image.step]
     [4.09, 4.0]
+
+    Attributes:
+        ranges: (E, A) [m]. `far` means no hit; 0 means no information.
+        at: measured position of the robot at the time of the image [m].
+        attitude: unit quaternion w, x, y, z: world from sensor.
+        low: elevation of the lowest ring [rad].
+        high: elevation of the highest ring [rad].
+        mount: position of the sensor in its own frame [m].
+        far: largest range of the sensor [m].
+        range_error: largest error of a range [m].
+        position_error: largest error of `at` [m].
+        angle_error: largest error of the attitude, the same rotation for all beams [rad].
+        least_width: see above [m].
+        doubt: number of beams, 0 or 1, that may miss an obstacle among any four neighbouring beams.
+        speed: largest speed of the surfaces that were hit [m/s]; 0: the world is static.
+        age: time since the image [s].
     """
 
-    ranges: Array  # (E, A) [m]; `far`: no hit; 0: no information
-    at: tuple[float, float, float]  # measured position of the robot at the time of the image [m]
-    attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # unit quaternion w, x, y, z: world from sensor
-    low: float = -0.5 * math.pi  # elevation of the lowest ring [rad]
-    high: float = 0.5 * math.pi  # elevation of the highest ring [rad]
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)  # position of the sensor in its own frame [m]
-    far: float = 20.0  # largest range of the sensor [m]
-    range_error: float = 0.05  # largest error of a range [m]
-    position_error: float = 0.0  # largest error of `at` [m]
-    angle_error: float = 0.0  # largest error of the attitude, the same rotation for all beams [rad]
-    least_width: float = 0.5  # [m]
-    doubt: int = 0  # number of beams, 0 or 1, that may miss an obstacle among any four neighbouring beams
-    speed: float = 0.0  # largest speed of the surfaces that were hit [m/s]; 0: the world is static
-    age: float = 0.0  # time since the image [s]
+    ranges: Array
+    at: tuple[float, float, float]
+    attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    low: float = -0.5 * math.pi
+    high: float = 0.5 * math.pi
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    far: float = 20.0
+    range_error: float = 0.05
+    position_error: float = 0.0
+    angle_error: float = 0.0
+    least_width: float = 0.5
+    doubt: int = 0
+    speed: float = 0.0
+    age: float = 0.0
 
     def __eq__(self, other: object) -> bool:
         return same_values(self, other)

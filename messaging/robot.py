@@ -58,7 +58,9 @@ class Limit:
     2.0
 
     Attributes:
-        weights: (n,), one for each state coordinate.
+        name: the name that messages give.
+        weights: (n,), one for each state coordinate, in the order of the description.
+        most: largest value of `weights · state`; with one weight of 1, in the unit of that coordinate.
     """
 
     name: str

@@ -93,22 +93,39 @@ class Scan:
     >>> scan = Scan(ranges=np.full(360, 3.5), angles=np.radians(np.arange(360)), pose=(0.0, 0.0, 0.0))
     >>> bool(scan.valid_beams.all())
     True
+
+    Attributes:
+        ranges: (R,) [m]. `far` means no hit; 0 or NaN means no information.
+        angles: (R,) in the sensor's frame, ascending, over less than a turn [rad].
+        pose: measured pose of the robot at the time of the scan: x, y [m], heading [rad].
+        mount: position of the sensor in the robot's frame [m].
+        far: largest range of the sensor [m].
+        range_error: largest error of a range [m].
+        position_error: largest error of the pose's position [m].
+        heading_error: largest error of the pose's heading [rad].
+        least_width: see above [m].
+        doubt: number of beams on either side that must agree that space is free, against single false ranges.
+        speed: largest speed of the surfaces that were hit [m/s]; 0: the world is static.
+        age: time since the scan [s].
+        acceleration: largest acceleration of moving obstacles [m/s²]; 0: unknown.
+        least_radius: least radius of moving obstacles [m].
+        tracks: the tracks of the surfaces that the beams hit; None without tracking.
     """
 
-    ranges: Array  # (R,) [m]; `far`: no hit; 0 or NaN: no information
-    angles: Array  # (R,) in the sensor's frame, ascending, over less than a turn [rad]
-    pose: tuple[float, float, float]  # measured pose of the robot at the time of the scan: x, y [m], heading [rad]
-    mount: tuple[float, float] = (0.0, 0.0)  # position of the sensor in the robot's frame [m]
-    far: float = 3.5  # largest range of the sensor [m]
-    range_error: float = 0.02  # largest error of a range [m]
-    position_error: float = 0.0  # largest error of the pose's position [m]
-    heading_error: float = 0.0  # largest error of the pose's heading [rad]
-    least_width: float = 0.1  # [m]
-    doubt: int = 0  # number of beams on either side that must agree that space is free, against single false ranges
-    speed: float = 0.0  # largest speed of the surfaces that were hit [m/s]; 0: the world is static
-    age: float = 0.0  # time since the scan [s]
-    acceleration: float = 0.0  # largest acceleration of moving obstacles [m/s²]; 0: unknown
-    least_radius: float = 0.0  # least radius of moving obstacles [m]
+    ranges: Array
+    angles: Array
+    pose: tuple[float, float, float]
+    mount: tuple[float, float] = (0.0, 0.0)
+    far: float = 3.5
+    range_error: float = 0.02
+    position_error: float = 0.0
+    heading_error: float = 0.0
+    least_width: float = 0.1
+    doubt: int = 0
+    speed: float = 0.0
+    age: float = 0.0
+    acceleration: float = 0.0
+    least_radius: float = 0.0
     tracks: BeamTracks | None = None
 
     def __eq__(self, other: object) -> bool:

@@ -24,7 +24,7 @@ class ImportCommand:
     """The options of `brakeline import`."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Import these logs: CSV, Parquet, ROS bags, logs of ArduPilot, PX4 and of own runs (docs/data.md)."""
+    """Import these logs: CSV, JSON, Parquet, ROS bags, ArduPilot or PX4 logs, or Brakeline runs (docs/data.md)."""
     robot: str = "ground"
     """Read the log of this robot. Give its name, or the path of a description (.toml)."""
     out: Path | None = None

@@ -80,8 +80,9 @@ class FilterClient(Protocol):
         """Request the decision on an action and commit to its plan. Then execute `answer.action`.
 
         Args:
-            state: (n,) measured.
-            action: (m,) proposed. If it holds NaN or infinity, the decision is a failsafe.
+            state: (n,) measured, in the order and the units of the robot's description (`Robot.state`).
+            action: (m,) proposed, in the order and the units of the description (`Robot.action`). If it holds NaN or
+                infinity, the decision is a failsafe.
             obstacles: at least those within reach (1 m is enough for `ground`).
             scan: a sensor's measurement, instead of obstacles or in addition: a `Scan`, or a `RangeImage` in space.
                 Fill it in with `brakeline.filled` first.
