@@ -15,9 +15,8 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
-from brakeline.sim.autopilot.hil_sensors import SensorNoise
 from brakeline.sim.quadrotor import QUADROTOR, Quadrotor
-from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.sim_conditions import Conditions, SensorNoise
 from brakeline.sim.vehicle import MakeVehicle
 
 

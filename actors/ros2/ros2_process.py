@@ -18,8 +18,9 @@ import numpy as np
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings, Topics
 from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
-from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
+from brakeline.actors.ros2.ros_inputs import RosInputs
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, Mismatch, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
@@ -46,28 +47,6 @@ RESEND = 0.05  # s after which an input is sent again
 SILENCE = 0.5  # s for which a simulation's clock may stand still
 LATE = 0.02  # s after a period's beginning, from which on an answer is too late
 DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision changes
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Names of topics, below the namespace unless they begin with a slash."""
-
-    odometry: str = "odom"
-    """Read nav_msgs/Odometry from this topic."""
-    scan: str = "scan"
-    """Read sensor_msgs/LaserScan from this topic."""
-    raw: str = "cmd_vel_raw"
-    """Read the commands to filter from this topic."""
-    command: str = "cmd_vel"
-    """Send the filtered commands to this topic."""
-    transforms: str = "/tf"
-    """Read transforms from this topic."""
-    fixed_transforms: str = "/tf_static"
-    """Read transforms that never change from this topic."""
-    diagnostics: str = "/diagnostics"
-    """Send diagnostic_msgs/DiagnosticArray to this topic."""
-    markers: str = "~/markers"
-    """Send what the filter sees and plans to this topic, as visualization_msgs/MarkerArray."""
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,11 @@ from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender, WallClock
 from brakeline.sim.autopilot.hil_link import HilLink
-from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from brakeline.sim.wind import Wind
 
 

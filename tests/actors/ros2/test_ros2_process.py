@@ -10,7 +10,8 @@ import pytest
 
 from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER
 from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings, driven
-from brakeline.actors.ros2.ros_inputs import AgeLimits, RawCommand, SensorSettings
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
+from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadRequest, Mismatch
