@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from brakeline.messaging.number_checks import check_numbers
+
 if TYPE_CHECKING:
     from brakeline.actors.ros2.sensor_frames import PlanarPose
 
@@ -55,3 +57,8 @@ class SensorSettings:
     mount: PlanarPose | None = None  # the lidar's pose on the robot; None: the transforms contain it
     odometry_frame: str = "odom"  # the frame of the state
     base_frame: str = ""  # the robot's frame in the transforms, which then replace the odometry; empty: they do not
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "range_error", least=0.0)
+        if self.mount is not None:
+            check_numbers(self.mount, "x", "y", "yaw", "tilt")
