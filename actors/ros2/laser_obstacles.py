@@ -115,9 +115,8 @@ def obstacles(
         points = sensor + beams.ranges[:, None] * directions
         radii = (beams.gap + errors.heading) * beams.ranges + errors.range + errors.position
         far = np.linalg.norm(points - around, axis=1) > robot.sight + EXTRA_SIGHT + radii
-    near = ~(
-        far | beams.blind
-    )  # also a hit whose place is not a number: no obstacle can be made of it, so nothing passes
+    # A hit whose place is NaN counts as near: it makes no obstacle, and without one nothing is decided.
+    near = ~(far | beams.blind)
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]
     hits = _joined(points[order], radii[order], 2.0 * robot.footprint)
