@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from importlib.util import find_spec
+
 from brakeline.errors import MissingExtra
 
 # pyproject.toml lists the same packages under [project.optional-dependencies].
@@ -19,8 +22,12 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 
 
-def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
-    """Return the error that names the extra to install, or None if no extra brings the missing package.
+def missing_extra(error: ModuleNotFoundError, needed: Collection[str] = ()) -> MissingExtra | None:
+    """Return the error that names the extras to install, or None if no extra brings the missing package.
+
+    Args:
+        error: names the package.
+        needed: all extras that the command needs. The error also names those of them that are not installed.
 
     >>> str(missing_extra(ModuleNotFoundError("No module named 'torch'", name="torch")))
     "torch is not installed. It comes with the extra `train`: pip install 'brakeline[train]'"
@@ -29,8 +36,18 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
     extras = [extra for extra, packages in EXTRAS.items() if package in packages]
     if not extras:
         return None
+    first = next((extra for extra in extras if extra in needed), extras[0])
+    if len(absent := [extra for extra in needed if extra == first or not _installed(extra)]) > 1:
+        names, install = " and ".join(f"`{extra}`" for extra in absent), f"pip install 'brakeline[{','.join(absent)}]'"
+        why = f"{package} is not installed. The command needs the extras {names}: {install}"
+        return MissingExtra(why, name=package)
     which = " or ".join(f"`{extra}`" for extra in extras)
     return MissingExtra(
         f"{package} is not installed. It comes with the extra {which}: pip install 'brakeline[{extras[0]}]'",
         name=package,
     )
+
+
+def _installed(extra: str) -> bool:
+    """Return whether all packages of an extra are installed."""
+    return all(find_spec(package) is not None for package in EXTRAS[extra])

@@ -1,8 +1,9 @@
 """Implement `brakeline COMMAND ...`. TABLE is THE table of commands, each with an example.
 
 Each command is a module `deploy/commands/NAME_command.py` with a dataclass `NameCommand`: its fields are the options,
-and its method `run` returns the exit status. The module is imported when the command runs, so that `--help` answers at
-once.
+and its method `run` returns the exit status. `extras` names the optional parts that it needs. The module is imported
+when the command runs, so that `--help` answers at once. It imports what an extra brings in `run`, so that `--help` and
+`completion` need no extra.
 """
 
 from __future__ import annotations
@@ -266,6 +267,7 @@ def main(arguments: list[str] | None = None) -> int:
         hint = f"; did you mean `{near[0]}`?" if near else ""
         errors.print(f"brakeline: no command is called {name!r}{hint} (`brakeline --help` lists them)", markup=False)
         return 2
+    command: Any = None
     try:
         command = parse(name, words[1:])
         with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
@@ -276,7 +278,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
-        if (missing := missing_extra(error)) is None:
+        if (missing := missing_extra(error, getattr(command, "extras", ()))) is None:
             raise
         errors.print(f"[red]brakeline {name}:[/] {escape(str(missing))}", soft_wrap=True)
         return 1

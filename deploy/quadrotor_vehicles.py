@@ -10,22 +10,24 @@ import numpy as np
 from brakeline.actors.mavlink.frame_log import FrameTap
 from brakeline.actors.mavlink.lockstep_quadrotor import LockstepQuadrotor
 from brakeline.actors.mavlink.px4_lockstep import QUIET, Px4Flight, Px4Vehicle
+from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.sim.arena import Arena
 from brakeline.sim.arena_generator import draw_arena
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
 from brakeline.sim.autopilot.endpoint import Autopilot
-from brakeline.sim.autopilot.hil_sensors import SensorNoise
+from brakeline.sim.delayed_vehicle import check_described
 from brakeline.sim.quadrotor import QUADROTOR, Quadrotor
-from brakeline.sim.sim_conditions import Conditions
+from brakeline.sim.sim_conditions import Conditions, SensorNoise
 from brakeline.sim.vehicle import MakeVehicle
 
 
-def embedded(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
+def embedded(conditions: Conditions, tap: FrameTap | None = None, robot: Robot = QUADROTOR) -> MakeVehicle:
     """Return the function that makes quadrotors behind simulated autopilots.
 
-    tap: is called with each MAVLink frame. Raises ValueError as `changes_of`.
+    tap: is called with each MAVLink frame. Raises ValueError as `changes_of`, and Mismatch as `check_described`.
     """
+    check_described(robot, QUADROTOR)
     noise, wind, changes = conditions.flight_noise, conditions.wind, changes_of(conditions)
     # The autopilot brakes when a setpoint is late by one control period.
     parameters = {SETPOINT_TIMEOUT["px4"]: QUADROTOR.period}
@@ -48,12 +50,13 @@ def changes_of(conditions: Conditions) -> dict[str, float]:
     return {name: getattr(conditions, name) for name in names if name in conditions.unusual}
 
 
-def behind_px4(conditions: Conditions, tap: FrameTap | None = None) -> MakeVehicle:
+def behind_px4(conditions: Conditions, tap: FrameTap | None = None, robot: Robot = QUADROTOR) -> MakeVehicle:
     """Return the function that makes quadrotors behind the real PX4 in `$BRAKELINE_PX4`. It flies all episodes.
 
     Raises:
-        ValueError: the variable is not set, or as `changes_of`.
+        ValueError: the variable is not set, or as `changes_of`. Mismatch: as `check_described`.
     """
+    check_described(robot, QUADROTOR)
     changes = changes_of(conditions)
     folder = os.environ.get("BRAKELINE_PX4")
     if not folder:

@@ -25,9 +25,13 @@ CONTACTS = ("contacts_moving", "contacts_standing", "contacts_robots")  # with m
 
 RUN_INTO = "contacts_standing"  # one episode may have several
 
+ENDS = ("goals", "collisions", *CONTACTS, "timeouts")  # how episodes end
+
+OWN_PROGRAM = "own program"  # the policy in a log of `RecordedClient`
+
 # Fields of `EpisodeStats` that are also figures: sums over the actors.
 COUNTS = (
-    *("goals", "collisions", *CONTACTS, "timeouts", "steps", "interventions", "adjusted", "for_clearance"),
+    *(*ENDS, "steps", "interventions", "adjusted", "for_clearance"),
     *("failsafes", "recovering", "fallbacks"),
 )
 
@@ -190,7 +194,7 @@ def intervals(figures: Figures, parts: Iterable[EpisodeStats]) -> dict[str, list
     rate = ClusteredProportion()
     for part in parts:
         rate.join(part.intervention_rate)
-    ends = {name: figures[name] for name in ("goals", "collisions", *CONTACTS, "timeouts") if name != RUN_INTO}
+    ends = {name: figures[name] for name in ENDS if name != RUN_INTO}
     by_name = {
         **{name: clopper_pearson(count, max(episodes, count)) for name, count in ends.items()},
         RUN_INTO: poisson(figures[RUN_INTO], episodes),

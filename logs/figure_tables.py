@@ -130,8 +130,12 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
     yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))
     if figures.get("refused"):
         yield "[red]steps that do not count[/]", f"{figures['refused']}: repeated, or not permitted by the learner"
-    yield "episodes", f"{episodes}" + known(", mean reward {:.2f}", figures["mean_reward"])
-    for name in ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts"):
+    stated = figures.get("outcomes_stated", True)
+    yield "episodes", f"{episodes}" + (known(", mean reward {:.2f}", figures["mean_reward"]) if stated else "")
+    if not stated:
+        yield "goals, collisions, rewards", NOT_STATED
+    ends = ("goals", "collisions", *(CONTACTS if figures["fleet"] else CONTACTS[:2]), "timeouts")
+    for name in ends if stated else ():
         text, interval = share(figures[name], episodes, within.get(name)), within.get(name)
         if name == RUN_INTO:  # several in one episode are possible, so it has an interval of the mean number
             text = f"{figures[name]}" + known(", 95 %: {0[0]:.2g} to {0[1]:.2g} in an episode", interval)
@@ -192,6 +196,7 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
             yield f"[red]{label}[/]", str(figures[name])
 
 
+NOT_STATED = "not recorded: the program did not call `record_outcome`, nor `reset` with an outcome"
 LEARNER = (
     "{updates} updates, critic loss {critic_loss:.4g}, actor loss {actor_loss:.4g}, weights v{weights_version}, "
     "staleness {staleness:.1f}, steps missing {missing}, duplicate {duplicates}"
@@ -206,9 +211,9 @@ def _runs(runs: dict[str, Figures]) -> Table:
             label,
             *(known("{}", run[name], "-") for name in setup),
             *(str(run[name]) for name in ("steps", "episodes")),
-            *(share(run[name], run["episodes"]) for name in ends),
+            *(share(run[name], run["episodes"]) if run["outcomes_stated"] else "not recorded" for name in ends),
             share(run["interventions"], run["steps"]),
-            known("{:.1f}", run["mean_reward"]),
+            known("{:.1f}", run["mean_reward"]) if run["outcomes_stated"] else "not recorded",
         )
         for label, run in runs.items()
     ]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from brakeline.logs.episode_sampler import SKETCHES, ActorBuffer, EpisodeSampler
-from brakeline.logs.episode_stats import Figures, closed_loop
+from brakeline.logs.episode_stats import ENDS, OWN_PROGRAM, Figures, closed_loop
 from brakeline.logs.intervention_map import InterventionMap
 from brakeline.logs.learning_curve import LearningCurve
 from brakeline.logs.mcap_container import LogChannel
@@ -145,8 +145,7 @@ class RunAnalysis:
         if setup["seed"] is not None and setup["seed"].lstrip("-").isdigit():
             setup["seed"] = int(setup["seed"])
         return {
-            **setup,
-            **closed_loop([metrics.actors[name] for name in sorted(metrics.actors)]),
+            **mark_outcomes(setup | closed_loop([metrics.actors[name] for name in sorted(metrics.actors)])),
             "seconds": metrics.seconds(),
             **{name: sum(topic[name] for topic in topics) for name in ("messages", "missing", "duplicates")},
             "files": len(log.paths),
@@ -172,6 +171,18 @@ def cuts_in(log: Log) -> list[str]:
     """Return the damage of a log that has been read, one line each."""
     jumps = [f"the recorder's clock jumped by {jump:+.0f} s: the figures leave that out" for jump in log.clock.jumps]
     return [*(str(cut) for cut in log.cuts), *jumps]
+
+
+def mark_outcomes(figures: Figures) -> Figures:
+    """Return figures with `outcomes_stated`: whether the log says how its episodes ended.
+
+    A program of your own states outcomes and rewards with `record_outcome` and `reset`. If it states none at all, their
+    counts are zero because nobody counted, so they have no intervals.
+    """
+    names = ("goals", "collisions", "mean_reward")
+    stated = figures["policy"] != OWN_PROGRAM or any(figures[name] for name in names)
+    nothing = {} if stated else {"intervals": figures["intervals"] | dict.fromkeys(ENDS)}
+    return figures | nothing | {"outcomes_stated": stated}
 
 
 def perception_in(conditions: Mapping[str, str]) -> str:
@@ -201,8 +212,7 @@ class LogAnalysis:
         prefixes = [part.prefix if len(self.parts) > 1 else "" for part in self.parts]
         merged = merge_runs({prefix: part.metrics for prefix, part in zip(prefixes, self.parts, strict=True)})
         return {
-            **_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP),
-            **merged,
+            **mark_outcomes(_common([{name: run[name] for name in SETUP} for run in rows.values()], SETUP) | merged),
             "training": {
                 prefix + robot: part.training[robot].figures()
                 for prefix, part in zip(prefixes, self.parts, strict=True)

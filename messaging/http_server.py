@@ -112,7 +112,11 @@ class BoundedServer(ThreadingHTTPServer):
         if not 0 <= address[1] <= LARGEST_PORT:  # the socket would raise an OverflowError
             raise OSError(f"{address[1]} is no port: ports are 0 to {LARGEST_PORT}")
         self.slots = ConnectionSlots()
-        super().__init__(address, handler)
+        try:
+            super().__init__(address, handler)
+        except OSError as error:
+            why = f"{error.strerror}: cannot listen at {address[0]}:{address[1]}, give another port"
+            raise OSError(error.errno, why) from error
         self.hosts = (address[0], socket.gethostname())
         self.checked_port = int(self.server_address[1]) if own_port else None
 

@@ -62,6 +62,14 @@ class Obstacle:
     motion: Motion | None = None
 
     def __post_init__(self) -> None:
+        try:
+            self._check()
+        except BadShape:
+            raise
+        except (TypeError, ValueError, AttributeError) as error:  # a field has another type
+            raise self._wrong_type() from error
+
+    def _check(self) -> None:
         if self.kind not in KINDS:
             raise BadShape("kind", f"no obstacle is called {self.kind!r}; there are: {', '.join(KINDS)}")
         for name, values in (("position", self.position), ("size", self.size)):
@@ -85,6 +93,14 @@ class Obstacle:
             )
         if self.motion is not None and (problem := self.motion.problem(dim)):
             raise BadShape("motion", problem)
+
+    def _wrong_type(self) -> BadShape:
+        """Return the error that names the first field without the numbers that belong there."""
+        numbers = {"position": self.position, "size": self.size, "yaw": (self.yaw,), "margin": (self.margin,)}
+        for name, values in numbers.items():
+            if wrong := [value for value in values if not isinstance(value, int | float | np.number)]:
+                return BadShape(name, f"an obstacle's {name} needs numbers, not {wrong[0]!r:.80}")
+        return BadShape("motion", f"an obstacle's motion is a Motion of numbers or None, not {self.motion!r:.80}")
 
 
 @dataclass(frozen=True, eq=False)

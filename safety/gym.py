@@ -104,15 +104,20 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @classmethod
     def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:
-        """Wrap an environment with the model in a file; how: the keyword arguments of the constructor.
+        """Wrap an environment with a model; how: the keyword arguments of the constructor.
+
+        Args:
+            model: the path of a model set or of a rival's model, or the name of a shipped robot (`"ground"`,
+                `"quadrotor"`).
 
         Raises:
-            BadModel: the file holds no model.
+            BadModel: the file holds no model, or no shipped robot has that name.
             TooLoose, Mismatch: see the constructor.
         """
         from brakeline.safety.methods import load, ready  # a client of a service needs no solver
+        from brakeline.safety.model.model_set import path_of_model
 
-        return cls(env, ready(load(Path(model))), penalty, **how)
+        return cls(env, ready(load(path_of_model(model))), penalty, **how)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from inspect import signature
+
 import numpy as np
 
+from brakeline.errors import Mismatch
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import RobotWithTask
@@ -47,12 +50,34 @@ def delayed(make: MakeVehicle, robot: Robot) -> MakeVehicle:
 def simulated_vehicle(robot: RobotWithTask, conditions: Conditions, tap: object = None) -> MakeVehicle:
     """Return a function that makes the vehicles of a robot's task under some conditions.
 
-    A robot in real time gets delayed vehicles. A simulator behind MAVLink calls `tap` with every frame.
+    A robot in real time gets delayed vehicles. A simulator behind MAVLink calls `tap` with every frame. A simulator
+    that has an argument `robot` gets the robot, and can refuse what it cannot simulate.
 
     Raises:
         UnknownTask: the code that the task names cannot be loaded.
+        Mismatch: the simulator moves another robot than the one that the description states.
     """
     if robot.late:
         return delayed(simulated_vehicle(robot.in_lockstep(), conditions, tap), robot)
-    make: MakeVehicle = robot.task.code(robot.task.simulator)(conditions, tap)
+    code = robot.task.code(robot.task.simulator)
+    described = {"robot": robot} if "robot" in signature(code).parameters else {}
+    make: MakeVehicle = code(conditions, tap, **described)
     return make
+
+
+def check_described(robot: Robot, simulated: Robot) -> None:
+    """Raise Mismatch if a simulator of the robot `simulated` can't move as the description of `robot` states."""
+    (low, high), (least, most) = robot.bounds, simulated.bounds
+    sizes = [(one.state_dim, one.action_dim) for one in (robot, simulated)]
+    if sizes[0] != sizes[1]:
+        why = f"has {sizes[1][0]} coordinates and {sizes[1][1]} inputs, not {sizes[0][0]} and {sizes[0][1]}"
+    elif robot.period != simulated.period:
+        why = f"has a period of {simulated.period:g} s, not {robot.period:g} s"
+    elif (low < least).any() or (high > most).any() or (robot.slew > simulated.slew).any():
+        why = "clips inputs to narrower bounds or to a smaller slew"
+    else:
+        return
+    raise Mismatch(
+        f"{robot.name}: the simulated {simulated.name} {why}: correct the description, or name another simulator in "
+        "the task file"
+    )

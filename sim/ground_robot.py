@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 
 from brakeline.messaging.obstacle import Array
-from brakeline.messaging.robot import robot_named
+from brakeline.messaging.robot import Robot, robot_named
 from brakeline.sim.arena import Arena
+from brakeline.sim.delayed_vehicle import check_described
 from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
@@ -223,8 +224,12 @@ class GroundRobot(TurtleBot):
         return collision
 
 
-def simulated(conditions: Conditions, tap: object = None) -> MakeVehicle:
-    """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`)."""
+def simulated(conditions: Conditions, tap: object = None, robot: Robot = GROUND) -> MakeVehicle:
+    """Return a function that makes this task's vehicles (`brakeline.messaging.task.Task.simulator`).
+
+    Raises ValueError as `changes_of`, and Mismatch as `check_described`.
+    """
+    check_described(robot, GROUND)
     changes = changes_of(conditions)
     return partial(GroundRobot, noise=conditions.noise, process_noise=conditions.process_noise, **changes)
 

@@ -66,6 +66,28 @@ class ProcessNoise:
 
 
 @dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations of the errors of a real autopilot's sensors: normal, of each axis at each reading.
+
+    A bias is drawn once. The defaults are those of a small IMU and an RTK receiver. The map is exact to centimetres,
+    and a filter cannot use it behind a position that is wrong by metres. An ordinary receiver has `gps_position` 0.5
+    and `gps_velocity` 0.1.
+    """
+
+    scale: float = 1.0  # multiplies every value below; 0 switches errors off
+    accelerometer: float = 0.05  # m/s²
+    accelerometer_bias: float = 0.05  # m/s²
+    gyro: float = 0.003  # rad/s
+    gyro_bias: float = 0.002  # rad/s
+    magnetometer: float = 0.003  # gauss
+    magnetometer_bias: float = 0.005  # gauss
+    barometer: float = 0.15  # m
+    barometer_bias: float = 1.0  # m, from the weather
+    gps_position: float = 0.015  # m
+    gps_velocity: float = 0.02  # m/s
+
+
+@dataclass(frozen=True)
 class QuadrotorNoise:
     """Standard deviations of the quadrotor's errors: normal, cut off at two standard deviations (`CUT`).
 

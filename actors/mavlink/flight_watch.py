@@ -61,17 +61,23 @@ class FlightWatch:
         """Return the seconds since the last message of the autopilot."""
         return now - max(self._received_at.values(), default=-math.inf)
 
-    def lost(self, now: float) -> str:
-        """Return why the measurement or our control does not count; empty if both count."""
-        client = self._client
-        if client.interruption:
-            return f"our command of the vehicle has ended: {client.interruption}"
+    def stale(self, now: float) -> str:
+        """Return why the measured state is too old to count; empty if it counts."""
         for what in IN_FLIGHT:
             silent = now - self._received_at.get(what, -math.inf)
             if silent > STALE:
                 return f"no telemetry of {what} for {silent:.2f} s"
         if (age := self.age(now)) > STALE:
             return f"telemetry arrives too late: no newer position for {age:.2f} s"
+        return ""
+
+    def lost(self, now: float) -> str:
+        """Return why the measurement or our control does not count; empty if both count."""
+        client = self._client
+        if client.interruption:
+            return f"our command of the vehicle has ended: {client.interruption}"
+        if why := self.stale(now):
+            return why
         if now - self._received_at.get("mode", -math.inf) > SILENT:
             return f"no heartbeat for more than {SILENT:.0f} s"
         if not (client.offboard and client.armed):

@@ -91,7 +91,8 @@ class MavlinkVehicle(PeriodicVehicle):
             self._send, flight.system, tap, lambda text: log.info("the autopilot says: %s", text)
         )
         self._watch = FlightWatch(self._client, self.timing)
-        self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold, from_ground)
+        stale = lambda: self._watch.stale(time.monotonic())  # noqa: E731
+        self._takeoff = Takeoff(self._client, robot, flight, self._wait, self._hold, stale, from_ground)
         self.notes = self._takeoff.notes
         try:
             if flight.truth:

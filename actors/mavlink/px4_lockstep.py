@@ -22,10 +22,11 @@ from brakeline.messaging.robot import Robot
 from brakeline.sim.arena import Arena, room_boundary, room_bounds
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_link import HilLink
-from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import SAMPLES, Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from brakeline.sim.vehicle import Period
 
 RECEIVE_EVERY, SETPOINT_EVERY = 4, 20  # physics steps

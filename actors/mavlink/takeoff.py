@@ -27,6 +27,8 @@ PROGRESS_INTERVAL = 5.0  # s between two log lines meanwhile
 ESTIMATOR_SILENCE = 30.0  # s without the estimator's state, after which the takeoff goes on without it
 REST = 0.2  # m/s: a slower vehicle hovers; the estimate may be wrong by half of that for good
 STOPPING = 20.0  # s until the vehicle hovers: it may have been flying at full speed
+LONGEST_PAUSE = 3.0  # s that a vehicle waits in its takeoff for newer telemetry
+MOST_PAUSES = 20  # of a takeoff
 CLIMB = np.array([0.0, 0.0, 1.0])  # m/s
 TIMEOUTS = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}  # s without a setpoint until it brakes by itself
 FIXED_TIMEOUT = {"ardupilot": 3.0}  # s, in versions without that parameter
@@ -43,6 +45,7 @@ class Takeoff:
         flight: FlightSettings,
         wait: Wait,
         hold: Callable[[Array | None], None],
+        stale: Callable[[], str],
         from_ground: bool = False,
     ) -> None:
         """Prepare the takeoff of one vehicle.
@@ -50,9 +53,11 @@ class Takeoff:
         Args:
             wait: exchanges messages until a condition holds, or a time [s] is over.
             hold: called with a setpoint (3,) [m/s] to repeat from now on; None: send none.
+            stale: returns why the measured state is too old to count; empty if it counts.
             from_ground: refuse a vehicle that flies already.
         """
         self._client, self._robot, self._flight, self._wait, self._hold = client, robot, flight, wait, hold
+        self._stale = stale
         self._from_ground, self.armed_it = from_ground, False  # armed_it: whether this takeoff armed the vehicle
         self.notes: list[str] = []  # about the messages that are used, and the parameters that are too low
 
@@ -90,7 +95,7 @@ class Takeoff:
         if not client.airborne:
             self._climb(kind, self._flight.height)
         self._hold(np.zeros(3))
-        if not wait(lambda: float(np.linalg.norm(client.velocity)) < REST, STOPPING):
+        if not self._wait_in_flight(lambda: float(np.linalg.norm(client.velocity)) < REST, STOPPING, np.zeros(3)):
             raise MavlinkError("the vehicle does not come to rest")
         if not wait(lambda: client.offboard and client.armed, 3.0):
             raise MavlinkError(
@@ -154,16 +159,37 @@ class Takeoff:
         elif timeout is not None and timeout > SHORTEST_TIMEOUT:
             self.note(f"{name} is {timeout:g}: if setpoints stop, it flies on for so many seconds")
 
+    def _wait_in_flight(self, condition: Callable[[], bool], seconds: float, velocity: Array | None) -> bool:
+        """Wait as `wait` does, but stop the vehicle while the measured state is too old, and then go on.
+
+        velocity: the setpoint to repeat, (3,) [m/s]; None: the autopilot flies by itself, and stops by itself.
+
+        Raises:
+            TelemetryMissing: the state stays too old, or is too old again and again.
+        """
+        why = ""
+        for _ in range(MOST_PAUSES):
+            holds = self._wait(lambda: bool(self._stale()) or condition(), seconds)
+            if not (why := self._stale()):
+                return holds
+            if velocity is not None:
+                self._hold(np.zeros(3))
+            if not self._wait(lambda: not self._stale(), LONGEST_PAUSE):
+                break
+            if velocity is not None:
+                self._hold(velocity)
+        raise TelemetryMissing(f"{why}: the vehicle stops its takeoff")
+
     def _climb(self, kind: str, height: float) -> None:
         client, wait = self._client, self._wait
         assert client.position is not None
         top = client.position[2] + height
-        if kind == "ardupilot":
-            self._hold(None)  # a setpoint would end the takeoff
+        velocity = None if kind == "ardupilot" else CLIMB
+        self._hold(velocity)
+        if velocity is None:  # a setpoint would end the takeoff
             client.take_off(height, wait)
-        else:
-            self._hold(CLIMB)
-        if not wait(lambda: client.position is not None and client.position[2] > top - 0.3, 10.0 + 3.0 * height):
+        climbed = lambda: client.position is not None and client.position[2] > top - 0.3  # noqa: E731
+        if not self._wait_in_flight(climbed, 10.0 + 3.0 * height, velocity):
             why = "" if client.offboard else f": it changed to {client.mode}, as after setpoints that came too late"
             raise MavlinkError(f"the vehicle does not climb{why}")
 

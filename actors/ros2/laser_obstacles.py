@@ -106,7 +106,9 @@ def obstacles(
     with np.errstate(invalid="ignore"):
         points = sensor + beams.ranges[:, None] * directions
         radii = (beams.gap + errors.heading) * beams.ranges + swing + errors.range + errors.position
-        near = np.linalg.norm(points - around, axis=1) <= robot.sight + EXTRA_SIGHT + radii
+        far = np.linalg.norm(points - around, axis=1) > robot.sight + EXTRA_SIGHT + radii
+    # A hit whose place is NaN counts as near: it makes no obstacle, and without one nothing is decided.
+    near = ~(far | beams.too_near)
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]
     hits = _joined(points[order], radii[order], 2.0 * robot.footprint)

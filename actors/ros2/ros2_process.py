@@ -18,10 +18,12 @@ import numpy as np
 
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.ros2.command_gate import CommandGate
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings, Topics
 from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
-from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
+from brakeline.actors.ros2.ros_inputs import RosInputs
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.errors import InputMissing, Mismatch, PoseJumped
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.ros2 import ALL_LATCHED, SENSOR, MessageTap, RosNode, RosPublisher, RosSettings
@@ -49,28 +51,6 @@ DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision cha
 
 
 @dataclass(frozen=True)
-class Topics:
-    """Names of topics, below the namespace unless they begin with a slash."""
-
-    odometry: str = "odom"
-    """Read nav_msgs/Odometry from this topic."""
-    scan: str = "scan"
-    """Read sensor_msgs/LaserScan from this topic."""
-    raw: str = "cmd_vel_raw"
-    """Read the commands to filter from this topic."""
-    command: str = "cmd_vel"
-    """Send the filtered commands to this topic."""
-    transforms: str = "/tf"
-    """Read transforms from this topic."""
-    fixed_transforms: str = "/tf_static"
-    """Read transforms that never change from this topic."""
-    diagnostics: str = "/diagnostics"
-    """Send diagnostic_msgs/DiagnosticArray to this topic."""
-    markers: str = "~/markers"
-    """Send what the filter sees and plans to this topic, as visualization_msgs/MarkerArray."""
-
-
-@dataclass(frozen=True)
 class Ros2Settings:
     """Settings of the process."""
 
@@ -85,6 +65,10 @@ class Ros2Settings:
     age_limits: AgeLimits = field(default_factory=AgeLimits)
     turn_aside: bool = False  # whether the filter turns a blocked robot aside
     seconds: float = 0.0  # s by the robot's clock until the end; 0: until the process is asked to stop
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "lead", above=0.0)
+        check_numbers(self, "seconds", least=0.0)
 
 
 def driven(name: str) -> Robot:
@@ -125,6 +109,7 @@ class FilterNode:
         self._markers = self.node.publisher(names.markers, MarkerArray)
         self._diagnostics = self.node.publisher(names.diagnostics, DiagnosticArray)
         self._subscribe()
+        self._commanders, self._senders = (self.node.other_publishers(name) for name in (names.command, names.raw))
 
     def run(self) -> None:
         """Run until asked to stop; then follow the committed plan to a stop."""
@@ -189,6 +174,7 @@ class FilterNode:
         try:
             if self._ending:
                 raise InputMissing("the filter ends")
+            self._check_publishers(now)
             state = self.inputs.state(began, now)
             around: tuple[Obstacle, ...] = self.inputs.obstacles(state[:2], now)
             self.gate.decide(state, around, self.inputs.command(now), began, number)
@@ -206,6 +192,18 @@ class FilterNode:
         outcome = self.gate.outcome
         if outcome is not None and outcome.answer is not None:
             self._markers.put(markers(began, self.inputs.frame, outcome.answer, around))
+
+    def _check_publishers(self, now: float) -> None:
+        """Raise InputMissing if another node commands the base too, or if all raw commands have another type."""
+        topics = self.settings.topics
+        if others := self._commanders.nodes():
+            raise InputMissing(
+                f"{', '.join(others)} publishes on {topics.command} too, which no filter checks: let it publish on "
+                f"{topics.raw}"
+            )
+        if self.inputs.command(now) is None and (others := self._senders.of_other_type(self._twist)):
+            hint = "leave out --stamped" if self.settings.stamped else "give --stamped if it sends TwistStamped"
+            raise InputMissing(f"{', '.join(others)} sends {topics.raw} as another type than we expect: {hint}")
 
     def _resend_until(self, moment: float, stop: threading.Event) -> bool:
         """Wait for a moment [s], and send the input in force again meanwhile. Return False as `SystemClock.wait` does.

@@ -10,7 +10,8 @@ import numpy as np
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
 from brakeline.actors.ros2.odometry import OdometryHistory, StepLimits
-from brakeline.actors.ros2.sensor_frames import MOST_LEAN, MOST_TILT, PlanarPose, TransformTree, frame_name, pose_of
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
+from brakeline.actors.ros2.sensor_frames import MOST_LEAN, MOST_TILT, TransformTree, frame_name, pose_of
 from brakeline.errors import BadScan, InputMissing, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
@@ -19,32 +20,6 @@ from brakeline.messaging.ros2.cdr_messages import LaserScan, Odometry, TFMessage
 
 LONGEST_FRAME = 100  # characters of a frame's name
 OTHER_CLOCK = 1e3  # s: a message of this age has the time of another clock
-
-
-@dataclass(frozen=True)
-class AgeLimits:
-    """The greatest age [s] of each input; an older one counts as missing."""
-
-    odometry: float = 0.15
-    """Count odometry as missing if it is older than this [s]."""
-    scan: float = 0.6
-    """Count a scan as missing if its first beam is older than this [s]. That includes one turn of a slow lidar and the
-    wait for the next scan."""
-    command: float = 0.5
-    """Count a command as missing if it is older than this [s]."""
-    ahead: float = 0.05
-    """Let a stamp be in the future by this much, because clocks differ [s]."""
-
-
-@dataclass(frozen=True)
-class SensorSettings:
-    """How to interpret a robot's sensors."""
-
-    range_error: float = 0.02  # m, the largest of the lidar
-    zero_is_free: bool = False  # the lidar reports 0 where nothing is within its range
-    mount: PlanarPose | None = None  # the lidar's pose on the robot; None: the transforms contain it
-    odometry_frame: str = "odom"  # the frame of the state
-    base_frame: str = ""  # the robot's frame in the transforms, which then replace the odometry; empty: they do not
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,11 @@ class ActorCommand:
     arena drawn with the seed. The safety service must serve quadrotor-late."""
     flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
 
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """The optional parts that the command needs."""
+        return ("sim", "mavlink") if self.url else ("sim",)
+
     def run(self) -> int:
         """Act until the last step, SIGINT or SIGTERM. Returns the exit status."""
         from brakeline.actors.actor_process import ActorSettings, run

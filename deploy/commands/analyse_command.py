@@ -11,8 +11,6 @@ from typing import Any
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.common_options import LATEST, Json, Logs, Quiet, Verbose
 from brakeline.deploy.progress import under_way
-from brakeline.logs.figure_tables import show, show_episode
-from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
 
 
 @dataclass(frozen=True)
@@ -37,6 +35,8 @@ class AnalyseCommand:
 
     def run(self) -> int:
         """Print the figures. Returns the exit status."""
+        from brakeline.logs.log_analysis import AnalysisOptions, analyse_runs
+
         if self.json and self.csv:
             raise ValueError("--json and --csv exclude each other: give one of them")
         with under_way("reading " + ", ".join(map(str, self.logs))):
@@ -59,6 +59,8 @@ class AnalyseCommand:
         return 0
 
     def _print(self, figures: dict[str, Any]) -> None:
+        from brakeline.logs.figure_tables import show, show_episode
+
         episodes = figures.get("episode_detail", [])
         if self.json:
             print_json(figures)

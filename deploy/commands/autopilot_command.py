@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from brakeline.deploy.commands.command_output import errors, print_counts
 from brakeline.deploy.commands.common_options import Json, Seed, settings_from
-from brakeline.deploy.run import autopilot_run, px4_simulation
-from brakeline.sim.arena import Arena
-from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
-from brakeline.sim.autopilot.autopilot_server import ServerStats
-from brakeline.sim.autopilot.hil_sensors import SensorNoise
-from brakeline.sim.quadrotor import Quadrotor
-from brakeline.sim.wind import Wind
+from brakeline.sim.sim_conditions import SensorNoise, Wind
+
+if TYPE_CHECKING:
+    from brakeline.deploy.run.px4_simulation import FlightResult
+    from brakeline.sim.arena import Arena
+    from brakeline.sim.autopilot.autopilot_server import ServerStats
+    from brakeline.sim.quadrotor import Quadrotor
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,15 @@ class AutopilotCommand:
     """With --px4, set these parameters, as NAME VALUE NAME VALUE ..."""
     json: Json = False
 
+    extras: ClassVar[tuple[str, ...]] = ("sim", "mavlink")
+
     def run(self) -> int:
         """Fly until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
         wind = Wind(self.wind, gust=self.gust)
-        result: ServerStats | px4_simulation.FlightResult
+        result: ServerStats | FlightResult
         if self.px4 is None:
+            from brakeline.deploy.run import autopilot_run
+
             settings = settings_from(autopilot_run.AutopilotSettings, self, wind=wind)
             result = autopilot_run.fly(settings, self._print_start)
         else:
@@ -72,11 +76,14 @@ class AutopilotCommand:
         print_counts(asdict(result), self.json)
         return 0
 
-    def _fly_px4(self, folder: Path, wind: Wind) -> px4_simulation.FlightResult:
+    def _fly_px4(self, folder: Path, wind: Wind) -> FlightResult:
         if self.vehicles != 1 or self.airborne or self.rules != "px4":
             raise ValueError(
                 "a real PX4 flies one vehicle, by its own rules, and starts on the ground: leave out the option"
             )
+        from brakeline.deploy.run import px4_simulation
+        from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT
+
         timeout = {} if self.setpoint_timeout is None else {SETPOINT_TIMEOUT["px4"]: self.setpoint_timeout}
         settings = settings_from(
             px4_simulation.HilSettings,

@@ -6,12 +6,11 @@ import contextlib
 import threading
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import errors, print_counts
 from brakeline.deploy.commands.ros2_command import GraphOptions, log_to_stderr, open_bag
-from brakeline.deploy.run.ros2_bridge import Bridge, BridgeSettings
-from brakeline.messaging.ros2 import RosSettings
 from brakeline.messaging.stop_signals import stop_on_signals
 
 
@@ -32,7 +31,7 @@ class BridgeSimCommand:
     """With --sim-time, run at most at this multiple of real time. 0 runs as fast as possible."""
     lockstep: bool = False
     """With --sim-time, wait in each control period for its command, so that no command is late on a busy machine."""
-    timeout: float = BridgeSettings.timeout
+    timeout: float = 0.3
     """Stop the base after this time without a command [s]."""
     stamped: bool = False
     """Expect TwistStamped commands."""
@@ -43,12 +42,16 @@ class BridgeSimCommand:
     """Run for this long by the clock of the robot [s]. 0 runs until you press ^C."""
     json: options.Json = False
 
+    extras: ClassVar[tuple[str, ...]] = ("sim", "ros2")
+
     def run(self) -> int:
         """Simulate until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.deploy.run.ros2_bridge import Bridge, BridgeSettings
+
         if not self.sim_time and (self.lockstep or self.factor != 1.0):
             raise ValueError("--factor and --lockstep need simulated time: give --sim-time too")
         listen = () if self.router else self.listen
-        ros = RosSettings(self.router, listen, self.graph.domain, self.graph.namespace)
+        ros = self.graph.settings(self.router, listen)
         settings = options.settings_from(BridgeSettings, self, ros=ros, conditions=self.physics.conditions())
         log_to_stderr("bridge-sim")
         with contextlib.ExitStack() as stack:

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
@@ -56,6 +56,8 @@ class CampaignCommand:
     """Store the rows of all episodes, and the logs of those that came too near, in this folder."""
     quiet: options.Quiet = False
     json: options.Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
 
     def run(self) -> int:
         """Drive what is missing and write the tables. Returns the exit status: 3 if a filtered robot hit something."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from rich.markup import escape
 
@@ -67,6 +67,8 @@ class CertifyCommand:
     verbose: options.Verbose = False
     quiet: options.Quiet = False
     json: options.Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
 
     def run(self) -> int:
         """Validate the model sets. Returns the exit status; 1 if none is supported, or one may not be used."""

@@ -35,6 +35,11 @@ class CollectCommand:
     quiet: options.Quiet = False
     json: options.Json = False
 
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """The optional parts that the command needs."""
+        return ("sim", "mavlink", "logs") if self.url else ("sim",)
+
     def run(self) -> int:
         """Record the data set. Returns the exit status; 1 if a first flight gave no model set to use."""
         from brakeline.deploy.data.data_paths import record_path

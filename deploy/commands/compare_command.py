@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 from rich.markdown import Markdown
@@ -79,6 +79,8 @@ class CompareCommand:
     """Store the logs and policies of the trainings in this folder."""
     quiet: Quiet = False
     json: Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
 
     def run(self) -> int:
         """Train, evaluate and write the tables. Returns the exit status."""

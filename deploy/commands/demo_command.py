@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from brakeline.deploy.commands.command_output import console, errors
 from brakeline.deploy.commands.common_options import Json, Quiet, RunBusOptions, RunFolder, Seed, Verbose
@@ -26,6 +26,8 @@ class DemoCommand:
     verbose: Verbose = False
     quiet: Quiet = False
     json: Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
 
     def run(self) -> int:
         """Drive the stored policy without and with the filter, then run the training. Returns the exit status."""

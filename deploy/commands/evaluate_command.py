@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import conditions_table, errors, print_result
@@ -45,6 +45,8 @@ class EvaluateCommand:
     verbose: options.Verbose = False
     quiet: options.Quiet = False
     json: options.Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
 
     def run(self) -> int:
         """Drive the episodes and print the figures. Returns the exit status."""

@@ -11,8 +11,6 @@ from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import console, errors, print_json
 from brakeline.deploy.commands.train_command import STOPPED, dated_folder
-from brakeline.deploy.run.display import Display, summary
-from brakeline.deploy.run.launcher import Launcher, prepare
 from brakeline.deploy.run.run_config import AutopilotConfig, RunConfig
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.messaging.robot import robot_named
@@ -66,8 +64,16 @@ class FlyCommand:
     quiet: options.Quiet = False
     json: options.Json = False
 
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """The optional parts that the command needs."""
+        return ("sim", "mavlink", "logs", *(("train",) if self.policy == LEARN else ()))
+
     def run(self) -> int:
         """Fly. Returns the exit status."""
+        from brakeline.deploy.run.display import Display, summary
+        from brakeline.deploy.run.launcher import Launcher, prepare
+
         config, folder = self.config(), self.out or dated_folder()
         config = prepare(config, folder, resume=False)
         with Display(errors if self.json else console, config.steps * len(config.flights)) as display:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -24,6 +24,8 @@ class PretrainCommand:
     """Draw the driving from this seed. Defaults to the one that the comparison uses."""
     quiet: Quiet = False
     json: Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "train")
 
     def run(self) -> int:
         """Pretrain the method. Returns the exit status."""

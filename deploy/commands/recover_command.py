@@ -11,8 +11,6 @@ import tyro
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet
 from brakeline.deploy.progress import under_way
-from brakeline.logs.log_recovery import recover
-from brakeline.logs.reader import find
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,9 @@ class RecoverCommand:
 
     def run(self) -> int:
         """Repair the logs. Returns the exit status."""
+        from brakeline.logs.log_recovery import recover
+        from brakeline.logs.reader import find
+
         paths = find(list(self.logs))
         if self.out is not None and len(paths) > 1:
             raise ValueError(f"--out takes one file, but the logs have {len(paths)}: name one file")

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from brakeline.deploy.commands.command_output import console, errors, print_damage, print_json
 from brakeline.deploy.commands.common_options import LATEST, Certificate, Json, Logs, Mode, Quiet
@@ -38,6 +38,8 @@ class ReplayCommand:
     """Decide with this clearance margin [m] instead of the model set's own."""
     quiet: Quiet = False
     json: Json = False
+
+    extras: ClassVar[tuple[str, ...]] = ("sim", "logs")
 
     def run(self) -> int:
         """Replay the logs and print the comparison. Returns the exit status: 0, or DIFFERENT."""

@@ -9,19 +9,19 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from brakeline.actors.decision_guard import Ask
-from brakeline.actors.ros2.ros2_process import Ros2Settings, Topics, driven, run
-from brakeline.actors.ros2.ros_inputs import AgeLimits, SensorSettings
-from brakeline.actors.ros2.sensor_frames import PlanarPose
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings, Topics
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.commands.command_output import print_counts
-from brakeline.logs.bag_writer import BagWriter
-from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.bus import Bus, BusSettings
-from brakeline.messaging.ros2 import ROUTER, RosSettings
 from brakeline.messaging.stop_signals import stop_on_signals
-from brakeline.safety.service.client import query_service
+
+if TYPE_CHECKING:
+    from brakeline.actors.decision_guard import Ask
+    from brakeline.logs.bag_writer import BagWriter
+    from brakeline.messaging import brakeline_pb2 as pb
+    from brakeline.messaging.robot import Robot
+    from brakeline.messaging.ros2 import RosSettings
 
 SERVICE_LEAD = 0.12  # s, default of --lead with --connect: an answer over the bus takes longer than one in process
 
@@ -30,10 +30,20 @@ SERVICE_LEAD = 0.12  # s, default of --lead with --connect: an answer over the b
 class GraphOptions:
     """Place the node in the ROS graph."""
 
-    domain: int = int(os.environ.get("ROS_DOMAIN_ID") or 0)
+    domain: int | None = None
     """Join this ROS domain. Defaults to $ROS_DOMAIN_ID, else to 0."""
     namespace: str = "/"
     """Put the node into this namespace."""
+
+    def settings(self, connect: tuple[str, ...], listen: tuple[str, ...] = ()) -> RosSettings:
+        """Return how to reach the graph at these endpoints. Raises ValueError if the domain is not a number from 0."""
+        from brakeline.messaging.ros2 import RosSettings
+
+        text = os.environ.get("ROS_DOMAIN_ID") or "0" if self.domain is None else str(self.domain)
+        if not text.isdecimal():
+            name = "ROS_DOMAIN_ID" if self.domain is None else "--domain"
+            raise ValueError(f"{name} is {text!r}: a ROS domain is a whole number from 0 on")
+        return RosSettings(connect, listen, int(text), self.namespace)
 
 
 @dataclass(frozen=True)
@@ -41,7 +51,7 @@ class Ros2Command:
     """The options of `brakeline ros2`."""
 
     robot: options.Robot = "ground"
-    router: tuple[str, ...] = (ROUTER,)
+    router: tuple[str, ...] = ("tcp/localhost:7447",)
     """Connect to the router of rmw_zenoh at these endpoints, as Zenoh writes them."""
     graph: options.Unprefixed[GraphOptions] = field(default_factory=GraphOptions)
     name: str = "brakeline"
@@ -81,13 +91,23 @@ class Ros2Command:
     """Run for this long by the clock of the robot [s]. 0 runs until you press ^C."""
     json: options.Json = False
 
+    @property
+    def extras(self) -> tuple[str, ...]:
+        """The optional parts that the command needs."""
+        if not self.connect:
+            return "sim", "ros2", "logs"
+        return ("ros2", "logs") if self.bag else ("ros2",)
+
     def run(self) -> int:
         """Filter commands until the duration ends, SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.actors.ros2.ros2_process import Ros2Settings, driven, run
+        from brakeline.actors.ros2.sensor_frames import PlanarPose
+
         mount = PlanarPose(*self.mount) if self.mount else None
         settings = options.settings_from(
             Ros2Settings,
             self,
-            ros=RosSettings(self.router, domain=self.graph.domain, namespace=self.graph.namespace),
+            ros=self.graph.settings(self.router),
             lead=self.lead or (SERVICE_LEAD if self.connect else Ros2Settings.lead),
             sensors=options.settings_from(
                 SensorSettings, self, mount=mount, base_frame=self.base_frame if self.tf else ""
@@ -95,23 +115,29 @@ class Ros2Command:
             age_limits=self.fresh,
         )
         log_to_stderr(self.name)
-        with self._asker(settings) as asker, open_bag(self.bag) as bag, stop_on_signals(threading.Event()) as stop:
+        with (
+            self._asker(driven(self.robot), settings.lead) as asker,
+            open_bag(self.bag) as bag,
+            stop_on_signals(threading.Event()) as stop,
+        ):
             figures = run(settings, asker, stop, bag)
         print_counts(figures, self.json)
         return 0
 
     @contextlib.contextmanager
-    def _asker(self, settings: Ros2Settings) -> Iterator[Ask]:
+    def _asker(self, robot: Robot, lead: float) -> Iterator[Ask]:
         """Yield the function that asks for decisions: in this process, or over the bus."""
-        from brakeline.deploy.data.model_store import model_for
-        from brakeline.deploy.experiments.evaluate import in_process
-
-        robot = driven(self.robot)
         if not self.connect:
+            from brakeline.deploy.data.model_store import model_for
+            from brakeline.deploy.experiments.evaluate import in_process
+
             accept_bound = self.filtering.accept_bound
             yield in_process(model_for(robot, self.filtering.model_config(), accept_bound), accept_bound)
             return
-        deadline = 0.3 * settings.lead  # a period may need three requests
+        from brakeline.messaging.bus import Bus, BusSettings
+        from brakeline.safety.service.client import query_service
+
+        deadline = 0.3 * lead  # a period may need three requests
 
         def ask_service(requests: Sequence[pb.Request]) -> list[pb.Reply]:
             return query_service(bus, requests, deadline)
@@ -123,7 +149,11 @@ class Ros2Command:
 
 def open_bag(folder: Path | None) -> contextlib.AbstractContextManager[BagWriter | None]:
     """Open a ROS 2 bag to record into, if there is a folder."""
-    return contextlib.nullcontext() if folder is None else BagWriter(folder)
+    if folder is None:
+        return contextlib.nullcontext()
+    from brakeline.logs.bag_writer import BagWriter
+
+    return BagWriter(folder)
 
 
 def log_to_stderr(name: str) -> None:

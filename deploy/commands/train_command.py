@@ -102,6 +102,8 @@ class TrainCommand(RunConfig):
         with under_way("counting the steps of the logs"):
             return max(count(self.from_logs, robot_with_task(name)) for name in self.robots)
 
+    extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
+
     def run(self) -> int:
         """Run the training. Returns the exit status."""
         folder = self.resume or self.out or dated_folder()

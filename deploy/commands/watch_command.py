@@ -8,17 +8,21 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from brakeline.deploy.commands.command_output import console
 from brakeline.deploy.commands.common_options import LATEST, BusOptions, Unprefixed
-from brakeline.logs.watch.dashboard import Dashboard
-from brakeline.logs.watch.foxglove_server import ORIGINS, FoxgloveServer
-from brakeline.logs.watch.live_page_server import LivePageServer, RunReport
+from brakeline.logs.watch.websocket_gate import ORIGINS
 from brakeline.messaging.bus import Bus
 from brakeline.messaging.bus.inbox import Inbox
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.messaging.topics import RECORDED
+
+if TYPE_CHECKING:
+    from brakeline.logs.watch.dashboard import Dashboard
+    from brakeline.logs.watch.foxglove_server import FoxgloveServer
+    from brakeline.logs.watch.live_page_server import RunReport
 
 REFRESH_PERIOD = 0.05  # s
 MOST_SHOWING = 1.0  # s of one refresh; a signal ends the command after it
@@ -45,6 +49,10 @@ class WatchCommand:
 
     def run(self) -> int:
         """Serve the live views until SIGINT or SIGTERM. Returns the exit status."""
+        from brakeline.logs.watch.dashboard import Dashboard
+        from brakeline.logs.watch.foxglove_server import FoxgloveServer
+        from brakeline.logs.watch.live_page_server import LivePageServer
+
         inbox, board, live = Inbox(), Dashboard(), None
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(self.endpoints.bus(), f"viewer.watch-{time.time_ns() % 10**6}"))
@@ -61,6 +69,8 @@ class WatchCommand:
 
     def _report(self) -> RunReport | None:
         """Return the report of the run that is watched, if this machine has its log."""
+        from brakeline.logs.watch.live_page_server import RunReport
+
         if self.report is None and (self.endpoints.connect or self.endpoints.listen):
             return None
         return RunReport((self.report or LATEST).resolve())

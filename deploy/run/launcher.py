@@ -7,6 +7,7 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,11 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         DamagedPart: the checkpoint of the run to resume is lost in part.
         BadModel: the folder of a resumed run lacks a model, or a vehicle that is not simulated here has no model set.
         TooLoose: the stated bound of a model set is above the accepted one.
+        ModuleNotFoundError: a process of the run needs a package that is not installed.
         ValueError: the run adapts, and a model set is of mode recursion or of a rival. Or a robot's simulator does not
             have one of the conditions.
     """
+    _check_packages(config)
     if not resume and (folder / CONFIG).exists():
         raise LaunchError(f"{folder} holds a run already: give --resume {folder}, or another --out")
     if resume and not config.policy and not config.from_logs:
@@ -80,6 +83,13 @@ def prepare(config: RunConfig, folder: Path, resume: bool) -> RunConfig:
         check_adaptable(model)
     folder.mkdir(parents=True, exist_ok=True)
     return config
+
+
+def _check_packages(config: RunConfig) -> None:
+    """Raise ModuleNotFoundError if a process of the run would end for lack of a package."""
+    for package, used in (("torch", not config.policy), ("pymavlink", bool(config.flights))):
+        if used and find_spec(package) is None:
+            raise ModuleNotFoundError(f"No module named {package!r}", name=package)
 
 
 def _check_conditions(config: RunConfig) -> None:

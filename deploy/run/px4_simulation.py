@@ -5,6 +5,7 @@ Flight code, estimator and failsafes are PX4's own. This program simulates vehic
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,10 +20,11 @@ from brakeline.messaging.stop_signals import stop_on_signals
 from brakeline.sim.arena import Arena
 from brakeline.sim.autopilot.autopilot_server import PATIENCE, TRUTH_RATE, TruthSender, WallClock
 from brakeline.sim.autopilot.hil_link import HilLink
-from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import QuadrotorNoise
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from brakeline.sim.wind import Wind
 
 
@@ -61,28 +63,28 @@ def fly(settings: HilSettings, on_start: Callable[[Quadrotor], Any] = lambda veh
         on_start: is called when PX4 has answered for the first time.
 
     Raises:
-        LaunchError: PX4 is not in the folder or does not start.
+        LaunchError: PX4 is not in the folder or does not start, or a signal ended its start.
         AutopilotGone: PX4 fell silent.
         ValueError: the URL is not on this machine.
     """
     port = _port(settings.url)
     arena = arena_or_field(settings.arena, settings.seed)
-    truth = open_truth(settings.truth)
-    px4 = Px4Process(settings.folder, port, settings.parameters)
-    try:
-        with stop_on_signals(threading.Event(), patient=True) as stop:
+    with contextlib.ExitStack() as stack:
+        # From here on, so that a signal during PX4's start also ends PX4 and deletes its files.
+        stop = stack.enter_context(stop_on_signals(threading.Event(), patient=True))
+        if (truth := open_truth(settings.truth)) is not None:
+            stack.callback(truth.close)
+        px4 = Px4Process(settings.folder, port, settings.parameters, stop.is_set)
+        stack.callback(px4.close)
+        try:
             hil = HilLink(px4.connection, *_vehicle(settings, arena))
             while not hil.answering and not stop.is_set():
                 hil.tick()
             on_start(hil.vehicle)
             end = settings.seconds or float("inf")
             return serve(hil, WallClock(), settings.speed, lambda: stop.is_set() or hil.time >= end, truth)
-    except AutopilotGone as error:
-        raise AutopilotGone(f"{error}; PX4's last output:\n{px4.last_output()}") from error
-    finally:
-        px4.close()
-        if truth is not None:
-            truth.close()
+        except AutopilotGone as error:
+            raise AutopilotGone(f"{error}; PX4's last output:\n{px4.last_output()}") from error
 
 
 def serve(

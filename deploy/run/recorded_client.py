@@ -54,8 +54,8 @@ class RecordedClient:
 
     The log states what your program knows: positions and speeds are the measured ones, clearances are those to the
     obstacles of the requests (none with a scan alone). Rewards, goals and collisions are those of `record_outcome` and
-    `reset`; without these calls they are zero. A step is complete when the next request has the state after it, so the
-    last decision of an episode has no step, and its outcome counts for the step before.
+    `reset`. Without these calls, `analyse` says that they are not recorded. A step is complete when the next request
+    has the state after it, so the last decision of an episode has no step, and its outcome counts for the step before.
 
     >>> from brakeline import Filter, InProcess
     >>> with RecordedClient(InProcess(Filter.load("ground")), FOLDER / "mine") as safety:
@@ -118,7 +118,12 @@ class RecordedClient:
         observation: ArrayLike | None = None,
         known_free: bool = False,
     ) -> Answer:
-        """Decide as the client does, and record the request and its answer. Raises what the client raises."""
+        """Decide as the client does, and record the request and its answer.
+
+        Raises what the client raises; BusError: the log is closed. Then `fallback` brakes the robot.
+        """
+        if self._closed.is_set():
+            raise BusError(f"{self.path} is closed, so nothing is recorded: make another RecordedClient")
         listed = None if obstacles is None else obstacles_in(obstacles)
         more: dict[str, Any] = {"scan": scan, "observation": observation, "known_free": known_free}
         now = (steady_time_ns() - self._began) * 1e-9
@@ -255,12 +260,13 @@ class RecordedClient:
 def _recording(path: Path, client: FilterClient, inbox: Inbox) -> Recording:
     """Return what writes the log. With a filter in this process, it holds the model set, so a replay needs no more."""
     try:
+        from brakeline.logs.episode_stats import OWN_PROGRAM
         from brakeline.logs.mcap_container import model_attachment_name
         from brakeline.logs.recorder import LogSettings, Recording
     except ModuleNotFoundError as error:
         raise missing_extra(error) or error from error
     robot, model = client.robot, getattr(getattr(client, "method", None), "model", None)
-    run = {"policy": "own program", "robots": robot.name}
+    run = {"policy": OWN_PROGRAM, "robots": robot.name}
     metadata = {"run": run, "versions": {"brakeline": version("brakeline")}}
     metadata["robots"] = {robot.kind: json.dumps(robot.description)}
     files = {}

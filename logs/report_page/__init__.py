@@ -20,7 +20,7 @@ from typing import Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from brakeline.logs.decision_stats import PARTS
-from brakeline.logs.episode_stats import Figures
+from brakeline.logs.episode_stats import ENDS, Figures
 from brakeline.logs.json_values import finite
 from brakeline.logs.log_analysis import SETUP
 from brakeline.logs.tube_stats import stated
@@ -92,6 +92,7 @@ def rates(figures: Figures) -> list[Figures]:
         dict(zip(("count", "of", "unit"), counts[name], strict=True))
         | {"name": name, "what": what, "interval": figures["intervals"][name]}
         for name, _, what in RATES
+        if figures["outcomes_stated"] or name not in ENDS
     ]
 
 

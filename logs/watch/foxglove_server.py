@@ -12,11 +12,10 @@ from foxglove.websocket import ServerListener
 from brakeline.logs.foxglove import ROOT, FoxgloveConverter
 from brakeline.logs.recorder import entry as stored_entry
 from brakeline.logs.segment import Entry, schema_of
-from brakeline.logs.watch.websocket_gate import WebSocketGate, hidden_host
+from brakeline.logs.watch.websocket_gate import ORIGINS, WebSocketGate, hidden_host
 from brakeline.messaging.bus import Sample
 
 RATE = 20.0  # drawn steps per second and robot
-ORIGINS = ("https://app.foxglove.dev",)  # Foxglove in a browser
 
 
 class FoxgloveServer:

@@ -17,6 +17,7 @@ from email.parser import BytesHeaderParser
 from brakeline.messaging.allowed_hosts import rejection_reason
 from brakeline.messaging.http_server import ConnectionSlots
 
+ORIGINS = ("https://app.foxglove.dev",)  # Foxglove in a browser
 MOST_HANDSHAKE = 2**14  # bytes
 TIMEOUT = 5.0  # s for the handshake
 BUFFER = 2**16  # bytes

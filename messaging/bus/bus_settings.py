@@ -75,8 +75,12 @@ class BusSettings:
         for endpoint in endpoints:
             if not ENDPOINT.match(endpoint):
                 raise ValueError(f"{endpoint!r} is no endpoint: give PROTOCOL/HOST:PORT, such as tcp/127.0.0.1:7447")
-            if endpoint.startswith("tls/") != (self.keys is not None):
-                raise ValueError(f"{endpoint}: with keys a bus is at tls/HOST:PORT, and without it is not")
+            if endpoint.startswith("tls/") and self.keys is None:
+                raise ValueError(f"{endpoint}: a bus at tls/ needs keys: give --keys FOLDER, or set BRAKELINE_KEYS")
+            if self.keys is not None and not endpoint.startswith("tls/"):
+                raise ValueError(
+                    f"{endpoint}: with keys a bus is at tls/HOST:PORT: correct it, or leave out the keys ({self.keys})"
+                )
         open_to_others = [endpoint for endpoint in self.listen if not local(endpoint)]
         if self.keys is None and not self.insecure and open_to_others:
             raise BadKeys(

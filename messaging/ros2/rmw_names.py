@@ -102,6 +102,24 @@ class GraphEntity:
         return "/".join(parts)
 
 
+def publishers_key(domain: int, topic: str) -> str:
+    """Return the key expression of the tokens of all publishers of a topic (its full name), of any type."""
+    return f"{SPACE}/{domain}/*/*/*/{PUBLISHER}/*/*/*/{_mangled(topic)}/**"
+
+
+def publisher_of(token: str) -> tuple[str, str, str]:
+    """Return session, node and type (`geometry_msgs::msg::dds_::Twist_`) of the token of a publisher.
+
+    Raises:
+        BadRosName: the key is no token of a publisher.
+    """
+    parts = token.split("/")
+    if len(parts) != 13 or parts[5] != PUBLISHER:
+        raise BadRosName(f"{token!r:.200} is no token of a publisher")
+    namespace, node = parts[7].replace("%", "/").rstrip("/"), parts[8]
+    return parts[2], f"{namespace}/{node}", parts[10]
+
+
 def gid_of(token: str) -> bytes:
     """Return a publisher's global id: XXH3-128 of its liveliness token, low half first, each half little-endian."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]

@@ -25,7 +25,7 @@ from zenoh.ext import (
 )
 from zenoh.handlers import RingChannel
 
-from brakeline.errors import Malformed, Unreachable
+from brakeline.errors import BadRosName, Malformed, Unreachable
 from brakeline.messaging.bus.subscription import Subscription
 from brakeline.messaging.bus.zenoh_sessions import as_bus_error, close_sessions, zenoh_config
 from brakeline.messaging.rejected_messages import RejectedMessages
@@ -37,8 +37,11 @@ from brakeline.messaging.ros2.rmw_names import (
     GraphEntity,
     Qos,
     attachment,
+    dds_type,
     full_name,
     gid_of,
+    publisher_of,
+    publishers_key,
     topic_key,
 )
 from brakeline.messaging.steady_clock import steady_time_ns
@@ -47,6 +50,7 @@ M = TypeVar("M")
 ROUTER = "tcp/localhost:7447"  # rmw_zenoh's default
 RELIABLE = Qos()
 LARGEST = 2**20  # bytes of a received message
+MOST_WATCHED = 1000  # publishers of a topic
 
 
 class MessageTap(Protocol):
@@ -111,6 +115,41 @@ class RosPublisher(Generic[M]):
             self._tap(self.entity.topic, self._kind, payload, now, self._qos)
 
 
+class PublisherWatch:
+    """The other nodes that publish on a topic at the moment, by their liveliness tokens."""
+
+    def __init__(self, session: str) -> None:
+        """session: the Zenoh id of this node, whose own publishers do not count."""
+        self._session = session
+        self._lock = threading.Lock()
+        self._types: dict[str, tuple[str, str]] = {}  # node and type, by token
+
+    def take(self, sample: zenoh.Sample) -> None:
+        """Handle a token that appears or disappears."""
+        token = str(sample.key_expr)
+        try:
+            session, node, kind = publisher_of(token)
+        except BadRosName:
+            return
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._types.pop(token, None)
+            elif session != self._session and len(self._types) < MOST_WATCHED:
+                self._types[token] = node, kind
+
+    def nodes(self) -> list[str]:
+        """Return the names of these nodes."""
+        with self._lock:
+            return sorted({node for node, _ in self._types.values()})
+
+    def of_other_type(self, kind: type) -> list[str]:
+        """Return the names of these nodes if none of them publishes this type."""
+        wanted = dds_type(type_of(kind))
+        with self._lock:
+            found = list(self._types.values())
+        return [] if any(its == wanted for _, its in found) else sorted({node for node, _ in found})
+
+
 class RosNode:
     """A node in the graph, until `close`.
 
@@ -130,6 +169,7 @@ class RosNode:
         self._tokens: list[Any] = []
         self._senders: list[Any] = []  # Zenoh closes a publisher that nothing refers to
         self._subscriptions: list[Subscription] = []
+        self._watches: list[Any] = []
         try:
             self._session = zenoh.open(settings.configuration())
         except zenoh.ZError as error:
@@ -213,6 +253,13 @@ class RosNode:
         self._subscriptions.append(subscription)
         self._declare(entity)
         return subscription
+
+    def other_publishers(self, topic: str) -> PublisherWatch:
+        """Watch which other nodes publish on a topic, of any type. Raises BadRosName."""
+        watch = PublisherWatch(self._zid)
+        key = publishers_key(self.settings.domain, self.full_name(topic))
+        self._watches.append(self._session.liveliness().declare_subscriber(key, watch.take, history=True))
+        return watch
 
     def _entity(self, kind: str, topic: str = "", message: type | None = None, qos: Qos = RELIABLE) -> GraphEntity:
         with self._lock:

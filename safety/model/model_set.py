@@ -248,19 +248,7 @@ class ModelSet:
         >>> ModelSet.load("ground")
         ModelSet('ground', residual, direct, version 'ade8bf47fe17', at most 0.43 % of plans outside)
         """
-        path = Path(source)
-        if path.suffix == ".toml":
-            raise BadModel(
-                f"{path} is a description: give the model set that `brakeline certify {path} --use` wrote, "
-                "such as data/NAME/residual-one-step.safetensors"
-            )
-        if isinstance(source, str) and source == path.name and not path.suffix:
-            shipped = SHIPPED / f"{source}.model.safetensors"
-            if shipped.is_file():  # a file here that is called like the robot is ./ground
-                path = shipped
-            elif not path.exists():
-                names = ", ".join(sorted(p.name.partition(".")[0] for p in SHIPPED.glob("*.model.safetensors")))
-                raise BadModel(f"no model set comes with {source!r}; there are: {names}, or give the path of a file")
+        path = path_of_model(source)
         try:
             model = ModelSet.decode(path.read_bytes())
             refuse_shipped_name(model.robot)
@@ -278,6 +266,28 @@ class ModelSet:
             stated = "no bound stated"
         kind = f"{self.model_config.certificate}, {self.model_config.mode}"
         return f"ModelSet({self.robot.name!r}, {kind}, version {self.version!r}, {stated})"
+
+
+def path_of_model(source: Path | str) -> Path:
+    """Return the path of a model's file; of the model set that comes with a shipped robot, if `source` is its name.
+
+    Raises:
+        BadModel: the source is a description, or neither a shipped robot's name nor a file.
+    """
+    path = Path(source)
+    if path.suffix == ".toml":
+        raise BadModel(
+            f"{path} is a description: give the model set that `brakeline certify {path} --use` wrote, "
+            "such as data/NAME/residual-one-step.safetensors"
+        )
+    if isinstance(source, str) and source == path.name and not path.suffix:
+        shipped = SHIPPED / f"{source}.model.safetensors"
+        if shipped.is_file():  # a file here that is called like the robot is ./ground
+            return shipped
+        if not path.exists():
+            names = ", ".join(sorted(p.name.partition(".")[0] for p in SHIPPED.glob("*.model.safetensors")))
+            raise BadModel(f"no model set comes with {source!r}; there are: {names}, or give the path of a file")
+    return path
 
 
 def checksum(about: dict[str, Any]) -> str:

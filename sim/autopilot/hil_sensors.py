@@ -6,7 +6,6 @@ IMU, magnetometer and barometer become HIL_SENSOR messages, GPS becomes HIL_GPS 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.flight_controller import Vector
 from brakeline.sim.flight_estimator import Estimate
+from brakeline.sim.sim_conditions import SensorNoise
 
 IMU, MAGNETOMETER, BAROMETER = 0x3F, 0x1C0, 0x1A00  # bits of HIL_SENSOR.fields_updated
 FIX = int(mavlink.GPS_FIX_TYPE_RTK_FIXED)
@@ -28,27 +28,6 @@ RATES = (50.0, 25.0, 10.0)  # Hz, of magnetometer, barometer and GPS; the IMU re
 DRAWS_AT_ONCE = 256  # one draw alone takes as long as many
 DRAW_SIZE = 16  # random numbers for one reading of all sensors
 GPS_DRAWS = slice(10, 16)
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations of the sensors' normal errors: of each axis at each reading; a bias is drawn once.
-
-    The defaults are those of a small IMU and an RTK receiver. The map is exact to centimetres, and a filter cannot use
-    it behind a position that is wrong by metres. An ordinary receiver has `gps_position` 0.5 and `gps_velocity` 0.1.
-    """
-
-    scale: float = 1.0  # multiplies every value below; 0 switches errors off
-    accelerometer: float = 0.05  # m/s²
-    accelerometer_bias: float = 0.05  # m/s²
-    gyro: float = 0.003  # rad/s
-    gyro_bias: float = 0.002  # rad/s
-    magnetometer: float = 0.003  # gauss
-    magnetometer_bias: float = 0.005  # gauss
-    barometer: float = 0.15  # m
-    barometer_bias: float = 1.0  # m, from the weather
-    gps_position: float = 0.015  # m
-    gps_velocity: float = 0.02  # m/s
 
 
 class HilSensors:

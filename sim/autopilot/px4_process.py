@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import logging
 import os
 import re
 import socket
@@ -10,12 +12,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from brakeline.errors import LaunchError
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.kernels.flight_kernels import AIRFRAME as BODY
 from brakeline.sim.kernels.flight_kernels import GRAVITY
+
+log = logging.getLogger("brakeline.px4")
 
 AIRFRAME = "none_iris"  # the airframe of PX4 that expects its simulator at a TCP port
 FIRST_PORT = 4560  # of the simulator of instance 0; PX4's scripts add the number of the instance
@@ -53,16 +58,23 @@ PARAMETERS: dict[str, float] = {
 class Px4Process:
     """A running PX4."""
 
-    def __init__(self, folder: Path, remote: int, parameters: dict[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        remote: int,
+        parameters: dict[str, float] | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Start PX4.
 
         Args:
             folder: a build for SITL, with `px4` or `bin/px4`, and `etc`.
             remote: UDP port for MAVLink.
             parameters: values besides `PARAMETERS`.
+            stop: whether to give up before PX4 has started.
 
         Raises:
-            LaunchError: the folder holds no PX4, or PX4 did not start.
+            LaunchError: the folder holds no PX4, PX4 did not start, or `stop` returned True.
         """
         binary, aliases, etc = _find_parts(folder)
         # remote, local: UDP ports of 127.0.0.1 that PX4 sends MAVLink to and from
@@ -98,7 +110,7 @@ class Px4Process:
                 start_new_session=True,  # so that ^C ends only this program
             )
         try:
-            self.connection = self._accept()  # TCP connection on which PX4 waits for sensors
+            self.connection = self._accept(stop)  # TCP connection on which PX4 waits for sensors
         except BaseException:
             self._end()
             raise
@@ -125,14 +137,21 @@ class Px4Process:
             trace.unlink(missing_ok=True)
         self._folder.cleanup()
 
-    def _accept(self) -> socket.socket:
+    def _accept(self, stop: Callable[[], bool]) -> socket.socket:
+        """Return the connection of our PX4. Another program of this machine may connect, too: it is hung up on."""
         end = time.monotonic() + START_TIMEOUT
         self._listener.settimeout(0.1)
-        while time.monotonic() < end and self.alive:
+        while time.monotonic() < end and self.alive and not stop():
             try:
-                return self._listener.accept()[0]
+                connection = self._listener.accept()[0]
             except TimeoutError:
                 continue
+            if _belongs_to(connection, self._process.pid):
+                return connection
+            log.warning("another program than PX4 connected to PX4's simulator at port %d", connection.getsockname()[1])
+            connection.close()
+        if stop():
+            raise LaunchError("asked to stop before PX4 had started")
         raise LaunchError(f"PX4 did not connect to its simulator; the end of its output:\n{self.last_output()}")
 
 
@@ -143,6 +162,20 @@ def _find_parts(folder: Path) -> tuple[Path, Path, Path]:
         if (place / "px4").is_file() and (place / "px4-alias.sh").is_file() and (folder / "etc").is_dir():
             return place / "px4", place / "px4-alias.sh", folder / "etc"
     raise LaunchError(f"{folder} holds no PX4 for SITL: it must have px4 and px4-alias.sh (or both in bin/), and etc/")
+
+
+def _belongs_to(connection: socket.socket, session: int) -> bool:
+    """Return whether the other end of a connection on this machine is a process of this session, by the kernel."""
+    (_, peer), (_, own) = connection.getpeername(), connection.getsockname()
+    rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    ends = f":{peer:04X}", f":{own:04X}"
+    names = {f"socket:[{row[9]}]" for row in rows if (row[1][-5:], row[2][-5:]) == ends}
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or it is not ours
+            ours = os.getsid(int(process.name)) == session
+            if ours and names & {str(file.readlink()) for file in (process / "fd").iterdir()}:
+                return True
+    return False
 
 
 def _free_instance() -> tuple[int, socket.socket]:

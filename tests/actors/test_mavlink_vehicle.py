@@ -13,8 +13,9 @@ import pytest
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.frame_log import CapturedFrame
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.actors.mavlink.takeoff import LONGEST_PAUSE
 from brakeline.actors.mavlink.telemetry import ATTITUDE
-from brakeline.errors import BadInput, CommandLost
+from brakeline.errors import BadInput, CommandLost, TelemetryMissing
 from brakeline.messaging.free_ports import free_udp_port
 from brakeline.sim.autopilot import autopilot_server
 from brakeline.sim.autopilot.autopilot_rules import SETPOINT_TIMEOUT as TIMEOUT
@@ -91,6 +92,31 @@ def test_a_vehicle_takes_off_flies_brakes_and_lands(stalled: Callable[[], float]
 
         vehicle.land()
         until(lambda: not autopilot.flight.armed, "it disarms on the ground", 15.0)
+
+
+@pytest.mark.parametrize("silence", [1.0, 4.5])
+def test_a_climb_stops_without_fresh_positions_and_lands_if_they_stay_away(silence: float) -> None:
+    autopilot, heights, silent_since = Autopilot(quadrotor(floor=0.0), "px4"), [0.0], [np.inf]
+    real, ground = autopilot.take, float(autopilot.vehicle.state()[2])
+
+    def take() -> bytes:
+        data = real()
+        heights.append(float(autopilot.vehicle.state()[2]) - ground)
+        if heights[-1] > 0.7 and silent_since[0] == np.inf:
+            silent_since[0] = time.monotonic()
+        return b"" if 0.0 <= time.monotonic() - silent_since[0] < silence else data
+
+    autopilot.take = take  # type: ignore[method-assign]
+    flight = FlightSettings("", height=2.5, raise_limits=True)
+    with served(autopilot) as url:
+        if silence < LONGEST_PAUSE:
+            MavlinkVehicle(QUADROTOR, replace(flight, url=url)).close()
+            assert heights[-1] == pytest.approx(2.5, abs=0.5)
+            return
+        with pytest.raises(TelemetryMissing, match=r"no telemetry of .*stops its takeoff"):
+            MavlinkVehicle(QUADROTOR, replace(flight, url=url))
+        until(lambda: not autopilot.flight.armed, "it lands", 20.0)
+    assert max(heights) < 1.7, "it does not climb on blindly"
 
 
 def test_the_autopilot_brakes_when_the_link_dies() -> None:

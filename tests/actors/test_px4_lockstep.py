@@ -15,8 +15,8 @@ from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.px4_lockstep import OLDEST, Px4Flight, Px4Vehicle
 from brakeline.errors import AutopilotGone
 from brakeline.messaging.obstacle import CYLINDER, Obstacle
-from brakeline.sim.autopilot.hil_sensors import SensorNoise
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from tests.actors.test_lockstep_quadrotor import quadrotor
 from tests.robots import QUADROTOR
 

@@ -207,7 +207,7 @@ def test_a_vehicle_does_not_take_off_if_a_second_one_has_its_id() -> None:
     autopilot = ScriptedAutopilot("ardupilot", dict.fromkeys(grants, 50.0))
     autopilot.client.second_source = "10.0.0.2:14550"
     setpoints: list[object] = []
-    takeoff = Takeoff(autopilot.client, QUADROTOR, FlightSettings(""), autopilot.wait, setpoints.append)
+    takeoff = Takeoff(autopilot.client, QUADROTOR, FlightSettings(""), autopilot.wait, setpoints.append, str)
     with pytest.raises(MavlinkError, match=r"vehicle 1 is at .*also come from 10\.0\.0\.2:14550"):
         takeoff.fly()
     assert not setpoints and not autopilot.client.armed

@@ -76,6 +76,7 @@ STATED = {
         ("query ground --known-free", "no run at runs/latest"),
         ("safety ground --listen tcp/0.0.0.0:7447", "is open to other machines: give --keys FOLDER"),
         ("query ground --known-free --connect tcp/127.0.0.1:1 --keys {folder}", "with keys a bus is at tls/HOST:PORT"),
+        ("query ground --known-free --connect tls/127.0.0.1:1", "give --keys FOLDER, or set BRAKELINE_KEYS"),
         ("query ground --known-free --connect tls/127.0.0.1:1 --keys {folder}", "ca.pem is missing: no keys of client"),
         ("keys {folder}/keys bob", "'bob' begins with no role"),
         ("keys {folder}/none --sign {folder}/none", "no key to sign models with"),

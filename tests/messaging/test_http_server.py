@@ -210,7 +210,7 @@ def test_who_is_stuck_does_not_live_and_who_is_cut_off_is_not_ready(exposed):
 def test_where_nothing_can_be_served_is_said(exposed):
     with pytest.raises(ValueError, match="HOST:PORT"):
         MetricsServer("nonsense", everything)
-    with pytest.raises(OSError, match="in use"):
+    with pytest.raises(OSError, match=r"in use: cannot listen at .*:\d+, give another port"):
         MetricsServer(str(exposed(everything())), everything)
     with pytest.raises(OSError, match="70000 is no port"):
         MetricsServer("127.0.0.1:70000", everything)

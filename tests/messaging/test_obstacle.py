@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from brakeline.errors import BadShape
 from brakeline.messaging.obstacle import BOX, CYLINDER, SPHERE, WALL, Obstacle, Shapes, rotate
+from brakeline.messaging.obstacle_motion import Motion
 
 pytestmark = pytest.mark.fast
 
@@ -152,6 +153,15 @@ NAN, INF = float("nan"), float("inf")
         ("size", (WALL, (0, 0), (1,))),
         ("size", (CYLINDER, (0, 0), 0.1)),
         ("position", (CYLINDER, 1.0, (0.1,))),
+        ("position", (CYLINDER, ("1.0", "2.0"), (0.1,))),
+        ("position", (CYLINDER, "ab", (0.1,))),
+        ("position", (CYLINDER, (None, 0.0), (0.1,))),
+        ("position", (CYLINDER, np.zeros((2, 2)), (0.1,))),
+        ("size", (CYLINDER, (0, 0), ("0.1",))),
+        ("yaw", (BOX, (0, 0), (1, 1), "left")),
+        ("margin", (BOX, (0, 0), (1, 1), 0.0, None)),
+        ("motion", (BOX, (0, 0), (1, 1), 0.0, 0.0, (0.5, 0.0))),
+        ("motion", (BOX, (0, 0), (1, 1), 0.0, 0.0, Motion(("0.5", "0"), 0.1, speed=1.0))),
     ],
 )
 def test_what_is_no_obstacle_in_the_plane_is_refused_by_its_field(field, arguments):

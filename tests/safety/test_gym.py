@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brakeline.deploy.data.environment_episodes import collect
-from brakeline.errors import BadData, BadRequest, Mismatch, NoReply
+from brakeline.errors import BadData, BadModel, BadRequest, Mismatch, NoReply
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
 from brakeline.safety.action_mapping import ActionMapping, mapping_for_space, normalised
@@ -104,6 +104,13 @@ def test_the_wrapper_from_a_file_reports_its_decisions(tmp_path, model):
     assert np.array_equal(diagnostics["executed"], [0.0, 0.0]) and np.array_equal(diagnostics["proposed"], [0.0, 0.0])
     assert reward == -info["penalty"] == 0.0
     assert ModelSet.load(tmp_path / "model.safetensors").version == diagnostics["model"]
+
+
+def test_the_wrapper_takes_the_name_of_a_shipped_robot():
+    env = SafetyWrapper.load(gymnasium.make("brakeline.envs:brakeline/Ground-v0"), "ground")
+    assert env.client.robot.name == "ground"
+    with pytest.raises(BadModel, match=r"no model set comes with 'grond'; there are: ground, quadrotor"):
+        SafetyWrapper.load(env.unwrapped, "grond")
 
 
 def test_the_wrapper_passes_a_safe_action_and_clipping_costs_nothing(ready):

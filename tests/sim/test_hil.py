@@ -16,11 +16,12 @@ from brakeline.errors import AutopilotGone, LaunchError
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.common_dialect import mavlink
 from brakeline.sim.autopilot.hil_link import HilLink
-from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, HilSensors, SensorNoise
+from brakeline.sim.autopilot.hil_sensors import DECLINATION, INCLINATION, HilSensors
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.flight_estimator import Estimate, QuadrotorNoise
 from brakeline.sim.kernels.flight_kernels import GRAVITY
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from tests.sim.station import field
 
 HOVER = 1.2 * 9.81 / 4.0 / 8.8  # of a rotor's full thrust

@@ -10,7 +10,11 @@ from brakeline.deploy import cli
 from brakeline.deploy.run.autopilot_run import AutopilotSettings, vehicle
 from brakeline.deploy.run.launcher import prepare
 from brakeline.deploy.vehicle_factory import empty_arena, vehicle_in_empty_arena
+from brakeline.errors import Mismatch
+from brakeline.messaging.robot_files import ROBOTS_FOLDER
+from brakeline.messaging.task import robot_with_task
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from brakeline.sim.delayed_vehicle import simulated_vehicle
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels, ProcessNoise, QuadrotorNoise, Wind
 from tests.robots import GROUND, QUADROTOR
 
@@ -95,3 +99,23 @@ def test_a_flight_has_the_conditions_of_its_simulated_vehicle_and_none_behind_a_
     settings = AutopilotSettings("", noise=QuadrotorNoise(scale=0.0), changes={"payload_kg": 0.3}, airborne=True)
     heavy, light = (vehicle(one, empty_arena(QUADROTOR), 1) for one in (settings, replace(settings, changes={})))
     assert heavy.vehicle._model.body_mass.sum() == pytest.approx(light.vehicle._model.body_mass.sum() + 0.3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after", "why"),
+    [
+        ("ground", "period = 0.2", "period = 0.1", r"has a period of 0\.2 s, not 0\.1 s"),
+        ("quadrotor", "period = 0.2", "period = 0.1", r"has a period of 0\.2 s, not 0\.1 s"),
+        ("ground", "high = 0.25", "high = 0.3", "narrower bounds"),
+        ("quadrotor", "slew = 0.8", "slew = 1.6", "smaller slew"),
+    ],
+)
+def test_a_simulator_refuses_a_description_that_it_cannot_follow(kind, before, after, why, tmp_path):
+    text = (ROBOTS_FOLDER / f"{kind}.toml").read_text()
+    path = tmp_path / "other.toml"
+    (tmp_path / "other.task.toml").write_text((ROBOTS_FOLDER / f"{kind}.task.toml").read_text())
+    path.write_text(text.replace(f'name = "{kind}"', 'name = "other"'))
+    simulated_vehicle(robot_with_task(str(path)), Conditions())
+    path.write_text(path.read_text().replace(before, after))
+    with pytest.raises(Mismatch, match=f"other: .*{why}"):
+        simulated_vehicle(robot_with_task(str(path)), Conditions())

@@ -26,9 +26,10 @@ from brakeline.messaging.obstacle import CYLINDER, Obstacle
 from brakeline.messaging.task import robot_with_task
 from brakeline.sim.autopilot import ned_frames
 from brakeline.sim.autopilot.hil_link import HilLink
-from brakeline.sim.autopilot.hil_sensors import HilSensors, SensorNoise
+from brakeline.sim.autopilot.hil_sensors import HilSensors
 from brakeline.sim.autopilot.px4_process import Px4Process
 from brakeline.sim.quadrotor import Quadrotor
+from brakeline.sim.sim_conditions import SensorNoise
 from tests.system.runs import BRAKELINE
 from tests.waiting import until
 

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brakeline.actors.ros2.laser_obstacles import HitErrors, _joined, obstacles, read
+from brakeline.actors.ros2.ros2_settings import SensorSettings
 from brakeline.actors.ros2.sensor_frames import PlanarPose
-from brakeline.errors import BadScan
+from brakeline.errors import BadScan, BadShape
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes, rotate
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena_generator import draw_arena
@@ -31,6 +32,18 @@ def obstacles_of(scan, at=(0.0, 0.0, 0.0), mount=MOUNT, **more):
     beams = read(scan, **more)
     poses = np.tile(at, (len(beams.times), 1))
     return obstacles(beams, poses, mount, GROUND, ERRORS, np.asarray(at[:2], float))
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -0.01])
+def test_a_range_error_or_a_place_of_the_lidar_that_is_no_number_never_hides_an_obstacle(wrong):
+    """With a NaN, no hit was near the robot: a room full of obstacles was free."""
+    with pytest.raises(ValueError, match="range_error"):
+        SensorSettings(range_error=wrong)
+    if not math.isfinite(wrong):
+        with pytest.raises(ValueError, match="x = "):
+            SensorSettings(mount=PlanarPose(wrong, 0.0, 0.0))
+        with pytest.raises(BadShape), np.errstate(invalid="ignore"):
+            obstacles_of(scan_of(np.full(BEAMS, 0.5)), mount=PlanarPose(wrong, 0.0, 0.0))
 
 
 def test_obstacles_contain_all_hits_in_random_rooms_with_the_largest_errors():

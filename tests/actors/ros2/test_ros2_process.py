@@ -10,7 +10,8 @@ import pytest
 
 from brakeline.actors.ros2.command_gate import BLIND, LATE, NO_ANSWER
 from brakeline.actors.ros2.ros2_process import FilterNode, Ros2Settings, driven
-from brakeline.actors.ros2.ros_inputs import AgeLimits, RawCommand, SensorSettings
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
+from brakeline.actors.ros2.ros_inputs import RawCommand
 from brakeline.actors.ros2.ros_views import diagnostics, markers
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.errors import BadRequest, Mismatch
@@ -118,10 +119,10 @@ class Robot:
 
 
 @contextmanager
-def steered(simulated=False, stamped=False):
+def steered(simulated=False, stamped=False, sends_stamped=None):
     endpoint, stop = free_endpoint(), threading.Event()
     with RosNode(RosSettings(listen=(endpoint,), namespace="/r"), "robot") as node:
-        robot = Robot(node, simulated, stamped)
+        robot = Robot(node, simulated, stamped if sends_stamped is None else sends_stamped)
         settings = Ros2Settings(
             ros=RosSettings(connect=(endpoint,), namespace="/r"),
             sim_time=simulated,
@@ -157,6 +158,27 @@ def test_a_missing_input_stops_the_robot_until_it_comes_again_and_the_end_of_the
         robot.drives()
     assert robot.speeds[-1] == 0.0 and not node_under_test.gate.backup_plan.plan.any()
     assert node_under_test.gate.stats.kinds["allowed"] > 0
+
+
+def test_a_node_that_commands_the_base_past_the_filter_stops_the_robot_until_it_is_gone():
+    with steered() as (robot, node_under_test):
+        robot.drives()
+        with RosNode(node_under_test.node.settings, "teleop") as other:
+            other.publisher("cmd_vel", cdr.TwistStamped)  # whatever its type is
+            robot.stops("/r/teleop publishes on cmd_vel too, which no filter checks: let it publish on cmd_vel_raw")
+        robot.drives()
+
+
+def test_commands_of_another_type_are_named():
+    with steered(stamped=True, sends_stamped=False) as (robot, _):
+        expected = "/robot sends cmd_vel_raw as another type than we expect: leave out --stamped"
+        until(lambda: any(expected in reason for reason in robot.reasons), lambda: f"{robot.reasons[-3:]}", 30.0)
+
+
+@pytest.mark.parametrize("settings", [{"lead": math.nan}, {"lead": 0.0}, {"seconds": math.nan}])
+def test_settings_that_are_no_times_are_refused(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        Ros2Settings(**settings)
 
 
 def test_an_error_in_a_decision_brakes_the_robot_and_the_process_goes_on():

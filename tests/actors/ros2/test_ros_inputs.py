@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from brakeline.actors.ros2.odometry import HISTORY, OdometryHistory, StepLimits
+from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
 from brakeline.actors.ros2.ros_clock import RosSimulatedClock, SystemClock
-from brakeline.actors.ros2.ros_inputs import AgeLimits, RosInputs, SensorSettings
+from brakeline.actors.ros2.ros_inputs import RosInputs
 from brakeline.actors.ros2.sensor_frames import MOST_TILT, PlanarPose, TransformTree
 from brakeline.errors import InputMissing, PoseJumped
 from brakeline.messaging.ros2 import cdr_messages as cdr

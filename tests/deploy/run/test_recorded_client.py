@@ -1,5 +1,6 @@
 """The log of a program of one's own: every request and step is in it, and it says how the robot followed its sets."""
 
+import re
 from pathlib import Path
 
 import gymnasium
@@ -174,6 +175,27 @@ def test_the_log_of_a_wrapped_environment_has_its_rewards_and_how_its_episodes_e
     assert ends == [(True, False, True, False), (False, True, True, False), (False, False, False, True)]
     run = figures("analyse", client.path)
     assert [run[name] for name in ("episodes", "goals", "collisions", "mean_reward")] == [3, 1, 1, 8.0]
+
+
+def test_what_the_program_never_stated_is_not_recorded(method, tmp_path, figures, command) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        drive(safety)
+    run = figures("analyse", safety.path)
+    assert not run["outcomes_stated"] and run["intervals"]["collisions"] is run["intervals"]["goals"] is None
+    status, out, _ = command("analyse", safety.path, "--html", tmp_path / "report.html")
+    assert status == 0 and "not recorded" in out and "timeouts" not in out
+    assert not re.search(r"collisions +0", out)
+    page = (tmp_path / "report.html").read_text()
+    assert "not recorded" in page and 'data-figure="collisions' not in page
+
+
+def test_after_close_nothing_is_decided_unrecorded_and_the_robot_brakes(method, tmp_path) -> None:
+    with RecordedClient(InProcess(method), tmp_path / "mine") as safety:
+        drive(safety, periods=4, obstacles=[])
+    with pytest.raises(BusError, match=r"is closed.*another RecordedClient"):
+        safety.decide([0.0] * 5, [0.25, 0.0], known_free=True)
+    inputs = [safety.fallback() for _ in range(12)]
+    assert np.array_equal(inputs[-1], [0.0, 0.0])
 
 
 def test_a_reward_that_no_log_can_hold_counts_as_zero(method, tmp_path) -> None:
