@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, ClassVar, Protocol
 
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
@@ -72,6 +73,12 @@ def _default(field: Field[Any]) -> Any:
     return json.loads(json.dumps(plain))
 
 
+def _check_writable(folder: Path) -> None:
+    """Raise OSError if the folder cannot hold results, before a job runs for hours."""
+    folder.mkdir(parents=True, exist_ok=True)
+    TemporaryFile(dir=folder).close()
+
+
 def write(results: Path, job: Job, result: dict[str, Any]) -> None:
     """Write a result atomically."""
     write_atomically(result_path(results, job), (json.dumps(result, separators=(",", ":")) + "\n").encode())
@@ -95,6 +102,7 @@ def complete(
 
     Raises:
         ResultError: a result was made with other settings, or two jobs have one name; raised before any job runs.
+        OSError: a result cannot be stored. If its folder cannot be written, raised before any job runs.
         Any exception of a job, after the jobs that already run have ended.
     """
     paths = Counter(result_path(results, job) for job in jobs)
@@ -104,6 +112,8 @@ def complete(
         for job in jobs:
             result_path(results, job).unlink(missing_ok=True)
     missing = [job for job in jobs if read(results, job) is None]
+    for folder in {result_path(results, job).parent for job in missing}:
+        _check_writable(folder)
     for job, result in engine.completed(missing, runs, say):
         write(results, job, result)
     stored = [read(results, job) for job in jobs]
