@@ -113,8 +113,9 @@ class CampaignCommand:
         return [name for name in self.perturbations if name in mine]
 
     def _prepared(self, robot: RobotWithTask, cell: CampaignPart) -> CampaignPart:
-        """Check the names of a cell, make the model set that it needs, and note the versions of both."""
+        """Check the names of a cell, make the model set that it needs, and note the versions of all files."""
         from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.experiment_jobs import task_hash
         from brakeline.deploy.policy_loading import policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
 
@@ -127,4 +128,4 @@ class CampaignCommand:
         what, model = cell.evaluation(), ""
         if what.method != "none":
             model = method_for(robot, what.method, what.model_config, what.accept_bound).version
-        return replace(cell, model=model, weights=policy_hash(cell.policy, robot))
+        return replace(cell, model=model, weights=policy_hash(cell.policy, robot), task=task_hash(cell.robot))

@@ -23,7 +23,7 @@ from brakeline.deploy.experiments.comparison_cells import (
     learning,
     quick,
 )
-from brakeline.deploy.experiments.experiment_jobs import Job, complete
+from brakeline.deploy.experiments.experiment_jobs import Job, complete, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.learner.learner_config import TD3Config
@@ -149,7 +149,7 @@ class CompareCommand:
             own = replace(cell, td3=learning(self.td3, cell.method, settings))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
-            jobs.append(Conservatism(robot))
+            jobs.append(Conservatism(robot, task=task_hash(robot)))
         return jobs
 
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:

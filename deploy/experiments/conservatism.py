@@ -34,6 +34,7 @@ class Conservatism:
     episodes: int = 60
     arena: str = "default"
     policies: tuple[str, ...] = (ORACLE, "trained")
+    task: str = ""  # see `experiment_jobs.task_hash`
 
     @property
     def name(self) -> str:

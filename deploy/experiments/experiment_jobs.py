@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Protocol
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
 from brakeline.errors import ResultError
 from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, task_values
 from brakeline.messaging.structured_text import parse_json
 
 
@@ -26,6 +28,19 @@ def configuration(job: Job) -> dict[str, Any]:
     """Return the fields of a job as JSON values."""
     values: dict[str, Any] = json.loads(json.dumps(asdict(job)))
     return values
+
+
+def task_hash(robot: str) -> str:
+    """Return a hash of the files that describe a robot of your own and its task, so that a changed one is noticed.
+
+    robot: its name or path. The hash is empty for a robot that comes with Brakeline.
+    """
+    from brakeline.messaging.task import robot_with_task, task_path  # slow to import
+
+    if not robot.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
+        return ""
+    values = robot_with_task(robot).description, task_values(task_path(robot))
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def result_path(results: Path, job: Job) -> Path:

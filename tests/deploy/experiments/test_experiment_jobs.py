@@ -82,11 +82,13 @@ class Nap(Errand):
 
 
 NAPS = """
+import signal
 from pathlib import Path
 from brakeline.deploy.experiments.experiment_jobs import complete
 from brakeline.deploy.experiments.task_engine import Engine
 from tests.deploy.experiments.test_experiment_jobs import Nap
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", engine=Engine(2))
 """
 
@@ -101,7 +103,6 @@ def napping(tmp_path):
         env=os.environ | {"PYTHONPATH": str(root)},
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a shell's job may ignore it
     )
     marks = [tmp_path / "runs" / "ground" / f"errand-{n}" / "ground" / f"errand-{n}.json" for n in (1, 2)]
     until(lambda: all(mark.exists() for mark in marks), "both are at work")
