@@ -360,6 +360,6 @@ def test_results_of_a_robot_of_ones_own_with_another_task_or_description_are_ref
         assert new in changed
         for job in jobs():
             write(tmp_path / file, job, {"study": configuration(before[job.name])})
-            with pytest.raises(ResultError, match="another .*task"):
+            with pytest.raises(ResultError, match=r"another .*task"):
                 read_result(tmp_path / file, job)
     assert task_hash("ground") == task_hash("ground+tracks") == "", "shipped robots change with Brakeline only"
