@@ -71,6 +71,7 @@ class CampaignCommand:
         from brakeline.deploy.experiments import campaign
         from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
         from brakeline.deploy.experiments.experiment_jobs import complete
+        from brakeline.messaging.atomic_files import write_atomically
         from brakeline.messaging.task import address, robot_with_task
 
         robot = robot_with_task(name)
@@ -92,9 +93,8 @@ class CampaignCommand:
         driven = cells_of(parts, results, self.runs)
         own = robot.task.name  # additional tasks of a robot have tables of their own
         table = {"robot": own, "cells": driven, "searches": found}
-        self.results.mkdir(parents=True, exist_ok=True)
-        (self.results / f"{own}.md").write_text(campaign.markdown(own, driven, found))
-        (self.results / f"{own}.json").write_text(json.dumps(table, indent=1) + "\n")
+        write_atomically(self.results / f"{own}.md", campaign.markdown(own, driven, found).encode())
+        write_atomically(self.results / f"{own}.json", f"{json.dumps(table, indent=1)}\n".encode())
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
             if found:

@@ -12,7 +12,7 @@ from tempfile import TemporaryFile
 from typing import Any, ClassVar, Protocol
 
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
-from brakeline.errors import ResultError
+from brakeline.errors import BadText, ResultError
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, task_values
 from brakeline.messaging.structured_text import parse_json
@@ -52,18 +52,29 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     """Return the stored result of a job, or None if there is none.
 
     Raises:
-        ResultError: the result was made with other settings; the message names them.
+        ResultError: the file is damaged, or the result was made with other settings; the message names them.
     """
     path = result_path(results, job)
     if not path.exists():
         return None
-    result: dict[str, Any] = parse_json(path.read_text())
-    stored, current = _completed(result.get("study", {}), job), configuration(job)
+    result = stored_result(path)
+    stored, current = _completed(result["study"], job), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
         raise ResultError(
             f"{path} was made with another {', '.join(differing)}: move it away, or run again with --again"
         )
+    return result
+
+
+def stored_result(path: Path) -> dict[str, Any]:
+    """Return the content of a result file. Raises ResultError: it is damaged."""
+    try:
+        result = parse_json(path.read_bytes())
+    except BadText as error:
+        raise ResultError(f"{path} is damaged ({error}): move it away, or run again with --again") from error
+    if not isinstance(result, dict) or not isinstance(result.get("study"), dict):
+        raise ResultError(f"{path} holds no result of a study: move it away, or run again with --again")
     return result
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, write
+from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, result_path, write
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.errors import ResultError
 from tests.waiting import until
@@ -68,6 +68,21 @@ def test_a_result_from_before_a_setting_had_its_default(tmp_path):
     write(tmp_path, Errand(1), {"study": study | {"former": 3}})
     with pytest.raises(ResultError, match="another former"):
         read(tmp_path, Errand(1))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b'{"study": {"num', b"[]", b"null", b'{"study": [1]}', b"{}", b"\xff\xfe0", bytes(9)]
+)
+def test_a_damaged_result_is_named_with_what_to_do(tmp_path, content):
+    """After a power cut, a file may be empty."""
+    write(tmp_path, Errand(1), {})
+    path = result_path(tmp_path, Errand(1))
+    path.write_bytes(content)
+    with pytest.raises(ResultError, match="run again with --again") as refused:
+        read(tmp_path, Errand(1))
+    assert str(path) in str(refused.value)
+    complete([Errand(1)], tmp_path, tmp_path / "runs", again=True)
+    assert read(tmp_path, Errand(1)) is not None
 
 
 @dataclass(frozen=True)

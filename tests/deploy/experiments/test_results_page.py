@@ -25,6 +25,7 @@ from brakeline.deploy.experiments.tuning_trials import (
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import robot_with_task
+from tests.full_disk import full_disk
 
 # Of 100 episodes, by run; in `dense` 10 fewer.
 GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80), "sac": (90,), "lagrange": (90,)}
@@ -129,6 +130,21 @@ def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
     assert (results / "README.md").read_text() == page(results, ["ground"])
     written = {path.name for path in (results / "ground").iterdir()}
     assert written > {"profiles.png", "curves.png", "seeds.png", "table.md", "table.json"}
+
+
+def test_a_full_disk_leaves_the_tables_that_were_there(results):
+    command = CompareCommand(("ground",), table=True, results=results, quiet=True)
+    assert command.run() == 0
+    before = {path: path.read_bytes() for path in results.rglob("*") if path.suffix in (".md", ".json")}
+    with full_disk(1_000), pytest.raises(OSError, match="File too large"):
+        command.run()
+    assert before == {path: path.read_bytes() for path in before}
+
+
+def test_a_damaged_cell_is_named_with_what_to_do(results):
+    (results / "ground" / "ddpc-s0.json").write_text('{"study": {"robot": "gro')
+    with pytest.raises(ResultError, match=r"ddpc-s0\.json is damaged .* run again with --again"):
+        stored_cells(results, "ground")
 
 
 def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
