@@ -38,7 +38,10 @@ MEMORY = 20.0  # minutes of driving, of all robots of the kind together
 PAUSE = 1.0  # minutes of driving from one attempt to the next
 SPARE = 1.2  # factor on the driving that the accepted bound needs: windows must not cross the ends of trajectories
 TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
-DOMAIN = 0.75  # of a fit to the recent driving alone: least ratio of a recorded range to that of the set in use
+# Least ratio of a range of the recent driving to that of the set in use. A fit knows its range, and the filter keeps
+# the robot within it. An update keeps the range of the set in use.
+FITTED, UPDATED = 0.5, 0.75
+NARROWER = "narrower"  # in `about` of a fit to less than `UPDATED`: the speed or input with the least ratio
 MOST_ROBOTS = 10_000
 WAITING = "waiting"  # the first word of `Adaptation.progress`
 SILENT = 30.0  # s after which a robot counts as gone
@@ -260,17 +263,21 @@ class Adaptation:
             data = Dataset(robot, trajectories, {"origin": "adaptation", "why": why})
             data.check()
             in_use = self.in_use(version)
-            _check_coverage(in_use, data)
+            covered = _coverage(in_use, data)
         except (BadData, BadModel) as error:
             return Recertification(f"none {why}: {error}")
+        if covered.narrower:
+            data = replace(data, about=data.about | {NARROWER: covered.name})
         most = _largest_half_width(in_use, widening, data)
-        ways = (_fitted, _updated) if in_use.model_config.mode == ONE_STEP else (_fitted,)
+        updatable = in_use.model_config.mode == ONE_STEP and not covered.narrower
+        ways = (_fitted, _updated) if updatable else (_fitted,)
         tried = [self._tried(way, in_use, data, most) for way in ways]
         if all(result.model is None for _, result in tried):
             return Recertification(f"none {why}: {'; '.join(result.text for _, result in tried)}")
         _, best = min(tried, key=lambda pair: pair[0])
         assert best.model is not None
-        return replace(best, text=f"{best.model.version} {why}, {best.text}", replaces=version)
+        keeps = f"; {covered.name} stays within {covered.share:.0%} of its range" if covered.narrower else ""
+        return replace(best, text=f"{best.model.version} {why}, {best.text}{keeps}", replaces=version)
 
     def _tried(self, way: Way, in_use: ModelSet, data: Dataset, most: float) -> tuple[float, Recertification]:
         """Return the mean half-width of a new model set [m], infinite if it may not be used, and the set or the reason.
@@ -308,16 +315,38 @@ class Adaptation:
         return Recertification(f"none: {self.version} came into use during the fit; it was compared with another set")
 
 
-def _check_coverage(in_use: ModelSet, data: Dataset) -> None:
-    """Raise BadData if the recent driving is too narrow.
+@dataclass(frozen=True)
+class _Coverage:
+    """The speed, acceleration or input of whose range in the set in use recent driving covers the least share."""
 
-    A fit to it would brake the robot outside its range. An update keeps the range, but its statement does not hold
-    there: of the windows of a quadrotor with a payload that flew faster again, 15 % left sets that stated 2.9 %.
+    name: str
+    share: float
+
+    @property
+    def narrower(self) -> bool:
+        """Whether it is too little for an update.
+
+        Its statement would not hold beyond the driven range: of the windows of a quadrotor with a payload that flew
+        faster again, 15 % left sets that stated 2.9 %.
+        """
+        return self.share < UPDATED
+
+
+def _coverage(in_use: ModelSet, data: Dataset) -> _Coverage:
+    """Return what the recent driving covers least. Raises BadData: too little for a fit, which would slow the robot.
+
+    A fit to a narrower range is not followed by one to a still narrower range.
     """
     ranges, recorded = np.ptp(in_use.domain, axis=0), np.ptp(recorded_domain(data), axis=0)
-    covered = float((recorded / np.where(ranges > 0.0, ranges, np.inf))[ranges > 0.0].min())
-    if covered < DOMAIN:
-        raise BadData(f"the driving covers {covered:.0%} of the speeds and inputs of the set in use, not {DOMAIN:.0%}")
+    shares = np.divide(recorded, ranges, out=np.full(len(ranges), np.inf), where=ranges > 0.0)
+    robot, least = in_use.robot, int(shares.argmin())
+    names = [*(robot.state[k] for k in robot.regressor), *robot.action]
+    covered, needed = _Coverage(names[least], float(shares[least])), UPDATED if NARROWER in in_use.about else FITTED
+    if covered.share < needed:
+        raise BadData(
+            f"the driving covers {covered.share:.0%} of the range of {covered.name} in the set in use, not {needed:.0%}"
+        )
+    return covered
 
 
 def _fitted(in_use: ModelSet, data: Dataset, outside: float) -> tuple[ModelSet, ValidationReport]:

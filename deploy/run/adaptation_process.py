@@ -16,7 +16,7 @@ from pathlib import Path
 
 from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
 from brakeline.deploy.run.adaptation import WAITING, Adaptation, Recertification
-from brakeline.deploy.run.processes import CERTIFIER
+from brakeline.deploy.run.processes import CERTIFIER, UNFINISHED
 from brakeline.errors import BadModel, BrakelineError
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import BusSettings
@@ -69,10 +69,23 @@ def main(settings: CertifierSettings) -> None:
         for topic in (STEP, EXCHANGE):
             process.bus.subscribe(topic, inbox.put)
         # In a thread, so that a fit does not delay the end of the process.
-        threading.Thread(target=_run, args=(inbox, kinds, signer, process), name="certifier", daemon=True).start()
+        worker = threading.Thread(target=_run, args=(inbox, kinds, signer, process), name="certifier", daemon=True)
+        worker.start()
         process.announce()
         log.info("ready")
         process.stop.wait()
+    _leave(worker)
+
+
+def _leave(worker: threading.Thread) -> None:
+    """Wait for the worker. If it is in a fit, end the process at once.
+
+    While compiled code still runs, the interpreter's own end can abort the process, and prints what the code leaks.
+    """
+    worker.join(PERIOD)
+    if worker.is_alive():
+        logging.shutdown()
+        os._exit(UNFINISHED)
 
 
 def _adaptation(robot: Robot, settings: CertifierSettings) -> Adaptation:

@@ -1,6 +1,8 @@
 """When the certifier makes a new model set of a robot that has changed, from which driving, and when it refuses."""
 
 import os
+import re
+import subprocess
 import threading
 from dataclasses import replace
 from functools import cache
@@ -12,9 +14,11 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.data.certification import certify, certify_update
+from brakeline.deploy.interpreter import PYTHON
 from brakeline.deploy.run import adaptation, adaptation_process
-from brakeline.deploy.run.adaptation import REQUESTS, Adaptation, Recertification
+from brakeline.deploy.run.adaptation import NARROWER, REQUESTS, UPDATED, Adaptation, Recertification
 from brakeline.deploy.run.adaptation_process import CertifierSettings, _follow, certifier_beside
+from brakeline.deploy.run.processes import UNFINISHED
 from brakeline.deploy.run.run_keys import check_adaptable, check_signer
 from brakeline.errors import BadModel, BadStep, Implausible, Untrusted
 from brakeline.messaging import brakeline_pb2 as pb
@@ -226,9 +230,22 @@ def test_a_looser_or_an_unproven_set_is_refused_with_the_reason(kind, why, widen
 
 
 def test_driving_that_is_too_narrow_makes_no_set(kind):
+    (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.4), widening=8.0)
+    assert attempt.model is None and re.search(r"of the range of \w+ .*\[.+\] in the set in use, not 50%", attempt.text)
+
+
+def test_narrow_driving_makes_a_set_that_keeps_the_robot_within_it():
     """An update would keep the range of the set in use, where the new driving shows nothing."""
-    (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.5), widening=8.0)
-    assert attempt.model is None and "of the speeds and inputs of the set in use, not 75%" in attempt.text
+    sets = {"old": in_use()}
+    (attempt,) = drive(Adaptation(ROBOT, sets.__getitem__, ACCEPTED), driven(2, 7, slip=-0.15, share=0.6), widening=8.0)
+    new = attempt.model
+    assert new.about[NARROWER] and "a fit to this driving" in attempt.text and "of its range" in attempt.text
+    assert (np.ptp(new.domain, axis=0) < UPDATED * np.ptp(in_use().domain, axis=0)).any()
+    assert share_outside(new, Dataset(ROBOT, driven(3, 6, slip=-0.15, share=0.6))) <= float(new.about["bound_plan"])
+    sets["new"] = new
+    kind = Adaptation(ROBOT, sets.__getitem__, ACCEPTED)
+    (again,) = drive(kind, driven(4, 7, slip=-0.3, share=0.4), widening=8.0, version="new")
+    assert again.model is None and "not 75%" in again.text, "it would become slower with each set"
 
 
 def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
@@ -365,6 +382,32 @@ def test_the_process_signs_what_it_publishes_and_goes_on_after_an_error(kind, tm
     assert TrustedSigners.load(tmp_path).open(signed, ROBOT.name).version == message.version
     assert process.figures[f"published {ROBOT.name}"] == process.figures[f"refused {ROBOT.name}"] == 1.0
     assert process.notes[f"adaptation {ROBOT.name}"] == "no"
+
+
+FITTING = """
+import threading
+import numpy as np
+from proxsuite import proxqp
+from brakeline.deploy.run.adaptation_process import _leave
+
+def fit():
+    while True:
+        qp = proxqp.dense.QP(40, 0, 40)
+        qp.init(np.eye(40), np.ones(40), None, None, np.eye(40), -np.ones(40), np.ones(40))
+        qp.solve()
+        begun.set()
+
+begun, worker = threading.Event(), threading.Thread(target=fit, daemon=True)
+worker.start()
+begun.wait()
+_leave(worker)
+"""
+
+
+def test_a_certifier_that_is_asked_to_end_in_a_fit_ends_without_an_abort():
+    """A real one printed "terminate called without an active exception", or what the solver leaked."""
+    done = subprocess.run([*PYTHON, "-c", FITTING], check=False, capture_output=True, text=True, timeout=60.0)
+    assert (done.returncode, done.stderr) == (UNFINISHED, "")
 
 
 @pytest.mark.parametrize("leaves", [False, True])
