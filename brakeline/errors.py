@@ -347,5 +347,9 @@ class ResultError(BrakelineError, ValueError):
     """An existing result was made with other settings, or the log of a run disagrees with the run's figures."""
 
 
+class WorkerKilled(BrakelineError, RuntimeError):
+    """Something killed a worker process of a study."""
+
+
 class LaunchError(BrakelineError, RuntimeError):
     """A run, or its PX4, can't start or go on. The message says what to do."""

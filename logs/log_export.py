@@ -20,6 +20,7 @@ from brakeline.logs.foxglove import FoxgloveConverter
 from brakeline.logs.reader import Log, Record
 from brakeline.logs.segment import Entry, Segment, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.atomic_files import whole_or_nothing
 from brakeline.messaging.task import RobotWithTask
 
 BATCH = 1000  # messages per write
@@ -106,25 +107,37 @@ def to_foxglove(log: Log, out: Path) -> int:
     Raises:
         ExportError: `out` exists, or the log has no message.
         LogError: as `Log`.
-        OSError: the disk is full or broken.
+        OSError: the disk is full or broken; no part of a file is left.
     """
     if out.exists():
         raise ExportError(f"{out} exists already")
+    with whole_or_nothing(out) as path:
+        return _write_scenes(log, path)
+
+
+def _write_scenes(log: Log, out: Path) -> int:
+    """Write what `to_foxglove` writes, to a new file."""
     converter = FoxgloveConverter(math.inf, log.robots)
     segment: Segment | None = None
     count = 0
     batch: list[Entry] = []
-    for stored, record in _stored(log):
-        if segment is None:  # the metadata come before the first message
-            segment = open_segment(out, {k: v for k, v in log.metadata.items() if k != "brakeline"}, log.attachments)
-        batch += [stored, *converter.from_record(record)]
-        if len(batch) >= BATCH:
-            segment.save(batch)
-            count, batch = count + len(batch), []
-    if segment is None:
-        raise ExportError("the log holds no message")
-    segment.save(batch)
-    segment.finish()
+    try:
+        for stored, record in _stored(log):
+            if segment is None:  # the metadata come before the first message
+                about = {name: values for name, values in log.metadata.items() if name != "brakeline"}
+                segment = open_segment(out, about, log.attachments)
+            batch += [stored, *converter.from_record(record)]
+            if len(batch) >= BATCH:
+                segment.save(batch)
+                count, batch = count + len(batch), []
+        if segment is None:
+            raise ExportError("the log holds no message")
+        segment.save(batch)
+        segment.finish()
+    except OSError:
+        if segment is not None:
+            segment.abandon()
+        raise
     return count + len(batch)
 
 

@@ -6,14 +6,11 @@ up to 3 s; the inverse beta function of `scipy.special`, which it uses too, take
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 Interval = tuple[float, float]
 
 CONFIDENCE = 0.95
-_Z = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 
 
 def clopper_pearson(count: int, of: int, confidence: float = CONFIDENCE) -> Interval | None:
@@ -24,6 +21,11 @@ def clopper_pearson(count: int, of: int, confidence: float = CONFIDENCE) -> Inte
     """
     if of <= 0:
         return None
+    return _beta_interval(count, of, confidence)
+
+
+def _beta_interval(count: float, of: float, confidence: float) -> Interval:
+    """Return the interval of Clopper and Pearson, also for numbers that are not whole."""
     from scipy.special import betaincinv  # imported late: a third of a second that a launcher needs only at its end
 
     tail = (1.0 - confidence) / 2.0
@@ -50,10 +52,13 @@ class ClusteredProportion:
     """Interval of a fraction of steps when the steps of one episode are correlated.
 
     With x_e of n_e steps in episode e = 1..E, the ratio estimator r = Σx / Σn has approximately the variance
-    E/(E-1) Σ(x_e - r n_e)² / (Σn)². Episodes are independent; steps are not.
+    v = E/(E-1) Σ(x_e - r n_e)² / (Σn)². Episodes are independent; steps are not. As many independent steps as have this
+    variance, r(1-r)/v, take the place of Σn in the interval of Clopper and Pearson (Korn and Graubard, "Confidence
+    intervals for proportions with small expected number of positive counts estimated from survey data", 1998). Because
+    few episodes tell v roughly, this number is reduced by the square of a ratio of quantiles of Student's t.
 
-    If r is 0 or 1, that variance is 0 however few episodes there are. Then each episode counts as one trial, and the
-    interval is the exact one of 0 or E successes in E trials.
+    If r is 0 or 1, v is 0 however few episodes there are. Then each episode counts as one trial, and the interval is
+    the exact one of 0 or E successes in E trials.
     """
 
     def __init__(self) -> None:
@@ -75,6 +80,17 @@ class ClusteredProportion:
         if hits in (0, trials):
             return clopper_pearson(clusters if hits else 0, clusters)
         rate = hits / trials
-        squares = max(0.0, xx - 2.0 * rate * xn + rate * rate * nn)
-        half = _Z * math.sqrt(squares * clusters / (clusters - 1)) / trials
-        return max(0.0, rate - half), min(1.0, rate + half)
+        variance = clusters / (clusters - 1) * max(0.0, xx - 2.0 * rate * xn + rate * rate * nn) / trials**2
+        return _by_variance(rate, variance, clusters, trials)
+
+
+def _by_variance(rate: float, variance: float, clusters: int, trials: int) -> Interval:
+    """Return the interval of Korn and Graubard for a rate of `trials` steps in `clusters` episodes."""
+    from scipy.special import stdtrit  # imported late, as above
+
+    of = float(trials)
+    if variance > 0.0:
+        quantile = 1.0 - (1.0 - CONFIDENCE) / 2.0
+        reduction = float(stdtrit(trials - 1, quantile) / stdtrit(clusters - 1, quantile)) ** 2
+        of = min(of, rate * (1.0 - rate) / variance * reduction)
+    return _beta_interval(rate * of, of, CONFIDENCE)

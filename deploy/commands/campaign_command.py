@@ -73,6 +73,7 @@ class CampaignCommand:
         from brakeline.deploy.experiments import campaign
         from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
         from brakeline.deploy.experiments.experiment_jobs import complete
+        from brakeline.messaging.atomic_files import write_atomically
         from brakeline.messaging.task import address, robot_with_task
 
         robot = robot_with_task(name)
@@ -94,9 +95,8 @@ class CampaignCommand:
         driven = cells_of(parts, results, self.runs)
         own = robot.task.name  # additional tasks of a robot have tables of their own
         table = {"robot": own, "cells": driven, "searches": found}
-        self.results.mkdir(parents=True, exist_ok=True)
-        (self.results / f"{own}.md").write_text(campaign.markdown(own, driven, found))
-        (self.results / f"{own}.json").write_text(json.dumps(table, indent=1) + "\n")
+        write_atomically(self.results / f"{own}.md", campaign.markdown(own, driven, found).encode())
+        write_atomically(self.results / f"{own}.json", f"{json.dumps(table, indent=1)}\n".encode())
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
             if found:
@@ -115,8 +115,9 @@ class CampaignCommand:
         return [name for name in self.perturbations if name in mine]
 
     def _prepared(self, robot: RobotWithTask, cell: CampaignPart) -> CampaignPart:
-        """Check the names of a cell, make the model set that it needs, and note the versions of both."""
+        """Check the names of a cell, make the model set that it needs, and note the versions of all files."""
         from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.experiment_jobs import task_hash
         from brakeline.deploy.policy_loading import policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
 
@@ -129,4 +130,4 @@ class CampaignCommand:
         what, model = cell.evaluation(), ""
         if what.method != "none":
             model = method_for(robot, what.method, what.model_config, what.accept_bound).version
-        return replace(cell, model=model, weights=policy_hash(cell.policy, robot))
+        return replace(cell, model=model, weights=policy_hash(cell.policy, robot), task=task_hash(cell.robot))

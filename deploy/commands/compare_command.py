@@ -23,10 +23,11 @@ from brakeline.deploy.experiments.comparison_cells import (
     learning,
     quick,
 )
-from brakeline.deploy.experiments.experiment_jobs import Job, complete
+from brakeline.deploy.experiments.experiment_jobs import Job, complete, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.learner.learner_config import TD3Config
+from brakeline.messaging.atomic_files import write_atomically
 
 QUICK = Path("runs/quick")
 
@@ -118,7 +119,8 @@ class CompareCommand:
             others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
             tables[robot] = self._write(cells, others, robot_folder(results, robot))
         if not self.quick:
-            (results / "README.md").write_text(page(results, [p.name for p in sorted(results.iterdir()) if p.is_dir()]))
+            text = page(results, [folder.name for folder in sorted(results.iterdir()) if folder.is_dir()])
+            write_atomically(results / "README.md", text.encode())
         if self.json:
             print_json(tables)
         return 0
@@ -151,7 +153,7 @@ class CompareCommand:
             own = replace(cell, td3=learning(self.td3, cell.method, settings))
             jobs.append(replace(quick(own) if self.quick else own, **changed))
         if self.conservatism and not self.quick:
-            jobs.append(Conservatism(robot))
+            jobs.append(Conservatism(robot, task=task_hash(robot)))
         return jobs
 
     def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
@@ -163,15 +165,15 @@ class CompareCommand:
 
         figures = table(cells)
         text = markdown(figures)
-        (folder / "table.md").write_text(text + "\n")
-        (folder / "table.json").write_text(json.dumps(plain(figures), indent=1) + "\n")
+        write_atomically(folder / "table.md", f"{text}\n".encode())
+        write_atomically(folder / "table.json", f"{json.dumps(plain(figures), indent=1)}\n".encode())
         learning_curves(cells, folder / "curves.png")
         seeds_as_points(figures, folder / "seeds.png")
         found = RobotResults(folder.name, cells)
         profiles({method: found.goals(method) for method in found.cells}, folder / "profiles.png")
         for result in others:
             rows = conservatism.markdown(result)
-            (folder / "conservatism.md").write_text(rows + "\n")
+            write_atomically(folder / "conservatism.md", f"{rows}\n".encode())
             text += "\n" + rows
         if not self.json:
             console.print(Markdown(text))

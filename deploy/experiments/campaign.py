@@ -72,6 +72,7 @@ class CampaignPart:
         near: distance [m] below which an episode's log is kept.
         first, episodes: number of the first episode, and how many there are.
         model, weights: version of the model set, and hash of the policy's file. Empty: none, or an older result.
+        task: see `experiment_jobs.task_hash`.
     """
 
     robot: str
@@ -85,6 +86,7 @@ class CampaignPart:
     accept_bound: float | None = None
     model: str = ""
     weights: str = ""
+    task: str = ""
 
     @property
     def cell(self) -> str:

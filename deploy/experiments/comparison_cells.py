@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, TD3_LEARNER
+from brakeline.deploy.experiments.experiment_jobs import task_hash
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
@@ -68,6 +69,7 @@ class CellConfig:
     robots: int = 64  # of a batch that trains
     physics: int = 1  # version of the simulator (`Task.simulator_version`); results of different ones do not compare
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
+    task: str = ""  # see `experiment_jobs.task_hash`
 
     def __post_init__(self) -> None:
         from brakeline.messaging.task import check_penalty
@@ -153,6 +155,7 @@ def cell_configs(
 
     methods, task, backend = tuple(methods), robot_with_task(robot).task, backend or backend_for(robot, arenas)
     others: dict[str, Any] = {"backend": backend, "robots": task.at_once, "physics": task.simulator_version}
+    others["task"] = task_hash(robot)
     seeds = range(SEEDS[backend]) if seeds is None else seeds
     penalties = {
         name: 1.0 if METHODS[name].filter in TUNED_AT_1 else task.reward.correction_penalty for name in methods

@@ -19,6 +19,7 @@ from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
 from brakeline.deploy.experiments.trials import EpisodeTable, fresh_trial
 from brakeline.errors import BadData, ErrorBoundError
+from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import arena_kind, robot_with_task
 from brakeline.safety.model.model_config import KINDS, MODES, ModelConfig
 
@@ -34,6 +35,7 @@ class Conservatism:
     episodes: int = 60
     arena: str = "default"
     policies: tuple[str, ...] = (ORACLE, "trained")
+    task: str = ""  # see `experiment_jobs.task_hash`
 
     @property
     def name(self) -> str:
@@ -89,7 +91,7 @@ def markdown(result: dict[str, Any]) -> str:
         rows.append(cells + [""] * (len(heads) - len(cells)))
     note = (
         "Half-widths of a full stop's set on its widest axis; held-out plans outside their tubes, and the bound on "
-        "that at 99 % confidence."
+        "that at 99 % confidence, rounded up."
     )
     return "\n".join([f"# Conservatism: {result['study']['robot']}", "", *markdown_table(heads, rows), "", note])
 
@@ -101,7 +103,7 @@ def _length(metres: float) -> str:
 def _figures(row: dict[str, Any], policies: Sequence[str]) -> list[str]:
     validation, driving = row["statement"], row["driving"]
     figures = [_length(validation[name]) for name in ("half_width_rest", "half_width_full")]
-    figures += [f"{validation['violations']} of {validation['windows']}", f"{validation['bound_plan']:.2%}"]
+    figures += [f"{validation['violations']} of {validation['windows']}", percent(validation["bound_plan"])]
     if driving is None:
         return [*figures, "not driven: wider than the arena"]
     return figures + [f"{driving[policy]['goals']}, {driving[policy]['interventions']:.1%}" for policy in policies]

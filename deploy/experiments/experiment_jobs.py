@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, ClassVar, Protocol
 
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
-from brakeline.errors import ResultError
+from brakeline.errors import BadText, ResultError
 from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, task_values
 from brakeline.messaging.structured_text import parse_json
 
 
@@ -27,6 +30,19 @@ def configuration(job: Job) -> dict[str, Any]:
     return values
 
 
+def task_hash(robot: str) -> str:
+    """Return a hash of the files that describe a robot of your own and its task, so that a changed one is noticed.
+
+    robot: its name or path. The hash is empty for a robot that comes with Brakeline.
+    """
+    from brakeline.messaging.task import robot_with_task, task_path  # slow to import
+
+    if not robot.removesuffix(REAL_TIME_SUFFIX).endswith(".toml"):
+        return ""
+    values = robot_with_task(robot).description, task_values(task_path(robot))
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
 def result_path(results: Path, job: Job) -> Path:
     """Return the path of a job's result file."""
     return robot_folder(results, job.robot) / f"{job.name}.json"
@@ -36,18 +52,29 @@ def read(results: Path, job: Job) -> dict[str, Any] | None:
     """Return the stored result of a job, or None if there is none.
 
     Raises:
-        ResultError: the result was made with other settings; the message names them.
+        ResultError: the file is damaged, or the result was made with other settings; the message names them.
     """
     path = result_path(results, job)
     if not path.exists():
         return None
-    result: dict[str, Any] = parse_json(path.read_text())
-    stored, current = _completed(result.get("study", {}), job), configuration(job)
+    result = stored_result(path)
+    stored, current = _completed(result["study"], job), configuration(job)
     differing = sorted(name for name in stored | current if stored.get(name) != current.get(name))
     if differing:
         raise ResultError(
             f"{path} was made with another {', '.join(differing)}: move it away, or run again with --again"
         )
+    return result
+
+
+def stored_result(path: Path) -> dict[str, Any]:
+    """Return the content of a result file. Raises ResultError: it is damaged."""
+    try:
+        result = parse_json(path.read_bytes())
+    except BadText as error:
+        raise ResultError(f"{path} is damaged ({error}): move it away, or run again with --again") from error
+    if not isinstance(result, dict) or not isinstance(result.get("study"), dict):
+        raise ResultError(f"{path} holds no result of a study: move it away, or run again with --again")
     return result
 
 
@@ -70,6 +97,12 @@ def _default(field: Field[Any]) -> Any:
         return default
     plain = asdict(default) if is_dataclass(default) and not isinstance(default, type) else default
     return json.loads(json.dumps(plain))
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise OSError if the folder cannot hold results, before a job runs for hours."""
+    folder.mkdir(parents=True, exist_ok=True)
+    TemporaryFile(dir=folder).close()
 
 
 def write(results: Path, job: Job, result: dict[str, Any]) -> None:
@@ -95,6 +128,7 @@ def complete(
 
     Raises:
         ResultError: a result was made with other settings, or two jobs have one name; raised before any job runs.
+        OSError: a result cannot be stored. If its folder cannot be written, raised before any job runs.
         Any exception of a job, after the jobs that already run have ended.
     """
     paths = Counter(result_path(results, job) for job in jobs)
@@ -104,6 +138,8 @@ def complete(
         for job in jobs:
             result_path(results, job).unlink(missing_ok=True)
     missing = [job for job in jobs if read(results, job) is None]
+    for folder in {result_path(results, job).parent for job in missing}:
+        _check_writable(folder)
     for job, result in engine.completed(missing, runs, say):
         write(results, job, result)
     stored = [read(results, job) for job in jobs]

@@ -17,6 +17,7 @@ import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
+from brakeline.deploy.experiments.experiment_jobs import stored_result
 from brakeline.deploy.experiments.task_engine import robot_folder
 from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
 from brakeline.deploy.policy_loading import TRAINED
@@ -25,7 +26,6 @@ from brakeline.learner.learner_config import TD3Config
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
 from brakeline.messaging.robot import Array
-from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_config import DDPC
 
@@ -38,10 +38,10 @@ def stored_cells(results: Path, robot: str) -> list[Result]:
     """Return the stored cells of a robot, by method and seed.
 
     Raises:
-        ResultError: cells differ in more than the method and its settings.
+        ResultError: a file is damaged, or cells differ in more than the method and its settings.
     """
     paths = sorted(robot_folder(results, robot).glob("*-s*.json"))
-    cells = [parse_json(path.read_text()) for path in paths if CELL.search(path.name)]
+    cells = [stored_result(path) for path in paths if CELL.search(path.name)]
     order = list(METHODS)
     cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
     for name in SAME:
@@ -283,7 +283,7 @@ def _tuning(results: Path, robot: RobotWithTask, found: RobotResults) -> list[st
     """Return the table of all tried values; nothing is tried for our filter and TD3."""
     tried: dict[str, list[Result]] = {}
     for path in sorted((results / found.name).glob("tuning-*.json")):
-        result = parse_json(path.read_text())
+        result = stored_result(path)
         tried.setdefault(result["study"]["method"], []).append(result)
     if not tried:
         return [f"No tuning is stored: `brakeline compare {found.name} --tune` runs it.\n"]

@@ -10,7 +10,9 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import active_children
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar
@@ -18,9 +20,14 @@ from typing import Annotated, Any, Protocol, TypeVar
 import tyro
 
 from brakeline.deploy.interpreter import ONE_THREAD, end_with_spawner, spawning
+from brakeline.errors import WorkerKilled
 from brakeline.messaging.structured_text import parse_json
 
 LONGEST_LINE = 500  # characters per progress message
+KILLED = (
+    "a worker process was killed, perhaps because the memory was full: run the command again, if need be with fewer "
+    "--workers. A study goes on after the results that it has stored"
+)
 
 Say = Callable[[str, str], object]  # called with a task's name and its progress
 
@@ -67,7 +74,10 @@ class Engine:
         Raises:
             ModuleNotFoundError: Ray is not installed.
             NoCluster: there is no Ray cluster at this address.
+            WorkerKilled: a worker process was killed, and the others with it.
             Any exception of a task, after the tasks that already run have ended; on Ray, after all others have.
+
+        If the caller stops, because it cannot store a result or the user presses Ctrl-C, no task goes on.
         """
         if self.ray and tasks:
             from brakeline.deploy.experiments.ray_tasks import run_on_ray
@@ -99,25 +109,33 @@ def robot_folder(root: Path, robot: str) -> Path:
 
 def _run_in_processes(tasks: Sequence[T], workers: int, runs: Path, say: Say) -> Iterator[tuple[T, Any]]:
     """Run each task in a process of its own."""
-    context, failure = spawning(), None
+    context, failure, others = spawning(), None, set(active_children())
     reader, writer = context.Pipe(duplex=False)
     with reader, writer, ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(writer,)) as pool:
-        under_way = {pool.submit(_run_task, task, folder_of(runs, task)): task for task in tasks}
-        while under_way:
-            done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
-            while reader.poll():
-                say(*parse_json(reader.recv_bytes()))
-            for future in done:
-                task = under_way.pop(future)
-                if future.cancelled():
-                    continue
-                if error := future.exception():
-                    failure = failure or error
-                    for other in under_way:
-                        other.cancel()
-                else:
-                    yield task, future.result()
-                    say(task.name, "done")
+        try:
+            under_way = {pool.submit(_run_task, task, folder_of(runs, task)): task for task in tasks}
+            while under_way:
+                done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
+                while reader.poll():
+                    say(*parse_json(reader.recv_bytes()))
+                for future in done:
+                    task = under_way.pop(future)
+                    if future.cancelled():
+                        continue
+                    if error := future.exception():
+                        failure = failure or error
+                        for other in under_way:
+                            other.cancel()
+                    else:
+                        yield task, future.result()
+                        say(task.name, "done")
+        except BaseException:  # nobody takes further results: Ctrl-C, or the last one could not be stored
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in set(active_children()) - others:
+                worker.kill()
+            raise
+    if isinstance(failure, BrokenProcessPool):
+        raise WorkerKilled(KILLED) from failure
     if failure is not None:
         raise failure
 

@@ -23,7 +23,7 @@ from typing import Any
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import CellConfig, cell_configs, learning
 from brakeline.deploy.experiments.evaluate import in_process
-from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.experiment_jobs import configuration, task_hash
 from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import RobotWithTask, robot_with_task
@@ -92,6 +92,7 @@ class FilterTuning:
     physics: int
     episodes: int = EPISODES
     seed_key: int = SEED_KEY
+    task: str = ""  # see `experiment_jobs.task_hash`
 
     @property
     def name(self) -> str:
@@ -164,7 +165,8 @@ def tuning_jobs(robot: str, methods: Sequence[str], arenas: tuple[str, ...]) -> 
                 jobs.append(LearnerTuning(robot, method, value, own))
         elif rival not in (NONE, DDPC) and METHODS[method].learner != SAC_LEARNER:
             values = values_of(rival, robot_with_task(robot))
-            jobs += [FilterTuning(robot, method, value, task.simulator_version) for value in values]
+            own_task = task_hash(robot)
+            jobs += [FilterTuning(robot, method, value, task.simulator_version, task=own_task) for value in values]
     return jobs
 
 

@@ -26,6 +26,7 @@ from brakeline.logs.log_analysis import SETUP
 from brakeline.logs.tube_stats import stated
 from brakeline.logs.viewer import SCRIPTS, STYLES, viewer_file
 from brakeline.messaging import stated_share
+from brakeline.messaging.atomic_files import whole_or_nothing
 
 OWN_STYLES = ("report.css",)
 PAGE = "report.html.j2"
@@ -78,10 +79,10 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
 
 
 def write(path: Path, figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> None:
-    """Write the page to a file; create its folder if needed."""
+    """Write the page to a file; create its folder if needed. Raises OSError: an earlier page stays."""
     page = render(figures, runs)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    with whole_or_nothing(path) as place:
+        place.write_text(page, encoding="utf-8")
 
 
 def rates(figures: Figures) -> list[Figures]:

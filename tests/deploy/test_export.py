@@ -13,6 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from brakeline import Filter, InProcess, RecordedClient
 from brakeline.messaging import brakeline_pb2 as pb
+from tests.full_disk import full_disk
 from tests.robots import GROUND
 
 STEPS = 150
@@ -95,6 +96,14 @@ def test_foxglove_draws_every_step_and_keeps_every_byte(log, tmp_path, command, 
     assert figures("export", out, "--foxglove", again)["foxglove"]["messages"] == count, "old pictures are not kept"
     assert command("replay", out)[0] == 0, "the model sets are in it too"
     assert command("export", log, "--foxglove", out)[0] == 1
+
+
+def test_a_full_disk_leaves_no_part_of_an_export(log, tmp_path, command) -> None:
+    """Else the next attempt would find the file there and refuse to write it."""
+    with full_disk(20_000):
+        for form in ("--foxglove", "--csv"):
+            assert command("export", log, form, tmp_path / "out")[0] == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_export_of_a_damaged_log_says_what_it_lacks(damaged, tmp_path, command) -> None:

@@ -1,6 +1,5 @@
 import itertools
 import json
-import resource
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -12,6 +11,7 @@ from brakeline.errors import CheckpointError
 from brakeline.learner import checkpoint
 from brakeline.learner.checkpoint import PartState
 from tests.faults.failing_calls import Died, failing, full
+from tests.full_disk import full_disk
 from tests.fuzz.mutations import flipped
 
 NAMES = ("big", "small")
@@ -126,13 +126,8 @@ def test_a_wrong_or_lost_pointer_and_a_lost_folder_are_no_fresh_start(tmp_path):
 
 def test_full_disk_leaves_the_one_before(tmp_path):
     save(tmp_path, 1)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))  # as on a full disk, the write itself fails
-    try:
-        with pytest.raises(checkpoint.CheckpointError, match="not written"):
-            save(tmp_path, 2)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(20_000), pytest.raises(checkpoint.CheckpointError, match="not written"):
+        save(tmp_path, 2)
     assert number_in(tmp_path) == 1
     assert names(tmp_path) == ["000001", "latest"]
     save(tmp_path, 3)

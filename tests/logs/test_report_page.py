@@ -17,6 +17,7 @@ from brakeline.logs.log_analysis import AnalysisOptions, LogAnalysis, analyse_ru
 from brakeline.logs.report_page import embedded, number, percent, render, write
 from brakeline.logs.segment import open_segment
 from tests.browser import Page, drawn
+from tests.full_disk import full_disk
 from tests.logs.conftest import show
 from tests.logs.sample_log import ABOUT, mixed
 
@@ -214,6 +215,15 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     analysis = analyse_runs(logs, AnalysisOptions(pictures=True))
     write(folder / "page.html", analysis.figures(), analysis.by_label())
     return folder / "page.html", [figures for figures, _ in analysis.by_label().values()]
+
+
+def test_a_full_disk_leaves_an_earlier_page(tmp_path: Path) -> None:
+    analysis = analyse_runs([mixed(tmp_path / "a", 1, 4)], AnalysisOptions(pictures=True))
+    page = tmp_path / "page.html"
+    page.write_text("earlier")
+    with full_disk(20_000), pytest.raises(OSError, match="File too large"):
+        write(page, analysis.figures(), analysis.by_label())
+    assert page.read_text() == "earlier"
 
 
 @pytest.fixture(scope="module")

@@ -1,17 +1,21 @@
 """The comparison: cells, figures by hand, and the same seed twice."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from brakeline.deploy.commands import compare_command
+from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments import bootstrap, compared_methods
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
+from brakeline.deploy.experiments.campaign import CampaignPart
 from brakeline.deploy.experiments.comparison_cells import (
     CellConfig,
     TrialConfig,
@@ -31,8 +35,11 @@ from brakeline.deploy.experiments.comparison_table import (
     table,
     written,
 )
-from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.experiment_jobs import configuration, task_hash, write
+from brakeline.deploy.experiments.experiment_jobs import read as read_result
 from brakeline.deploy.experiments.trials import EpisodeTable
+from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
+from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.rival_networks import FitConfig
 from brakeline.logs.figure_tables import analyse
@@ -333,3 +340,26 @@ def test_the_goals_of_training_are_counted_in_thirds_of_the_steps():
     assert [rates[row].seeds for row in THIRDS] == [(0.0, 1.0), (0.5, 1.0), (1.0, 0.5)]
     empty = _goals_by_third([trained([1, 1], [10, 120])])
     assert empty[THIRDS[2]] is None and written(THIRDS[2], None) == "–" and plain(None) is None
+
+
+def test_results_of_a_robot_of_ones_own_with_another_task_or_description_are_refused(tmp_path):
+    """Else a study would show, or add up, episodes of arenas that the file no longer describes."""
+    folder = shutil.copytree(Path(__file__).parents[3] / "examples" / "car", tmp_path / "car")
+    car, before = str(folder / "car.toml"), {}
+
+    def jobs():
+        part = CampaignPart(car, "default", "random", "none", "as-recorded", 0.1, 0, 1)
+        yield CampaignCommand(runs=tmp_path, results=tmp_path)._prepared(robot_with_task(car), part)
+        yield from CompareCommand(methods=("ddpc",), seeds=(0,))._jobs(car)
+        yield from tuning_jobs(car, ("secas",), ("default",))
+
+    for file, old, new in (("car.task.toml", "gap = 0.3", "gap = 0.4"), ("car.toml", "period = 0.2", "period = 0.3")):
+        before = {job.name: job for job in jobs()}
+        assert len(before) == 3 + len(values_of("secas", robot_with_task(car)))
+        (folder / file).write_text(changed := (folder / file).read_text().replace(old, new, 1))
+        assert new in changed
+        for job in jobs():
+            write(tmp_path / file, job, {"study": configuration(before[job.name])})
+            with pytest.raises(ResultError, match=r"another .*task"):
+                read_result(tmp_path / file, job)
+    assert task_hash("ground") == task_hash("ground+tracks") == "", "shipped robots change with Brakeline only"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, write
+from brakeline.deploy.experiments.experiment_jobs import complete, configuration, read, result_path, write
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.errors import ResultError
 from tests.waiting import until
@@ -69,6 +70,21 @@ def test_a_result_from_before_a_setting_had_its_default(tmp_path):
         read(tmp_path, Errand(1))
 
 
+@pytest.mark.parametrize(
+    "content", [b"", b'{"study": {"num', b"[]", b"null", b'{"study": [1]}', b"{}", b"\xff\xfe0", bytes(9)]
+)
+def test_a_damaged_result_is_named_with_what_to_do(tmp_path, content):
+    """After a power cut, a file may be empty."""
+    write(tmp_path, Errand(1), {})
+    path = result_path(tmp_path, Errand(1))
+    path.write_bytes(content)
+    with pytest.raises(ResultError, match="run again with --again") as refused:
+        read(tmp_path, Errand(1))
+    assert str(path) in str(refused.value)
+    complete([Errand(1)], tmp_path, tmp_path / "runs", again=True)
+    assert read(tmp_path, Errand(1)) is not None
+
+
 @dataclass(frozen=True)
 class Nap(Errand):
     """A job that says which process does it, and does not end."""
@@ -81,27 +97,75 @@ class Nap(Errand):
 
 
 NAPS = """
+import signal
 from pathlib import Path
 from brakeline.deploy.experiments.experiment_jobs import complete
 from brakeline.deploy.experiments.task_engine import Engine
 from tests.deploy.experiments.test_experiment_jobs import Nap
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     complete([Nap(1), Nap(2)], Path({0!r}) / "results", Path({0!r}) / "runs", engine=Engine(2))
 """
 
 
-def test_killed_it_leaves_no_worker_behind(tmp_path):
+@pytest.fixture
+def napping(tmp_path):
+    """A process whose two workers are at work, with all its child processes."""
     (tmp_path / "naps.py").write_text(NAPS.format(str(tmp_path)))
     root = Path(__file__).parents[3]
-    popen = subprocess.Popen([sys.executable, tmp_path / "naps.py"], env=os.environ | {"PYTHONPATH": str(root)})
+    popen = subprocess.Popen(
+        [sys.executable, tmp_path / "naps.py"],
+        env=os.environ | {"PYTHONPATH": str(root)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     marks = [tmp_path / "runs" / "ground" / f"errand-{n}" / "ground" / f"errand-{n}.json" for n in (1, 2)]
     until(lambda: all(mark.exists() for mark in marks), "both are at work")
-    workers = {json.loads(mark.read_text())["pid"] for mark in marks}
+    workers = [json.loads(mark.read_text())["pid"] for mark in marks]
     children = psutil.Process(popen.pid).children(recursive=True)
-    assert workers <= {child.pid for child in children}
-    popen.kill()
-    popen.wait()
+    assert set(workers) <= {child.pid for child in children}
+    with popen:
+        yield popen, workers
+        popen.kill()
     until(lambda: not any(child.is_running() for child in children), "all have ended", 10.0)
+
+
+def test_killed_it_leaves_no_worker_behind(napping):
+    napping[0].kill()
+
+
+def test_interrupted_alone_it_does_not_wait_for_its_workers(napping):
+    """A terminal interrupts the workers too, but `kill -INT` and supervisors only their parent."""
+    napping[0].send_signal(signal.SIGINT)
+    assert napping[0].wait(20.0) != 0
+
+
+def test_a_worker_that_is_killed_ends_it_and_says_what_to_do(napping):
+    os.kill(napping[1][0], signal.SIGKILL)
+    assert "run the command again" in napping[0].communicate(timeout=20.0)[1]
+
+
+@dataclass(frozen=True)
+class Short(Nap):
+    """A nap, or for number 0 a result that no file can hold."""
+
+    def run(self, folder: Path, say) -> dict:
+        return super().run(folder, say) if self.number else {"set": {1}}
+
+
+def test_if_a_result_cannot_be_stored_no_job_goes_on(tmp_path):
+    started = time.monotonic()
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        complete([Short(n) for n in range(6)], tmp_path / "results", tmp_path / "runs", engine=Engine(2))
+    assert time.monotonic() - started < 60.0, "the naps last ten minutes each"
+
+
+def test_a_folder_that_cannot_hold_results_is_an_error_before_any_job_runs(tmp_path):
+    (tmp_path / "results").write_text("a file")
+    for engine in (Engine(1), Engine(2)):
+        with pytest.raises(NotADirectoryError):
+            complete([Errand(1), Errand(2)], tmp_path / "results", tmp_path / "runs", engine=engine)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_side_by_side_they_give_the_same_and_one_that_fails_loses_nothing_that_was_done(tmp_path):

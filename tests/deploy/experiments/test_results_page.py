@@ -25,6 +25,7 @@ from brakeline.deploy.experiments.tuning_trials import (
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.task import robot_with_task
+from tests.full_disk import full_disk
 
 # Of 100 episodes, by run; in `dense` 10 fewer.
 GOALS = {"ddpc": (100, 98, 96, 94), "none": (97, 93, 80), "sac": (90,), "lagrange": (90,)}
@@ -131,6 +132,21 @@ def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
     assert written > {"profiles.png", "curves.png", "seeds.png", "table.md", "table.json"}
 
 
+def test_a_full_disk_leaves_the_tables_that_were_there(results):
+    command = CompareCommand(("ground",), table=True, results=results, quiet=True)
+    assert command.run() == 0
+    before = {path: path.read_bytes() for path in results.rglob("*") if path.suffix in (".md", ".json")}
+    with full_disk(1_000), pytest.raises(OSError, match="File too large"):
+        command.run()
+    assert before == {path: path.read_bytes() for path in before}
+
+
+def test_a_damaged_cell_is_named_with_what_to_do(results):
+    (results / "ground" / "ddpc-s0.json").write_text('{"study": {"robot": "gro')
+    with pytest.raises(ResultError, match=r"ddpc-s0\.json is damaged .* run again with --again"):
+        stored_cells(results, "ground")
+
+
 def test_rivals_are_tuned_over_as_many_values_and_the_page_lists_them(results):
     jobs = tuning_jobs("ground", tuple(METHODS), ("default", "dense"))
     counts = {job.method: sum(other.method == job.method for other in jobs) for job in jobs}
@@ -166,7 +182,7 @@ def test_a_missing_extra_of_a_method_is_told_before_any_training(monkeypatch, tm
     assert not list(tmp_path.iterdir())
 
 
-SAID = {"half_width_rest": 0.0056, "half_width_full": 0.0081, "violations": 2, "windows": 1981, "bound_plan": 0.0042}
+SAID = {"half_width_rest": 0.0056, "half_width_full": 0.0081, "violations": 2, "windows": 1981, "bound_plan": 0.004236}
 
 
 def test_every_kind_of_row_of_the_certificates_has_all_columns():
@@ -183,5 +199,5 @@ def test_every_kind_of_row_of_the_certificates_has_all_columns():
     lines = conservatism.markdown({"study": study, "rows": rows}).splitlines()
     table = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in table}) == 1 and len(table) == 5
-    assert "| 5.6 mm | 8.1 mm | 2 of 1981 | 0.42% | 60, 5.0% | 7, 5.0% |" in table[2]
+    assert "| 5.6 mm | 8.1 mm | 2 of 1981 | 0.43 % | 60, 5.0% | 7, 5.0% |" in table[2]
     assert "3e+05 m" in table[3] and "not driven" in table[3] and "refused: poor data" in table[4]
