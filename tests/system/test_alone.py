@@ -3,13 +3,13 @@
 import json
 import signal
 
-from brakeline.actors.ros2.ros2_process import Ros2Settings
 from brakeline.deploy.commands.ros2_command import Ros2Command
 from brakeline.deploy.data.data_paths import method_path
 from brakeline.logs.figure_tables import analyse
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
+from brakeline.messaging.robot import robot_named
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 from tests.system.runs import brakeline, refused
@@ -58,7 +58,7 @@ def test_safety_learner_actor_and_recorder_alone_with_the_keys_that_were_handed_
     assert near["kind"] in ("allowed", "adjusted")
     stranger = refused("query", "ground", "--known-free", *there, "--keys", parts / "actor-7")
     assert "no keys of client" in stranger
-    with Ros2Command(connect=(endpoint,), keys=parts / "client")._asker(Ros2Settings("ground", lead=30.0)) as question:
+    with Ros2Command(connect=(endpoint,), keys=parts / "client")._asker(robot_named("ground"), lead=30.0) as question:
         (reply,) = question([pb.Request(robot="ground")])
     assert reply.error.field == "plan", "a ROS robot's questions are heard, and this one was empty"
     status = brakeline("status", *there, "--keys", parts / "viewer")
