@@ -14,6 +14,7 @@ from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotG
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
 from brakeline.deploy.policy_loading import file_named, policy_named
+from brakeline.deploy.run.run_config import SEEDS
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.logs.episode_stats import EpisodeStats, closed_loop
 from brakeline.logs.log_analysis import perception_in
@@ -27,7 +28,7 @@ from brakeline.sim.scripted_policies import Policy
 from brakeline.sim.shared_world import FleetEnv
 from brakeline.sim.sim_conditions import Conditions
 
-FRESH = 1_000_000  # added to the seed, so that no training run has the same episodes
+FRESH = SEEDS  # added to the seed, so that no training run has the same episodes
 EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
 EPISODES_OF_A_BATCH = 1000  # the same for a batch, which waits for its last episodes at the end of a part
 POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
@@ -52,10 +53,10 @@ class Evaluation:
     accept_bound: float | None = None  # the largest stated bound that is accepted; None: the robot's own limit
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or self.seed < 0 or self.fleet < 0:
+        if self.episodes < 1 or not 0 <= self.seed < SEEDS or self.fleet < 0:
             raise ValueError(
-                "an evaluation has at least 1 episode, a seed of at least 0 and a fleet of at least 0 robots, not "
-                f"{self.episodes}, {self.seed} and {self.fleet}"
+                f"an evaluation has at least 1 episode, a seed from 0 to {SEEDS - 1} and a fleet of at least 0 robots, "
+                f"not {self.episodes}, {self.seed} and {self.fleet}"
             )
 
 

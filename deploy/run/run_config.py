@@ -24,6 +24,7 @@ MOST_IN_PROCESS = 64  # robots for which the access list lets a process publish,
 FORMER_NAMES = {"recipe": "model_config"}  # names that fields have in older files
 
 T = TypeVar("T")
+SEEDS = 1_000_000  # number of seeds of trainings; evaluations and tunings draw their episodes from larger ones
 Internal = Annotated[T, tyro.conf.Suppress]  # a field that commands set from other options, or by themselves
 
 
@@ -110,6 +111,8 @@ class RunConfig:
             raise ValueError(f"no method is called {self.method!r}; there are: {', '.join(METHODS)}")
         if (self.robots, self.arena) != (RunConfig.robots, RunConfig.arena):
             _check_arenas(self.robots, self.arena)
+        if not 0 <= self.seed < SEEDS:
+            raise ValueError(f"a seed is a number from 0 to {SEEDS - 1}, not {self.seed}: evaluations have the others")
         if self.fleet:
             _check_fleets(self)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):

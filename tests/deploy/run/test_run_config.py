@@ -11,9 +11,11 @@ import pytest
 from brakeline.actors.actor_settings import PhysicsChange
 from brakeline.deploy.commands.fly_command import FlyCommand
 from brakeline.deploy.commands.train_command import TrainCommand
+from brakeline.deploy.experiments.evaluate import FRESH, Evaluation
+from brakeline.deploy.experiments.tuning_trials import SEED_KEY
 from brakeline.deploy.policy_loading import policy_named
 from brakeline.deploy.run.processes import client_settings, metrics_address, process_specs, write_endpoint
-from brakeline.deploy.run.run_config import EXPERIMENTS, RunConfig, decode, encode, load
+from brakeline.deploy.run.run_config import EXPERIMENTS, SEEDS, RunConfig, decode, encode, load
 from brakeline.deploy.run.run_keys import make_run_keys
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.messaging.bus import BusSettings
@@ -85,6 +87,16 @@ def test_counts_are_one_or_more_and_a_deterministic_run_has_one_robot() -> None:
     assert RunConfig(deterministic=True, actors=1).learning().lockstep
     learning = RunConfig(seed=4, steps=77).learning()
     assert (learning.seed, learning.steps, learning.lockstep) == (4, 77, False)
+
+
+@pytest.mark.parametrize("seed", [-1, SEEDS])
+def test_no_training_has_the_episodes_of_an_evaluation(seed: int) -> None:
+    """With a seed of a million, it had those of `evaluate --seed 0`."""
+    assert RunConfig(seed=SEEDS - 1).seed < FRESH <= FRESH + Evaluation("random", seed=SEEDS - 1).seed < SEED_KEY
+    with pytest.raises(ValueError, match="a seed is a number from 0 to 999999"):
+        RunConfig(seed=seed)
+    with pytest.raises(ValueError, match="a seed from 0 to 999999"):
+        Evaluation("random", seed=seed)
 
 
 def test_the_processes_of_a_run() -> None:
