@@ -32,6 +32,7 @@ from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
 EXTRA_SIGHT = 0.2  # m: hits count up to the robot's sight plus this, since it drives on until the next scan
 STRAIGHT = 0.02  # m: hits that are nearer to a line belong to one wall
 MOST_BEAMS = 10_000
+MORE_BEAMS = 2.5  # than a turn has: some drivers repeat the first beam at the end
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,8 @@ def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
     limits = (scan.range_min, scan.range_max, scan.angle_min, gap, scan.time_increment)
     if not (2 <= n <= MOST_BEAMS and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST_BEAMS):
         raise BadScan(f"{n} beams, {gap:g} rad apart")
+    if n * abs(gap) > 2.0 * math.pi + MORE_BEAMS * abs(gap):
+        raise BadScan(f"{n} beams, {gap:g} rad apart, are more than a turn: are its angles in radians?")
     if not 0.0 <= scan.range_min < scan.range_max:
         raise BadScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")
     times = seconds(scan.header.stamp) + float(scan.time_increment) * np.arange(n)

@@ -186,6 +186,7 @@ def test_each_beam_starts_where_the_robot_was_at_its_time():
         {"angle_increment": 0.0},
         {"angle_increment": 1e-9},
         {"angle_increment": math.nan},
+        {"angle_increment": 1.0},  # degrees
         {"angle_min": math.inf},
         {"range_min": -1.0},
         {"range_max": 0.0},
