@@ -41,7 +41,8 @@ TIGHTER = 0.9  # largest ratio of the new half-widths to the widened ones in use
 # Least ratio of a range of the recent driving to that of the set in use. A fit knows its range, and the filter keeps
 # the robot within it. An update keeps the range of the set in use.
 FITTED, UPDATED = 0.5, 0.75
-NARROWER = "narrower"  # in `about` of a fit to less than `UPDATED`: the speed or input with the least ratio
+# In `about` of a fit to less than `UPDATED`, and of all sets after it: the speed or input that the fit covered least.
+NARROWER = "narrower"
 MOST_ROBOTS = 10_000
 WAITING = "waiting"  # the first word of `Adaptation.progress`
 SILENT = 30.0  # s after which a robot counts as gone
@@ -266,8 +267,8 @@ class Adaptation:
             covered = _coverage(in_use, data)
         except (BadData, BadModel) as error:
             return Recertification(f"none {why}: {error}")
-        if covered.narrower:
-            data = replace(data, about=data.about | {NARROWER: covered.name})
+        if narrower := covered.name if covered.narrower else in_use.about.get(NARROWER):  # an update inherits it
+            data = replace(data, about=data.about | {NARROWER: narrower})
         most = _largest_half_width(in_use, widening, data)
         updatable = in_use.model_config.mode == ONE_STEP and not covered.narrower
         ways = (_fitted, _updated) if updatable else (_fitted,)
@@ -317,7 +318,12 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class _Coverage:
-    """The speed, acceleration or input of whose range in the set in use recent driving covers the least share."""
+    """The speed, acceleration or input of which recent driving covers least.
+
+    Attributes:
+        name: its label in the robot's description.
+        share: the driven range, as a share of the range in the set in use.
+    """
 
     name: str
     share: float
@@ -335,7 +341,7 @@ class _Coverage:
 def _coverage(in_use: ModelSet, data: Dataset) -> _Coverage:
     """Return what the recent driving covers least. Raises BadData: too little for a fit, which would slow the robot.
 
-    A fit to a narrower range is not followed by one to a still narrower range.
+    After a fit to less than `UPDATED`, later sets must cover `UPDATED`: the robot must not become slower with each set.
     """
     ranges, recorded = np.ptp(in_use.domain, axis=0), np.ptp(recorded_domain(data), axis=0)
     shares = np.divide(recorded, ranges, out=np.full(len(ranges), np.inf), where=ranges > 0.0)

@@ -112,7 +112,7 @@ class RunConfig:
         if (self.robots, self.arena) != (RunConfig.robots, RunConfig.arena):
             _check_arenas(self.robots, self.arena)
         if not 0 <= self.seed < SEEDS:
-            raise ValueError(f"a seed is a number from 0 to {SEEDS - 1}, not {self.seed}: evaluations have the others")
+            raise ValueError(f"a seed is a number from 0 to {SEEDS - 1}, not {self.seed}: evaluations have larger ones")
         if self.fleet:
             _check_fleets(self)
         if min(self.robots_per_actor, self.replicas, self.steps) < 1 or self.actors < (0 if self.from_logs else 1):

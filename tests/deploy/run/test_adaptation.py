@@ -246,6 +246,9 @@ def test_narrow_driving_makes_a_set_that_keeps_the_robot_within_it():
     kind = Adaptation(ROBOT, sets.__getitem__, ACCEPTED)
     (again,) = drive(kind, driven(4, 7, slip=-0.3, share=0.4), widening=8.0, version="new")
     assert again.model is None and "not 75%" in again.text, "it would become slower with each set"
+    kind = Adaptation(ROBOT, sets.__getitem__, ACCEPTED)
+    (wide,) = drive(kind, driven(5, 7, slip=-0.3, share=0.6), widening=8.0, version="new")
+    assert wide.model is not None and wide.model.about[NARROWER] == new.about[NARROWER], "nor after a set of all of it"
 
 
 def test_an_update_of_the_set_in_use_holds_on_fresh_driving():
