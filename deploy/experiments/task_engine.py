@@ -111,9 +111,12 @@ def _run_in_processes(tasks: Sequence[T], workers: int, runs: Path, say: Say) ->
     """Run each task in a process of its own."""
     context, failure, others = spawning(), None, set(active_children())
     reader, writer = context.Pipe(duplex=False)
+    workers = min(workers, len(tasks))
     with reader, writer, ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(writer,)) as pool:
         try:
             under_way = {pool.submit(_run_task, task, folder_of(runs, task)): task for task in tasks}
+            # The pool wakes its watcher before it starts a worker, whose death may then go unnoticed: wake it again.
+            pool.submit(_nothing)
             while under_way:
                 done, _ = wait(under_way, timeout=0.5, return_when=FIRST_COMPLETED)
                 while reader.poll():
@@ -150,6 +153,10 @@ def _start_worker(progress: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends workers too, without a traceback
     if not end_with_spawner(signal.SIGKILL):
         os._exit(1)
+
+
+def _nothing() -> None:
+    """Return."""
 
 
 def _run_task(task: StudyTask, folder: Path) -> Any:

@@ -140,8 +140,9 @@ def test_interrupted_alone_it_does_not_wait_for_its_workers(napping):
     assert napping[0].wait(20.0) != 0
 
 
-def test_a_worker_that_is_killed_ends_it_and_says_what_to_do(napping):
-    os.kill(napping[1][0], signal.SIGKILL)
+@pytest.mark.parametrize("worker", [0, 1])
+def test_a_worker_that_is_killed_ends_it_and_says_what_to_do(napping, worker):
+    os.kill(napping[1][worker], signal.SIGKILL)
     assert "run the command again" in napping[0].communicate(timeout=20.0)[1]
 
 
