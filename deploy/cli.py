@@ -12,6 +12,7 @@ import difflib
 import errno
 import importlib
 import os
+import signal
 import sys
 from contextlib import nullcontext
 from copy import copy
@@ -35,6 +36,7 @@ from tyro.constructors import (
 
 from brakeline.deploy import progress
 from brakeline.extras import missing_extra
+from brakeline.messaging.stop_signals import interrupt_on_signals
 
 # tyro shows `X | None` as `{None}|X`, takes the word None, and names Python's NoneType if it can't parse a value. An
 # option that is left out is None already, so that only X is shown and parsed.
@@ -250,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command. Returns the exit status.
 
     0: done. 1: the command failed; stderr has the reason. 2: the command line can't be parsed. 130: the user
-    interrupted the command. A command may have further ones.
+    interrupted the command; 143 and 129: SIGTERM or SIGHUP did. A command may have further ones.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes with two threads each on two cores are slower
     words = sys.argv[1:] if arguments is None else arguments
@@ -269,11 +271,12 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     command: Any = None
     try:
-        command = parse(name, words[1:])
-        with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
-            return int(command.run())
-    except KeyboardInterrupt:
-        return 130
+        with interrupt_on_signals():
+            command = parse(name, words[1:])
+            with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
+                return int(command.run())
+    except KeyboardInterrupt as interrupted:
+        return 128 + next(iter(interrupted.args), signal.SIGINT)
     except BrokenPipeError:  # the reader of the output, such as `head`, has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -176,3 +176,34 @@ def test_the_handlers_are_restored_and_another_thread_changes_none() -> None:
     thread.start()
     thread.join()
     assert seen == before
+
+
+INTERRUPTED = """
+import signal, time
+from brakeline.messaging.stop_signals import interrupt_on_signals
+signal.signal(signal.SIGHUP, signal.{hangup})  # the tests may run under nohup
+with interrupt_on_signals():
+    try:
+        print("ready", flush=True)
+        time.sleep({seconds})
+    except KeyboardInterrupt as error:
+        time.sleep(0.3)  # while it stores a file
+        print("stored", error, flush=True)
+"""
+
+
+def test_sigterm_interrupts_as_ctrl_c_does_and_its_echo_changes_nothing(spawn: Spawn) -> None:
+    process = spawn(INTERRUPTED.format(hangup="SIG_DFL", seconds=30))
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=20.0)
+    assert (process.returncode, output) == (0, f"stored {signal.SIGTERM:d}\n")
+
+
+def test_a_closed_terminal_interrupts_but_not_under_nohup(spawn: Spawn) -> None:
+    process = spawn(INTERRUPTED.format(hangup="SIG_DFL", seconds=30))
+    process.send_signal(signal.SIGHUP)
+    assert process.communicate(timeout=20.0)[0] == f"stored {signal.SIGHUP:d}\n"
+    process = spawn(INTERRUPTED.format(hangup="SIG_IGN", seconds=0.5))
+    process.send_signal(signal.SIGHUP)
+    assert process.communicate(timeout=20.0)[0] == "" and process.returncode == 0

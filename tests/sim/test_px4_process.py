@@ -73,11 +73,24 @@ def port_is_free(port: int) -> bool:
         return True
 
 
-def test_sigterm_during_the_start_of_px4_ends_it_and_leaves_no_files(build, tmp_path) -> None:
-    command = [sys.executable, "-m", "brakeline.deploy.cli", "autopilot", "--px4", str(build), "--truth", ""]
-    running = subprocess.Popen(command, cwd=tmp_path, env=os.environ, stderr=subprocess.PIPE, text=True)
+ROBOT = Path(__file__).parents[2] / "examples" / "px4" / "quadrotor_px4.toml"
+
+
+@pytest.mark.parametrize(
+    "command, status, words",
+    [
+        (("autopilot", "--truth", "", "--px4"), 1, "asked to stop before PX4 had started"),
+        (("collect", str(ROBOT), "--trajectories", "1", "--out"), 128 + signal.SIGTERM, "You can interrupt it"),
+    ],
+    ids=["autopilot", "collect"],
+)
+def test_sigterm_during_the_start_of_px4_ends_it_and_leaves_no_files(build, tmp_path, command, status, words) -> None:
+    last = str(build) if command[-1] == "--px4" else str(tmp_path / "x.safetensors")
+    program = [sys.executable, "-m", "brakeline.deploy.cli", *command, last]
+    environment = os.environ | {"BRAKELINE_PX4": str(build)}
+    running = subprocess.Popen(program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
     until(lambda: left(build), "the command has begun", 60.0)
     running.send_signal(signal.SIGTERM)
     _, err = running.communicate(timeout=20.0)
-    assert running.returncode == 1 and "asked to stop before PX4 had started" in err
+    assert running.returncode == status and words in err
     assert not left(build)
