@@ -47,7 +47,7 @@ def stop_on_signals(stop: threading.Event, patient: bool = False) -> Iterator[th
 
 @contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGTERM and SIGHUP within the block, with the signal's number; only in the main thread.
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP within the block, with their number; only in the main thread.
 
     A program that they kill would lose what it has not stored, and leave its temporary files behind. Signals within
     `REPEAT_TIME` are one: `timeout` sends SIGTERM twice.

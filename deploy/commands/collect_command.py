@@ -57,7 +57,6 @@ class CollectCommand:
         return 0
 
     def _first_flight(self) -> int:
-        from brakeline.deploy.data.build_lock import folder_lock
         from brakeline.deploy.data.data_paths import model_path, note_mode, record_path
         from brakeline.deploy.run.first_flight_run import fly
         from brakeline.messaging.task import robot_maybe_with_task
@@ -68,9 +67,7 @@ class CollectCommand:
             raise ValueError(f"a {robot.kind} robot does not fly: leave out --url")
         accepted_bound(robot, self.accept_bound)
         path = self.out or record_path(robot).with_name("flown.safetensors")
-        flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first)
-        with folder_lock(path.parent):
-            flight.data.save(path)
+        flight = fly(robot.in_lockstep().in_real_time(), self.url, self.seed, self.first, path)
         minutes, model, report = flight.seconds / 60.0, flight.model, flight.report
         figures: dict[str, Any] = {"path": str(path), "periods": flight.data.periods, "minutes": minutes}
         figures |= {"level": flight.level, "missing": flight.missing}

@@ -135,12 +135,18 @@ class FirstFlight:
             self._missing.append(str(error))
         self._cut()
 
-    def result(self, about: dict[str, str]) -> FirstFlightResult:
-        """Return the data, and the model set if the data support one. Raises BadData: nothing was recorded."""
+    def result(self, about: dict[str, str], store: Callable[[Dataset], object]) -> FirstFlightResult:
+        """Return the data, and the model set if the data support one.
+
+        store: called with the data before the fit of the model set, which may be interrupted.
+
+        Raises BadData: nothing was recorded.
+        """
         missing, reached = list(self._missing), self._reached
         if not self._flown:
             raise BadData(f"nothing was recorded: {'; '.join(missing)}")
         data = self._dataset(about)
+        store(data)
         model, report = self._model(data, missing)
         if (drift := self._drift()) > MAX_DRIFT:
             missing.append(

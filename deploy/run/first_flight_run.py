@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from brakeline.messaging.stop_signals import stop_on_signals
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
     from brakeline.deploy.data.first_flight import FirstFlightResult
+    from brakeline.safety.model.dataset import Dataset
 
 log = logging.getLogger("brakeline.collect")
 
@@ -44,14 +46,15 @@ class FirstFlightSettings:
     so use it with both `collect` and `fly`."""
 
 
-def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> FirstFlightResult:
-    """Take off, fly, land, and return the recorded data and the model set of it.
+def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: Path) -> FirstFlightResult:
+    """Take off, fly, land, store the recorded data, and return them with their model set.
 
     SIGINT or SIGTERM land the vehicle at once, and so does any error; the data until then count.
 
     Args:
         robot: the description in real time.
         url: the MAVLink link.
+        path: the file for the data.
 
     Raises:
         BadLink, MavlinkError: the vehicle can't be flown; the message says what to do.
@@ -60,6 +63,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
     from brakeline.actors.actor_settings import FlightSettings
     from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
     from brakeline.actors.mavlink.vehicle_socket import listening
+    from brakeline.deploy.data.build_lock import folder_lock
     from brakeline.deploy.data.first_flight import Box, FirstFlight
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
@@ -80,7 +84,13 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings) -> Fir
                 land(vehicle, robot.horizon)
         finally:
             vehicle.close()
-    return flight.result(metadata)
+
+    def store(data: Dataset) -> None:
+        with folder_lock(path.parent):
+            data.save(path)
+        log.info("the flight is stored in %s", path)
+
+    return flight.result(metadata, store)
 
 
 def land(vehicle: MavlinkVehicle, periods: int) -> None:

@@ -79,7 +79,7 @@ class Sluggish:
 def flown(vehicle: Sluggish, minutes: float, about: dict[str, str] | None = None, seed: int = 0) -> FirstFlightResult:
     flight = FirstFlight(vehicle, LATE, BOX, seed)
     flight.fly(minutes)
-    return flight.result(about or {})
+    return flight.result(about or {}, lambda data: None)
 
 
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +14,7 @@ from brakeline.deploy.data.first_flight import FirstFlight
 from brakeline.deploy.run import first_flight_run
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import BadData, FlightEnded, MavlinkError
+from brakeline.safety.model.dataset import Dataset
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
 from tests.actors.conftest import served
@@ -34,7 +37,11 @@ def standing() -> Iterator[tuple[str, Autopilot]]:
     ("error", "raised"), [(FlightEnded("the flight was stopped"), BadData), (RuntimeError("a defect"), RuntimeError)]
 )
 def test_a_flight_that_ends_at_once_or_fails_lands(
-    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, error: Exception, raised: type[Exception]
+    standing: tuple[str, Autopilot],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    error: Exception,
+    raised: type[Exception],
 ) -> None:
     url, autopilot = standing
 
@@ -44,12 +51,27 @@ def test_a_flight_that_ends_at_once_or_fails_lands(
 
     monkeypatch.setattr(FirstFlight, "_record", record)
     with pytest.raises(raised):
-        first_flight_run.fly(LATE, url, 0, SETTINGS)
+        first_flight_run.fly(LATE, url, 0, SETTINGS, tmp_path / "flown.safetensors")
     assert not autopilot.flight.armed and autopilot.vehicle.on_floor
 
 
+def test_a_flight_whose_model_set_is_interrupted_is_stored(
+    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    url, _ = standing
+
+    def model(self: FirstFlight, data: Dataset, missing: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FirstFlight, "_model", model)
+    path = tmp_path / "flown.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        first_flight_run.fly(LATE, url, 0, replace(SETTINGS, minutes=0.1), path)
+    assert Dataset.load(path).periods > 10
+
+
 def test_a_pilot_who_took_the_vehicle_keeps_it(
-    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     url, autopilot = standing
 
@@ -61,7 +83,7 @@ def test_a_pilot_who_took_the_vehicle_keeps_it(
 
     monkeypatch.setattr(FirstFlight, "_record", record)
     with pytest.raises(BadData, match="nothing was recorded: no control"):
-        first_flight_run.fly(LATE, url, 0, SETTINGS)
+        first_flight_run.fly(LATE, url, 0, SETTINGS, tmp_path / "flown.safetensors")
     assert autopilot.flight.armed and autopilot.flight.mode is Mode.HOLD
     assert any("not landing" in record.message for record in caplog.records)
 
@@ -75,9 +97,9 @@ def test_a_takeoff_that_is_stopped_lands(standing: tuple[str, Autopilot]) -> Non
     until(lambda: not autopilot.flight.armed, "it lands", 30.0)
 
 
-def test_a_first_flight_does_not_begin_in_the_air() -> None:
+def test_a_first_flight_does_not_begin_in_the_air(tmp_path: Path) -> None:
     """Its box reaches two thirds of --height below the place where it begins."""
     autopilot = Autopilot(quadrotor(), "px4")
     with served(autopilot) as url, pytest.raises(MavlinkError, match="flies already"):
-        first_flight_run.fly(LATE, url, 0, SETTINGS)
+        first_flight_run.fly(LATE, url, 0, SETTINGS, tmp_path / "flown.safetensors")
     assert autopilot.flight.mode is not Mode.OFFBOARD
