@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -13,7 +13,7 @@ from rich.markdown import Markdown
 
 from brakeline.deploy.commands.command_output import console, print_json
 from brakeline.deploy.commands.common_options import Json, Quiet, Unprefixed
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER
+from brakeline.deploy.experiments.compared_methods import METHODS, SAC_LEARNER
 from brakeline.deploy.experiments.comparison_cells import (
     RESULTS,
     RUNS,
@@ -30,6 +30,14 @@ from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.atomic_files import write_atomically
 
 QUICK = Path("runs/quick")
+OUTPUT = {"robots", "results", "quiet", "json"}
+USED = {  # options that --table and --tune use
+    "table": {"table", "quick", *OUTPUT},
+    "tune": {"tune", "methods", "arenas", "engine", "again", "runs", *OUTPUT},
+}
+OPTIONS = {"engine": "--workers or --ray", "conservatism": "--no-conservatism", "task_settings": "--no-task-settings"}
+
+Results = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -85,13 +93,13 @@ class CompareCommand:
 
     def run(self) -> int:
         """Train, evaluate and write the tables. Returns the exit status."""
-        from brakeline.deploy.data.model_store import method_for
-        from brakeline.deploy.experiments.results_page import page, stored_cells
+        from brakeline.deploy.experiments.results_page import page
+        from brakeline.deploy.experiments.stored_cells import stored_cells
         from brakeline.deploy.experiments.task_engine import robot_folder
         from brakeline.deploy.experiments.tuning_trials import tuning_jobs
-        from brakeline.messaging.task import address, robot_with_task
-        from brakeline.safety.model.model_config import ModelConfig
+        from brakeline.messaging.task import address
 
+        self._refuse_unused()
         results, runs = self.results, self.runs
         if self.quick:
             results = QUICK / "results" if results == RESULTS else results
@@ -100,30 +108,50 @@ class CompareCommand:
         robots = [address(robot) for robot in self.robots]
         # A wrong option ends the command before the first of hours of training.
         jobs_of = {} if self.table or self.tune else {robot: self._jobs(robot) for robot in robots}
+        jobs_of = {robot: (self._prepared(cells, results), others) for robot, (cells, others) in jobs_of.items()}
         for robot in robots:
-            if self.table:
-                if not (stored := stored_cells(results, robot)):
-                    raise ValueError(f"{results}: there are no results of {robot}; `brakeline compare` makes them")
-                tables[robot] = self._write(stored, [], robot_folder(results, robot))
-                continue
             if self.tune:
-                trials: list[Job] = [*tuning_jobs(robot, self._methods(robot), self.arenas)]
+                trials = tuning_jobs(robot, self._methods(robot), self.arenas)
                 complete(trials, results, runs, self.engine, self.again, say)
                 continue
-            jobs = jobs_of[robot]
-            filters = {METHODS[job.method].filter for job in jobs if isinstance(job, CellConfig)} - {NONE}
-            for method in sorted(filters):  # make the models that several trainings need, before all of them
-                method_for(robot_with_task(robot), method, ModelConfig())
-            finished = complete(jobs, results, runs, self.engine, self.again or self.quick, say)
-            cells = [result for result, job in zip(finished, jobs, strict=True) if isinstance(job, CellConfig)]
-            others = [result for result, job in zip(finished, jobs, strict=True) if not isinstance(job, CellConfig)]
-            tables[robot] = self._write(cells, others, robot_folder(results, robot))
+            cells, others = jobs_of.get(robot, ([], []))
+            finished = complete([*cells, *others], results, runs, self.engine, self.again or self.quick, say)
+            shown = finished[: len(cells)] if self.quick and not self.table else stored_cells(results, robot)
+            if not shown:
+                raise ValueError(f"{results}: there are no results of {robot}; `brakeline compare` makes them")
+            tables[robot] = self._write(shown, finished[len(cells) :], robot_folder(results, robot))
         if not self.quick:
             text = page(results, [folder.name for folder in sorted(results.iterdir()) if folder.is_dir()])
             write_atomically(results / "README.md", text.encode())
         if self.json:
             print_json(tables)
         return 0
+
+    def _refuse_unused(self) -> None:
+        """Raise ValueError for options that do nothing beside --table or --tune."""
+        usual = CompareCommand()
+        for mode, used in USED.items():
+            if getattr(self, mode):
+                names = [item.name for item in fields(self) if getattr(self, item.name) != getattr(usual, item.name)]
+                if unused := [OPTIONS.get(name, f"--{name.replace('_', '-')}") for name in names if name not in used]:
+                    raise ValueError(f"--{mode} ignores {', '.join(unused)}: leave these options out")
+
+    def _prepared(self, cells: list[CellConfig], results: Path) -> list[CellConfig]:
+        """Make the models that several trainings need, and note the model set of a robot of your own.
+
+        Raises ResultError: the cells do not compare with the stored ones.
+        """
+        from brakeline.deploy.data.model_store import method_for
+        from brakeline.deploy.experiments.stored_cells import check_addable
+        from brakeline.messaging.task import robot_with_task
+        from brakeline.safety.model.model_config import DDPC, ModelConfig
+
+        robot, filters = robot_with_task(cells[0].robot), set().union(*(cell.filters() for cell in cells))
+        versions = {method: method_for(robot, method, ModelConfig()).version for method in sorted(filters)}
+        noted = [replace(one, model_set=versions[DDPC]) if one.task and DDPC in one.filters() else one for one in cells]
+        if not self.quick:
+            check_addable(results, noted)
+        return noted
 
     def _methods(self, robot: str) -> tuple[str, ...]:
         methods = compared_on(robot, self.arenas) if self.methods is None else self.methods
@@ -133,13 +161,16 @@ class CompareCommand:
             import_module("stable_baselines3")  # a missing extra is told before hours of other trainings
         return methods
 
-    def _jobs(self, robot: str) -> list[Job]:
+    def _jobs(self, robot: str) -> tuple[list[CellConfig], list[Job]]:
+        """Return the cells of a robot, and the other jobs."""
         from brakeline.deploy.experiments.conservatism import Conservatism
         from brakeline.messaging.task import check_penalty, robot_with_task
 
         described = robot_with_task(robot)
         check_penalty(self.penalty, described)
         cells = cell_configs(robot, self._methods(robot), self.seeds, self.arenas, self.backend)
+        if not cells:
+            raise ValueError("nothing to compare: give at least one of --seeds and of --methods")
         cells = [cell for cell in cells if not self.quick or cell.seed == cells[0].seed]
         numbers: dict[str, Any] = {"steps": self.steps, "episodes": self.episodes, "robots": self.at_once}
         changed = {name: value for name, value in numbers.items() if value is not None}
@@ -147,16 +178,13 @@ class CompareCommand:
             raise ValueError(f"the number of {few[0]} is at least 1, not {changed[few[0]]}")
         if self.penalty is not None:
             changed["penalty"] = self.penalty
-        jobs: list[Job] = []
         settings = described.task.learner if self.task_settings else {}
-        for cell in cells:
-            own = replace(cell, td3=learning(self.td3, cell.method, settings))
-            jobs.append(replace(quick(own) if self.quick else own, **changed))
-        if self.conservatism and not self.quick:
-            jobs.append(Conservatism(robot, task=task_hash(robot)))
-        return jobs
+        own = [replace(cell, td3=learning(self.td3, cell.method, settings)) for cell in cells]
+        chosen = [replace(quick(cell) if self.quick else cell, **changed) for cell in own]
+        conservatism = self.conservatism and not self.quick
+        return chosen, [Conservatism(robot, task=task_hash(robot))] if conservatism else []
 
-    def _write(self, cells: list[dict[str, Any]], others: list[dict[str, Any]], folder: Path) -> Any:
+    def _write(self, cells: Results, others: Results, folder: Path) -> Any:
         """Write the tables and figures of a robot, and return its figures."""
         from brakeline.deploy.experiments import conservatism
         from brakeline.deploy.experiments.comparison_plots import learning_curves, profiles, seeds_as_points

@@ -61,8 +61,9 @@ class CellRun:
     def __init__(self, cell: CellConfig, folder: Path, say: Report, seed_key: int = FRESH) -> None:
         self.cell, self.folder, self.say, self.seed_key = cell, folder, say, seed_key
         self.robot = robot_with_task(cell.robot)
-        methods = {METHODS[cell.method].filter, *(trial.method for trial in cell.trials())} - {NONE}
-        self.models = {method: method_for(self.robot, method, cell.model_config) for method in methods}
+        self.models = {method: method_for(self.robot, method, cell.model_config) for method in cell.filters()}
+        if cell.model_set and self.models[DDPC].version != cell.model_set:
+            raise ResultError(f"the model set of {cell.robot} is no longer {cell.model_set}: run the comparison again")
 
     def result(self) -> dict[str, Any]:
         """Train and evaluate, and return the content of the cell's file."""

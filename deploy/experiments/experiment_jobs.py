@@ -5,17 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, ClassVar, Protocol
 
+from brakeline.deploy.data.build_lock import lock_at_once
 from brakeline.deploy.experiments.task_engine import IN_THIS_PROCESS, Engine, Say, StudyTask, robot_folder, unsaid
 from brakeline.errors import BadText, ResultError
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, task_values
 from brakeline.messaging.structured_text import parse_json
+
+LOCK = ".study.lock"
+# Metadata of a field that older results do not state: they stay usable, whatever its value is today.
+UNSTATED = {"unstated": True}
 
 
 class Job(StudyTask, Protocol):
@@ -85,6 +91,8 @@ def _completed(stored: dict[str, Any], job: Any) -> dict[str, Any]:
         value = getattr(job, field.name)
         if is_dataclass(value) and isinstance(values.get(field.name), dict):
             values[field.name] = _completed(values[field.name], value)
+        elif field.name not in values and field.metadata.get("unstated"):
+            values[field.name] = value
         elif field.name not in values and (default := _default(field)) is not MISSING:
             values[field.name] = default
     return values
@@ -103,6 +111,20 @@ def _check_writable(folder: Path) -> None:
     """Raise OSError if the folder cannot hold results, before a job runs for hours."""
     folder.mkdir(parents=True, exist_ok=True)
     TemporaryFile(dir=folder).close()
+
+
+@contextmanager
+def only_study(folders: Iterable[Path]) -> Iterator[None]:
+    """Hold the locks of folders of run data until the block ends. Raises ResultError: another study holds one."""
+    with ExitStack() as locks:
+        for folder in sorted(set(folders)):
+            folder.mkdir(parents=True, exist_ok=True)
+            if not locks.enter_context(lock_at_once(folder / LOCK)):
+                raise ResultError(
+                    f"another study runs in {folder}, and both would write the same logs: wait until it ends, then run "
+                    "this one again. To run them side by side, give another --runs and another --results"
+                )
+        yield
 
 
 def write(results: Path, job: Job, result: dict[str, Any]) -> None:
@@ -127,20 +149,24 @@ def complete(
         say: called with a job's name and its progress.
 
     Raises:
-        ResultError: a result was made with other settings, or two jobs have one name; raised before any job runs.
+        ResultError: a result was made with other settings, two jobs have one name, or another process runs a study of
+            the same robot in `runs`; raised before any job runs.
         OSError: a result cannot be stored. If its folder cannot be written, raised before any job runs.
         Any exception of a job, after the jobs that already run have ended.
     """
     paths = Counter(result_path(results, job) for job in jobs)
     if twice := [path for path, count in paths.items() if count > 1]:
         raise ResultError(f"{twice[0]} would hold two results: give each setting once, and files different names")
-    if again:
-        for job in jobs:
-            result_path(results, job).unlink(missing_ok=True)
-    missing = [job for job in jobs if read(results, job) is None]
+    missing = [job for job in jobs if again or read(results, job) is None]
     for folder in {result_path(results, job).parent for job in missing}:
         _check_writable(folder)
-    for job, result in engine.completed(missing, runs, say):
-        write(results, job, result)
+    with only_study(robot_folder(runs, job.robot) for job in missing):
+        if again:
+            for job in jobs:
+                result_path(results, job).unlink(missing_ok=True)
+        # Another study may have ended in the meantime.
+        missing = [job for job in missing if read(results, job) is None]
+        for job, result in engine.completed(missing, runs, say):
+            write(results, job, result)
     stored = [read(results, job) for job in jobs]
     return [result for result in stored if result is not None]

@@ -6,8 +6,6 @@ score of a run is its share of goals in an evaluation; its task is the arena.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,10 +16,9 @@ import numpy as np
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
 from brakeline.deploy.experiments.experiment_jobs import stored_result
-from brakeline.deploy.experiments.task_engine import robot_folder
+from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
 from brakeline.deploy.policy_loading import TRAINED
-from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.logs.proportion_intervals import clopper_pearson
 from brakeline.logs.run_groups import aggregate, probability_of_improvement
@@ -30,39 +27,6 @@ from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.model.model_config import DDPC
 
 Result = dict[str, Any]
-SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend", "robots")  # in all cells of a robot
-CELL = re.compile(r"-s\d+\.json$")
-
-
-def stored_cells(results: Path, robot: str) -> list[Result]:
-    """Return the stored cells of a robot, by method and seed.
-
-    Raises:
-        ResultError: a file is damaged, or cells differ in more than the method and its settings.
-    """
-    paths = sorted(robot_folder(results, robot).glob("*-s*.json"))
-    cells = [stored_result(path) for path in paths if CELL.search(path.name)]
-    order = list(METHODS)
-    cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
-    for name in SAME:
-        values = {str(cell["study"].get(name)) for cell in cells}
-        if len(values) > 1:
-            raise ResultError(
-                f"{results / robot}: the cells have more than one {name} ({', '.join(sorted(values))}): move the older "
-                "ones away"
-            )
-    for method in METHODS:
-        if len({_settings(cell) for cell in cells if cell["study"]["method"] == method}) > 1:
-            raise ResultError(f"{results / robot}: {method} has cells of several settings: run the older again")
-    return cells
-
-
-def _settings(cell: Result) -> str:
-    """Return the settings of a cell's filter and learner, without defaults of the learner: older cells lack some."""
-    study = cell["study"]
-    td3 = {name: value for name, value in study["td3"].items() if value != getattr(DEFAULTS, name, None)}
-    model = (cell["model"] or {}).get("settings"), study.get("model_config")
-    return json.dumps([*model, study.get("penalty", 1.0), td3], sort_keys=True)
 
 
 class RobotResults:

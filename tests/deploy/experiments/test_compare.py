@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
-from brakeline.deploy.experiments import bootstrap, compared_methods
+from brakeline.deploy.experiments import bootstrap, cell_run, compared_methods
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
 from brakeline.deploy.experiments.campaign import CampaignPart
 from brakeline.deploy.experiments.comparison_cells import (
@@ -37,6 +38,7 @@ from brakeline.deploy.experiments.comparison_table import (
 )
 from brakeline.deploy.experiments.experiment_jobs import configuration, task_hash, write
 from brakeline.deploy.experiments.experiment_jobs import read as read_result
+from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
 from brakeline.errors import ResultError
@@ -304,7 +306,7 @@ def test_methods_whose_filter_replaces_inputs_have_the_learner_of_the_task():
         assert (used.imitation > 0.0) == (method in ("ddpc", "secas", "cbf", "psf")), method
     assert learning(replace(TD3Config(), imitation=0.5), "ddpc", task).imitation == 0.5
     for wanted in (True, False):
-        (job,) = CompareCommand(
+        (job,), _ = CompareCommand(
             ("quadrotor",), (0,), methods=("ddpc",), conservatism=False, task_settings=wanted
         )._jobs("quadrotor")
         assert (job.td3.imitation > 0.0) == wanted
@@ -350,7 +352,8 @@ def test_results_of_a_robot_of_ones_own_with_another_task_or_description_are_ref
     def jobs():
         part = CampaignPart(car, "default", "random", "none", "as-recorded", 0.1, 0, 1)
         yield CampaignCommand(runs=tmp_path, results=tmp_path)._prepared(robot_with_task(car), part)
-        yield from CompareCommand(methods=("ddpc",), seeds=(0,))._jobs(car)
+        cells, others = CompareCommand(methods=("ddpc",), seeds=(0,))._jobs(car)
+        yield from (*cells, *others)
         yield from tuning_jobs(car, ("secas",), ("default",))
 
     for file, old, new in (("car.task.toml", "gap = 0.3", "gap = 0.4"), ("car.toml", "period = 0.2", "period = 0.3")):
@@ -363,3 +366,49 @@ def test_results_of_a_robot_of_ones_own_with_another_task_or_description_are_ref
             with pytest.raises(ResultError, match=r"another .*task"):
                 read_result(tmp_path / file, job)
     assert task_hash("ground") == task_hash("ground+tracks") == "", "shipped robots change with Brakeline only"
+
+
+def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_path, monkeypatch):
+    folder = shutil.copytree(Path(__file__).parents[3] / "examples" / "car", tmp_path / "car")
+    in_use = SimpleNamespace(version="first")
+    for module in (model_store, cell_run):
+        monkeypatch.setattr(module, "method_for", lambda *_: in_use)
+
+    def noted(robot, methods=("ddpc", "none", "sailr"), seeds=(0,)):
+        command = CompareCommand(methods=methods, seeds=seeds, conservatism=False)
+        return command._prepared(command._jobs(robot)[0], tmp_path)
+
+    car = str(folder / "car.toml")
+    before = noted(car)
+    assert [cell.model_set for cell in before] == ["first", "first", ""], "TD3 is also run with our filter"
+    assert {cell.model_set for cell in noted("ground")} == {""}, "stored results of shipped robots stay"
+    for cell in before:
+        write(tmp_path, cell, {"study": configuration(cell), "model": None})
+    in_use.version = "second"
+    with pytest.raises(ResultError, match="another model_set"):
+        read_result(tmp_path, noted(car)[0])
+    assert read_result(tmp_path, noted(car)[2]) is not None
+    with pytest.raises(ResultError, match=r"more than one model_set \(first, second\)"):
+        noted(car, methods=("ddpc",), seeds=(1,))
+    with pytest.raises(ResultError, match="is no longer first: run the comparison again"):
+        before[0].run(tmp_path / "run")
+    for cell in before:  # of a version that did not note the model set
+        study = {name: value for name, value in configuration(cell).items() if name != "model_set"}
+        write(tmp_path, cell, {"study": study, "model": None})
+    assert all(read_result(tmp_path, cell) for cell in noted(car))
+
+
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        (CompareCommand(table=True, seeds=(0,), engine=Engine(4)), "--table ignores --seeds, --workers or --ray"),
+        (CompareCommand(table=True, tune=True), "--table ignores --tune"),
+        (CompareCommand(tune=True, steps=100, task_settings=False), "--tune ignores --steps, --no-task-settings"),
+        (CompareCommand(tune=True, quick=True), "--tune ignores --quick"),
+        (CompareCommand(seeds=()), "give at least one of --seeds"),
+    ],
+)
+def test_options_that_do_nothing_are_refused(command, words, monkeypatch):
+    monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a job began"))
+    with pytest.raises(ValueError, match=words):
+        command.run()

@@ -134,6 +134,20 @@ def test_killed_it_leaves_no_worker_behind(napping):
     napping[0].kill()
 
 
+def test_a_second_study_in_the_same_folder_is_refused_before_it_deletes_or_runs_anything(napping, tmp_path):
+    results, runs = tmp_path / "results", tmp_path / "runs"
+    write(results, Errand(3), {"study": configuration(Errand(3)), "square": -1})
+    for again in (True, False):
+        with pytest.raises(ResultError, match=r"another study runs in .*ground.*: wait until it ends"):
+            complete([Errand(3), Errand(4)], results, runs, again=again)
+    assert read(results, Errand(3)) is not None, "a refused one deletes nothing"
+    assert complete([Errand(3)], results, runs), "what is there needs no lock"
+    complete([Errand(4)], tmp_path / "other", tmp_path / "other")
+    napping[0].kill()
+    napping[0].wait()
+    complete([Errand(4)], results, runs)
+
+
 def test_interrupted_alone_it_does_not_wait_for_its_workers(napping):
     """A terminal interrupts the workers too, but `kill -INT` and supervisors only their parent."""
     napping[0].send_signal(signal.SIGINT)

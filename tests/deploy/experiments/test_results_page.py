@@ -3,18 +3,22 @@
 import json
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.compare_command import CompareCommand
+from brakeline.deploy.data import model_store
 from brakeline.deploy.experiments import bootstrap, conservatism
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
 from brakeline.deploy.experiments.conservatism import Conservatism
 from brakeline.deploy.experiments.evaluate import FRESH
 from brakeline.deploy.experiments.experiment_jobs import configuration
-from brakeline.deploy.experiments.results_page import RobotResults, page, stored_cells
+from brakeline.deploy.experiments.results_page import RobotResults, page
+from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.tuning_trials import (
     SEED_KEY,
     FilterTuning,
@@ -130,6 +134,30 @@ def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
     assert (results / "README.md").read_text() == page(results, ["ground"])
     written = {path.name for path in (results / "ground").iterdir()}
     assert written > {"profiles.png", "curves.png", "seeds.png", "table.md", "table.json"}
+
+
+def test_a_comparison_of_some_methods_keeps_the_others_in_its_table(results, monkeypatch):
+    monkeypatch.setattr(model_store, "method_for", lambda *_: SimpleNamespace(version="1"))
+    some = CompareCommand(("ground",), (0,), methods=("none",), conservatism=False, results=results, quiet=True)
+    assert some.run() == 0
+    seeds = json.loads((results / "ground" / "table.json").read_text())["seeds"]
+    assert {method: len(numbers) for method, numbers in seeds.items()} == {m: len(runs) for m, runs in GOALS.items()}
+
+
+@pytest.mark.parametrize(
+    "changed, words",
+    [
+        ({"steps": 100}, r"more than one steps \(100, 60000\)"),
+        ({"penalty": 3.0}, "none has cells of several settings"),
+    ],
+)
+def test_cells_that_do_not_compare_with_stored_ones_are_refused_before_they_are_made(
+    results, monkeypatch, changed, words
+):
+    monkeypatch.setattr(model_store, "method_for", lambda *_: SimpleNamespace(version="1"))
+    monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a training began"))
+    with pytest.raises(ResultError, match=words):
+        CompareCommand(("ground",), (7,), methods=("none",), conservatism=False, results=results, **changed).run()
 
 
 def test_a_full_disk_leaves_the_tables_that_were_there(results):

@@ -1,0 +1,69 @@
+"""Read the stored cells of a comparison, and check that they compare."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.comparison_cells import CellConfig
+from brakeline.deploy.experiments.experiment_jobs import configuration, stored_result
+from brakeline.deploy.experiments.task_engine import robot_folder
+from brakeline.errors import ResultError
+from brakeline.learner.learner_config import TD3Config
+
+SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend", "robots")  # in all cells of a robot
+SAME_IF_STATED = ("task", "model_set")
+CELL = re.compile(r"-s\d+\.json$")
+SEVERAL = "{folder}: {method} has cells of several settings: run the older again, or give another --results"
+
+
+def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
+    """Return the stored cells of a robot, by method and seed.
+
+    Raises:
+        ResultError: a file is damaged, or cells differ in more than the method and its settings.
+    """
+    folder, order = robot_folder(results, robot), list(METHODS)
+    cells = [stored_result(path) for path in _paths(folder)]
+    cells.sort(key=lambda cell: (order.index(cell["study"]["method"]), cell["study"]["seed"]))
+    _check_comparable([cell["study"] for cell in cells], folder)
+    for method in METHODS:
+        models = [cell["model"] or {} for cell in cells if cell["study"]["method"] == method]
+        if len({json.dumps(model.get("settings"), sort_keys=True) for model in models}) > 1:
+            raise ResultError(SEVERAL.format(folder=folder, method=method))
+    return cells
+
+
+def check_addable(results: Path, cells: Sequence[CellConfig]) -> None:
+    """Raise ResultError if cells to run would not compare with the stored ones that they do not replace."""
+    folder, names = robot_folder(results, cells[0].robot), {cell.name for cell in cells}
+    kept = [stored_result(path)["study"] for path in _paths(folder) if path.stem not in names]
+    _check_comparable([*kept, *map(configuration, cells)], folder)
+
+
+def _paths(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.glob("*-s*.json")) if CELL.search(path.name)]
+
+
+def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Raise ResultError if cells differ in more than the method and its settings."""
+    for name in (*SAME, *SAME_IF_STATED):
+        values = {str(study.get(name)) for study in studies if name in SAME or study.get(name)}
+        if len(values) > 1:
+            raise ResultError(
+                f"{folder}: the cells have more than one {name} ({', '.join(sorted(values))}): move the older "
+                "ones away, or give another --results"
+            )
+    for method in METHODS:
+        if len({_settings(study) for study in studies if study["method"] == method}) > 1:
+            raise ResultError(SEVERAL.format(folder=folder, method=method))
+
+
+def _settings(study: dict[str, Any]) -> str:
+    """Return the settings of a cell's filter and learner, without defaults of the learner: older cells lack some."""
+    td3 = {name: value for name, value in study["td3"].items() if value != getattr(TD3Config(), name, None)}
+    return json.dumps([study.get("model_config"), study.get("penalty", 1.0), td3], sort_keys=True)
