@@ -110,6 +110,13 @@ def _build_model_set(path: Path, robot: Robot, model_config: ModelConfig) -> Mod
     from brakeline.deploy.data.certification import certify
     from brakeline.deploy.data.simulated_recording import data_for, load_or_record
 
+    if isinstance(robot, RobotWithTask) and not record_path(robot).exists():
+        console.print(
+            f"{robot.name}: it has no model set yet{', and none for real time comes with Brakeline' * robot.late}. "
+            "Brakeline records the robot in its simulator and fits one, which takes minutes. The next start takes "
+            f"seconds: the set will be in {path}",
+            markup=False,
+        )
     try:
         data = data_for(robot)
     except BadData as error:

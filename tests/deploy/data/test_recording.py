@@ -52,6 +52,19 @@ def test_excitation_stays_in_bounds_and_slew_and_holds_plans_of_the_schedule():
     assert max(lengths) >= 10, "some long stops, for the latch"
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_a_robot_without_a_model_set_says_why_it_is_recorded_and_for_how_long(monkeypatch, tmp_path, capsys, late):
+    monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path))
+    monkeypatch.setattr(model_store, "_shipped", lambda robot: None)
+    monkeypatch.setattr(simulated_recording, "data_for", lambda robot: pytest.exit("it would record"))
+    robot = GROUND.in_real_time() if late else GROUND
+    with pytest.raises(pytest.exit.Exception):
+        model_store.model_for(robot, ModelConfig())
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{robot.name}: it has no model set yet" in said and "takes minutes" in said
+    assert ("none for real time comes with Brakeline" in said) == late
+
+
 @pytest.mark.parametrize(("held", "least", "most"), [(25, 0.06, 0.2), (3, 0.0, 0.03)])
 def test_lead_ins_of_inputs_held_for_long_are_sometimes_restless(held, least, most):
     robot = car("restless", stop=("ramp", "hold"))
