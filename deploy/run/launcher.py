@@ -178,7 +178,7 @@ class Launcher:
                     self._drain()
                     if not self._inbox:
                         for child in self.processes:
-                            child.report_silence()
+                            child.end_if_silent()
                     show(self)
                     process.stop.wait(PERIOD)
             except LaunchError as error:

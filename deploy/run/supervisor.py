@@ -21,6 +21,8 @@ RUN_PROCESS = (*PYTHON, "-m", "brakeline.deploy.run.run_process")
 FIRST_BACKOFF, LONGEST_BACKOFF = 0.5, 10.0  # s from a failure to the restart; doubles with each failure in a row
 HEALTHY_AFTER = 20.0  # s after its first sign of life at which a process counts as healthy
 START_ALLOWANCE = 60.0  # s from the start of a process that gives no sign of life: imports are slow on a busy machine
+HANGING_AFTER = 50.0  # s from the report of silence until the process is killed; a busy machine needs far less
+LONG_WORK = ("certifier",)  # kinds whose compiled code may hold up signs of life for longer
 LAST_BYTES = 2**16  # of a process's output, in which its last line is looked for
 MOST_FAILURES = 5  # in a row, none of them after a healthy time, before the run ends
 
@@ -37,7 +39,7 @@ class SupervisedProcess:
     started: float = 0.0  # monotonic time [s], as of the signs of life and of `next_start`
     first_sign_of_life: float | None = None
     last_sign_of_life: float | None = None
-    reported_silent: bool = False
+    reported_silent: float | None = None  # when
     next_start: float = 0.0
     finished: bool = False  # it ended with status 0: its work is done
 
@@ -61,7 +63,7 @@ class SupervisedProcess:
                 start_new_session=True,  # ^C reaches only the launcher, which ends the processes in order
             )
         self.started, self.first_sign_of_life, self.last_sign_of_life = time.monotonic(), None, None
-        self.reported_silent = False
+        self.reported_silent = None
 
     def release(self) -> None:
         """Let a process that was started as `held` begin."""
@@ -78,30 +80,42 @@ class SupervisedProcess:
         if self.popen is None or self.popen.pid != pid:
             return
         now = time.monotonic()
-        if self.reported_silent:
+        if self.reported_silent is not None:
             log.warning("%s gives signs of life again", self.spec.name)
-        self.reported_silent = False
+        self.reported_silent = None
         self.first_sign_of_life = now if self.first_sign_of_life is None else self.first_sign_of_life
         self.last_sign_of_life = now
 
-    def report_silence(self) -> None:
-        """Log once that the process runs but gives no sign of life. Call it when no health message waits.
+    def end_if_silent(self) -> None:
+        """Log once that the process runs but gives no sign of life, and later kill it: then it starts again.
 
-        A process that hangs is not ended here: one that a busy machine holds up looks the same.
+        Call it when no health message waits. Not ended are a process that has not given any sign of life yet, which may
+        still import, and one of `LONG_WORK`. The time counts from the report, so that a whole machine that was stopped
+        for a while ends nothing.
         """
-        if self.popen is None or self.reported_silent or not self.alive:
+        if self.popen is None or not self.alive:
             return
-        last = self.last_sign_of_life
-        since, most = (self.started, START_ALLOWANCE) if last is None else (last, MAX_SILENCE)
-        if (silent := time.monotonic() - since) > most:
-            self.reported_silent = True
-            log.error(
-                "%s has given no sign of life for %.0f s: it hangs, or the machine is too busy. If it hangs, end it "
-                "with `kill -9 %d`: the launcher starts it again",
-                self.spec.name,
-                silent,
-                self.popen.pid,
-            )
+        now, last = time.monotonic(), self.last_sign_of_life
+        ends = last is not None and self.spec.kind not in LONG_WORK
+        if self.reported_silent is None:
+            since, most = (self.started, START_ALLOWANCE) if last is None else (last, MAX_SILENCE)
+            if now - since > most:
+                self.reported_silent = now
+                self._log_silence(now - since, ends)
+        elif ends and now - self.reported_silent > HANGING_AFTER:
+            log.error("%s still gives no sign of life: killing it", self.spec.name)
+            self.reported_silent = now
+            self.popen.kill()
+
+    def _log_silence(self, seconds: float, ends: bool) -> None:
+        """Say what the silence may be, and what to do. ends: whether the launcher kills the process if it goes on."""
+        assert self.popen is not None
+        end = f"`kill -9 {self.popen.pid}`"
+        advice = f"If it hangs, end it with {end}: the launcher starts it again"
+        if ends:
+            advice = f"After {HANGING_AFTER:.0f} s more, the launcher kills it and starts it again. To do so now: {end}"
+        said = "%s has given no sign of life for %.0f s: it hangs, or the machine is too busy. %s"
+        log.error(said, self.spec.name, seconds, advice)
 
     def supervise(self) -> None:
         """Start the process if it is time, and schedule a restart if it has failed.

@@ -1,5 +1,6 @@
 """Test that repeated failures end the run and accidents do not, however slowly a busy machine starts a process."""
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from brakeline.deploy.run import run_process, supervisor
 from brakeline.deploy.run.processes import HOPELESS, ProcessSpec
 from brakeline.deploy.run.supervisor import (
+    HANGING_AFTER,
     HEALTHY_AFTER,
     MOST_FAILURES,
     START_ALLOWANCE,
@@ -91,28 +93,60 @@ def test_a_process_that_hangs_is_reported_once_and_when_it_goes_on(clock, tmp_pa
     assert child.popen is not None
     try:
         clock[0] += START_ALLOWANCE - 1.0
-        child.report_silence()
+        child.end_if_silent()
         child.record_sign_of_life(child.popen.pid)
         clock[0] += MAX_SILENCE - 1.0
-        child.report_silence()
+        child.end_if_silent()
         assert not caplog.text
         for _ in range(3):
             clock[0] += 1.5
-            child.report_silence()
+            child.end_if_silent()
         assert caplog.text.count("actor-0 has given no sign of life for 10 s") == 1
         assert f"kill -9 {child.popen.pid}" in caplog.text
         child.record_sign_of_life(child.popen.pid)
         assert "actor-0 gives signs of life again" in caplog.text
         clock[0] += MAX_SILENCE + 1.0
-        child.report_silence()
+        child.end_if_silent()
         assert caplog.text.count("no sign of life") == 2
     finally:
         child.popen.kill()
     child.popen.wait()
     child.supervise()
     assert child.restarts == 1, "as the report promises"
-    child.report_silence()
+    child.end_if_silent()
     assert caplog.text.count("no sign of life") == 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "speaks", "killed"), [("actor", True, True), ("actor", False, False), ("certifier", True, False)]
+)
+def test_a_process_that_goes_on_hanging_is_killed_and_starts_again(
+    kind, speaks, killed, clock, tmp_path, caplog
+) -> None:
+    """Not one that may still import, nor a certifier in a long fit."""
+    child = Hanging(ProcessSpec("one", kind, "ground"), tmp_path)
+    child.supervise()
+    assert child.popen is not None
+    popen = child.popen
+    popen.send_signal(signal.SIGSTOP)
+    try:
+        if speaks:
+            child.record_sign_of_life(popen.pid)
+        clock[0] += 3600.0  # also as after a sleep of the whole machine: the report comes first
+        child.end_if_silent()
+        clock[0] += HANGING_AFTER - 1.0
+        child.end_if_silent()
+        assert caplog.text.count("no sign of life") == 1 and "still" not in caplog.text
+        clock[0] += 2.0
+        child.end_if_silent()
+        assert ("still gives no sign of life: killing it" in caplog.text) == killed
+        if killed:
+            popen.wait(20.0)
+            child.supervise()
+            assert child.restarts == 1 and not child.finished
+    finally:
+        popen.kill()
+        popen.wait()
 
 
 class Diverging(SupervisedProcess):
