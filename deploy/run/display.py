@@ -56,6 +56,7 @@ class Display:
         if self._live is None and (phase := run_phase(run)) != self._last_phase:
             self._last_phase = phase
             self.console.print(phase, markup=False)
+            self._print_warnings(run)
         if self._page is not None and self._page.notice and not self._page_shown:
             self._page_shown = True
             self.console.print(self._page.notice, markup=False)
@@ -70,6 +71,16 @@ class Display:
             self._live.update(live(run, figures, self._bar), refresh=True)
         else:
             self.console.print(line(figures))
+            self._print_warnings(run)
+
+    def _print_warnings(self, run: Launcher) -> None:
+        """Print the latest warnings, each once: without a terminal, nothing else shows that a process hangs."""
+        waiting = list(run.lines)
+        run.lines.clear()
+        for text in waiting[-LINES:]:
+            self.console.print(text, markup=False)
+        if len(waiting) > LINES:
+            self.console.print(f"({len(waiting) - LINES} earlier warnings are in the log)", markup=False)
 
 
 def run_phase(run: Launcher) -> str:

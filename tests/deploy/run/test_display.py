@@ -58,6 +58,7 @@ def test_the_live_picture_fits_the_terminal(view: Launcher, width: int) -> None:
 
 
 def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    view.lines.clear()
     console = Console(file=io.StringIO(), soft_wrap=True)
     with Display(console, 1000) as display:
         for _ in range(100):
@@ -71,6 +72,20 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypa
         display(view)
     rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
     assert rows[1:] == [line(view.metrics.figures()), "ending every process in order"]
+
+
+def test_without_a_terminal_it_prints_each_warning_once_and_of_many_the_latest(
+    view: Launcher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view.lines.extend(f"actor-0 hangs [{n}]" for n in range(7))
+    console = Console(file=io.StringIO(), soft_wrap=True)
+    monkeypatch.setattr("brakeline.deploy.run.display.SPACING", 0.0)
+    with Display(console, 1000) as display:
+        for _ in range(3):
+            display(view)
+    rows = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    warnings = [*(f"actor-0 hangs [{n}]" for n in range(2, 7)), "(3 earlier warnings are in the log)"]
+    assert rows[1 : 1 + len(warnings)] == warnings and "hangs" not in "".join(rows[1 + len(warnings) :])
 
 
 def ended(view: Launcher, **changes: object) -> dict[str, object]:
