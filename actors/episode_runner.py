@@ -75,8 +75,11 @@ class ActorIdentity:
         return episode * EPISODE_STRIDE + self.number
 
     def noise(self, episode: int) -> np.random.Generator:
-        """Return the generator of an episode's exploration. It depends on the episode only, so every run can resume."""
-        return np.random.default_rng((self.seed, self.number, episode))
+        """Return the generator of an episode's exploration. It depends on the episode only, so every run can resume.
+
+        The key ends with 1 because NumPy ignores zeros at the end: (seed, number, 0) would draw the first arena again.
+        """
+        return np.random.default_rng((self.seed, self.number, episode, 1))
 
 
 class EpisodeRunner:
