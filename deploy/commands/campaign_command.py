@@ -61,12 +61,23 @@ class CampaignCommand:
 
     def run(self) -> int:
         """Drive what is missing and write the tables. Returns the exit status: 3 if a filtered robot hit something."""
+        self._check()
         tables = {robot: self._campaign(robot) for robot in self.robots}
         if self.json:
             print_json(tables)
         filtered = [cell for table in tables.values() for cell in table["cells"] if cell["model_set"] != "none"]
         searches = [one for table in tables.values() for one in table["searches"] if one["model_set"] != "none"]
         return COLLIDED if any(one["collisions"] for one in (*filtered, *searches)) else 0
+
+    def _check(self) -> None:
+        """Raise ValueError for numbers that make no sense, and for lists without a name: a table would become empty."""
+        for option in ("robots", "arenas", "policies", "model_sets", "perturbations"):
+            if not getattr(self, option):
+                raise ValueError(f"name at least one of the {option.replace('_', ' ')}")
+        if self.episodes < 1 or self.search < 0:
+            raise ValueError("--episodes is a number from 1 on, and --search a number from 0 on")
+        if self.near is not None and not self.near >= 0.0:
+            raise ValueError(f"--near is a distance from 0 m on, not {self.near}")
 
     def _campaign(self, name: str) -> dict[str, Any]:
         """Drive the episodes of a robot, write its table, and return its figures."""

@@ -45,6 +45,7 @@ class CollectCommand:
         from brakeline.deploy.data.data_paths import record_path
         from brakeline.messaging.task import robot_maybe_with_task
 
+        self._check()
         if self.url:
             return self._first_flight()
         robot = robot_maybe_with_task(self.robot)
@@ -55,6 +56,17 @@ class CollectCommand:
         counts = f"{data.periods} periods in {len(data.trajectories)} trajectories, {data.digest()}"
         print_result(self.json, figures, f"{path}: {counts}", f"next: brakeline certify {self.robot} --data {path}")
         return 0
+
+    def _check(self) -> None:
+        """Raise ValueError for a value that makes no sense, and for options that do nothing with or without --url."""
+        if self.seed < 0 or (self.trajectories is not None and self.trajectories < 1):
+            raise ValueError("--seed is a number from 0 on, and --trajectories a number from 1 on")
+        if self.out is not None and self.out.is_dir():
+            raise ValueError(f"--out {self.out} is a folder: give the path of a file, such as data.safetensors")
+        if self.url and (self.trajectories is not None or self.physics != options.PhysicsOptions()):
+            raise ValueError("--url ignores --trajectories and what changes the simulator: leave these options out")
+        if not self.url and (self.first != FirstFlightSettings() or self.accept_bound is not None):
+            raise ValueError("the options of a first flight, such as --minutes and --accept-bound, need --url")
 
     def _first_flight(self) -> int:
         from brakeline.deploy.data.data_paths import model_path, note_mode, record_path

@@ -26,6 +26,7 @@ from brakeline.deploy.experiments.comparison_cells import (
 from brakeline.deploy.experiments.experiment_jobs import Job, complete, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
+from brakeline.deploy.run.run_config import SEEDS
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.atomic_files import write_atomically
 
@@ -99,7 +100,7 @@ class CompareCommand:
         from brakeline.deploy.experiments.tuning_trials import tuning_jobs
         from brakeline.messaging.task import address
 
-        self._refuse_unused()
+        self._check_options()
         results, runs = self.results, self.runs
         if self.quick:
             results = QUICK / "results" if results == RESULTS else results
@@ -127,8 +128,12 @@ class CompareCommand:
             print_json(tables)
         return 0
 
-    def _refuse_unused(self) -> None:
-        """Raise ValueError for options that do nothing beside --table or --tune."""
+    def _check_options(self) -> None:
+        """Raise ValueError for options that make no sense, or that do nothing beside --table or --tune."""
+        if not (self.robots and self.arenas):
+            raise ValueError("name at least one robot and at least one of the --arenas")
+        if wrong := [seed for seed in self.seeds or () if not 0 <= seed < SEEDS]:
+            raise ValueError(f"a seed is a number from 0 to {SEEDS - 1}, not {wrong[0]}: evaluations have larger ones")
         usual = CompareCommand()
         for mode, used in USED.items():
             if getattr(self, mode):

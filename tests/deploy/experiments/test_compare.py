@@ -12,6 +12,7 @@ import pytest
 
 from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.campaign_command import CampaignCommand
+from brakeline.deploy.commands.collect_command import CollectCommand
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
 from brakeline.deploy.experiments import bootstrap, cell_run, compared_methods
@@ -41,6 +42,7 @@ from brakeline.deploy.experiments.experiment_jobs import read as read_result
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
+from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
 from brakeline.learner.rival_networks import FitConfig
@@ -406,9 +408,20 @@ def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_p
         (CompareCommand(tune=True, steps=100, task_settings=False), "--tune ignores --steps, --no-task-settings"),
         (CompareCommand(tune=True, quick=True), "--tune ignores --quick"),
         (CompareCommand(seeds=()), "give at least one of --seeds"),
+        (CompareCommand(seeds=(0, -1)), "a seed is a number from 0 to 999999, not -1"),
+        (CompareCommand(arenas=()), "at least one of the --arenas"),
+        (CampaignCommand(episodes=0), "--episodes is a number from 1 on"),
+        (CampaignCommand(search=-1), "--search a number from 0 on"),
+        (CampaignCommand(arenas=()), "name at least one of the arenas"),
+        (CampaignCommand(near=float("nan")), "--near is a distance from 0 m on, not nan"),
+        (CollectCommand(trajectories=0), "--trajectories a number from 1 on"),
+        (CollectCommand(seed=-1), "--seed is a number from 0 on"),
+        (CollectCommand(out=Path("/")), "is a folder: give the path of a file"),
+        (CollectCommand(first=FirstFlightSettings(minutes=3.0)), "need --url"),
+        (CollectCommand("quadrotor", url="udpin:0.0.0.0:1", trajectories=3), "--url ignores --trajectories"),
     ],
 )
-def test_options_that_do_nothing_are_refused(command, words, monkeypatch):
+def test_options_that_make_no_sense_or_do_nothing_are_refused(command, words, monkeypatch):
     monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a job began"))
     with pytest.raises(ValueError, match=words):
         command.run()
