@@ -234,13 +234,13 @@ def parse(name: str, arguments: list[str]) -> Any:
 
 
 def reason(error: Exception) -> str:
-    """Return the message of an error; for a place that may not be written to or does not exist, also what to do."""
+    """Return the message of an error; for a place that cannot be written to or does not exist, also what to do."""
+    places = "BRAKELINE_DATA for data sets and model sets, --out for a run or a file"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{error}. Free some space, or name a place on another disk: {places}, --runs and --results for a study"
     if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
         reading = "" if error.errno == errno.EROFS else "To read it, you need the permission to read. To write: "
-        return (
-            f"{error}. {reading}Run the command in a folder in which you may write, or name one: BRAKELINE_DATA for "
-            "data sets and model sets, --out for a run or a file"
-        )
+        return f"{error}. {reading}Run the command in a folder in which you may write, or name one: {places}"
     if isinstance(error, FileNotFoundError) and isinstance(error.filename, str):
         folder = Path(error.filename).absolute().parent
         if not folder.is_dir():

@@ -134,15 +134,15 @@ class BufferedFile:
         Raises:
             OSError: the disk is full or broken; no waiting byte is in the file.
         """
-        waiting = memoryview(self._waiting)
-        try:
-            done = 0
-            while done < len(waiting):
-                done += self._file.write(waiting[done:])
-        except OSError:
-            self._file.truncate(self._written)
-            raise
-        self._written += len(waiting)
+        with memoryview(self._waiting) as waiting:  # a view that an error's traceback holds would forbid `write`
+            try:
+                done = 0
+                while done < len(waiting):
+                    done += self._file.write(waiting[done:])
+            except OSError:
+                self._file.seek(self._file.truncate(self._written))
+                raise
+        self._written += len(self._waiting)
         self._waiting = bytearray()
 
 

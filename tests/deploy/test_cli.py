@@ -137,6 +137,11 @@ def test_a_file_without_permission_is_an_error_for_reading_and_for_writing():
     assert "Permission denied: 'secret.mcap'. To read it" in text and "folder in which you may write" in text
 
 
+def test_a_full_disk_is_an_error_that_says_what_to_do():
+    text = reason(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert "No space left on device. Free some space, or name a place on another disk: BRAKELINE_DATA" in text
+
+
 @pytest.mark.parametrize("words", ["train --method prayer", "evaluate --certificate hope", "certify --mode loud"])
 def test_a_wrong_choice_is_answered_with_the_possible_ones(command, words):
     status, out, err = command(*words.split())

@@ -11,9 +11,10 @@ from mcap_protobuf.decoder import DecoderFactory
 from brakeline.errors import LogError
 from brakeline.logs.reader import by_run, find, open_log, read
 from brakeline.logs.recorder import entry
-from brakeline.logs.segment import Entry, Segment, name_of, number_of, open_segment
+from brakeline.logs.segment import BufferedFile, Entry, Segment, name_of, number_of, open_segment
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus import Sample
+from tests.full_disk import full_disk
 from tests.logs.conftest import Say
 
 
@@ -142,3 +143,17 @@ def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Pat
     seen: list[tuple[str, object]] = []
     exec(code.replace("print(channel.topic, value)", "seen.append((channel.topic, value))"), {"seen": seen})
     assert [topic for topic, _ in seen] == ["log/a", "mavlink/1/1/HEARTBEAT"] and seen[1][1] == {"type": 2}
+
+
+def test_the_error_of_a_full_disk_lets_the_file_be_finished(tmp_path):
+    """The error's traceback held the waiting bytes, and a log that was closed for the error raised another one."""
+    with (tmp_path / "log").open("wb", buffering=0) as file:
+        spool = BufferedFile(file)
+        spool.write(bytes(5_000))
+        with full_disk(1_000), pytest.raises(OSError, match="File too large"):
+            try:
+                spool.flush()
+            finally:
+                spool.write(b"the end")
+        spool.flush()
+    assert (tmp_path / "log").read_bytes() == bytes(5_000) + b"the end"
