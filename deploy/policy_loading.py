@@ -54,8 +54,8 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     if not path.is_file():
         names = ", ".join([*sorted(stored), UNTRAINED, *robot.task.policies])
         raise ValueError(
-            f"no policy is called {name!r} and no such file exists; there are: {names}, or the path of a weights file or "
-            "of a run's folder"
+            f"no policy is called {name!r} and no such file exists; there are: {names}, or the path of a weights file "
+            "or of a run's folder"
         )
     if robot.late:
         with suppress(BadWeights):  # the weights may be of a training in lockstep
