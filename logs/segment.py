@@ -140,7 +140,8 @@ class BufferedFile:
                 while done < len(waiting):
                     done += self._file.write(waiting[done:])
             except OSError:
-                self._file.seek(self._file.truncate(self._written))
+                self._file.truncate(self._written)
+                self._file.seek(self._written)
                 raise
         self._written += len(self._waiting)
         self._waiting = bytearray()

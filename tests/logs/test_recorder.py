@@ -77,6 +77,9 @@ class Quota:
         self.size += taken
         return taken
 
+    def seek(self, place: int) -> int:
+        return self.file.seek(place)
+
     def truncate(self, size: int) -> None:
         self.file.truncate(size)
         self.disk.free += self.size - size
