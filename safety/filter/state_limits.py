@@ -66,7 +66,6 @@ class StateLimits:
         return other
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self.count * len(self.ends)
 
     def rows(self, start: Array, heading: float, turn: Array, widening: float) -> ConstraintRows:

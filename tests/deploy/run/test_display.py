@@ -89,7 +89,6 @@ def test_without_a_terminal_it_prints_each_warning_once_and_of_many_the_latest(
 
 
 def ended(view: Launcher, **changes: object) -> dict[str, object]:
-    """Return the figures of a run that has ended."""
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
     outcome = {"finished": False, "restarts": {"learner": 2, "safety-0": 1}}
