@@ -7,8 +7,8 @@ A beam that hits at range r becomes a disc of radius
 with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
 may be anywhere in it; the others cover the error of the hit's position. Neighbouring hits that the body cannot pass
 between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
-sensor's range. Something too near to be measured touches the body where the beam leaves it. A scan with a direction
-without information is refused: earlier scans do not count, so nobody knows what is there.
+sensor's range. Something too near to be measured touches the body where the beam leaves it. Beams without information
+are left out here: `unknown_space.py` says what may be there.
 
 Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
 (7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come

@@ -99,6 +99,22 @@ def has_blind_directions(image: RangeImage) -> bool:
     return bool((patch_free_ranges(image)[1] <= 0.0).any())
 
 
+def unseen_poles(image: RangeImage) -> str:
+    """Return what an image without beams up or down lacks, and what to do; empty if its rings reach both poles.
+
+    A body that flies then touches unknown space, and no earlier image shows what is above and below it.
+    """
+    below, above = BeamGrid.of(*image.ranges.shape, image.low, image.high).added
+    sides = [f"above {math.degrees(image.high):.0f}°"] if above else []
+    sides += [f"below {math.degrees(image.low):.0f}°"] if below else []
+    if not sides:
+        return ""
+    return (
+        f"the range image has no beams {' and '.join(sides)}, so all space there counts as occupied, up to the body: "
+        "give an image whose rings reach from -90° to 90°, or obstacles from a map and no image"
+    )
+
+
 def by_mesh(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
     """Combine the values (E, A) of each beam, its left neighbour and the two above them; in the last ring, of two."""
     meshes = of(values, np.roll(values, -1, axis=1))
