@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
 
@@ -107,7 +107,7 @@ def unseen_poles(image: RangeImage) -> str:
     below, above = BeamGrid.of(*image.ranges.shape, image.low, image.high).added
     sides = [f"above {math.degrees(image.high):.0f}°"] if above else []
     sides += [f"below {math.degrees(image.low):.0f}°"] if below else []
-    if not sides:
+    if not sides or not has_blind_directions(replace(image, ranges=np.full_like(image.ranges, image.far))):
         return ""
     return (
         f"the range image has no beams {' and '.join(sides)}, so all space there counts as occupied, up to the body: "
