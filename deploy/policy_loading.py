@@ -17,6 +17,7 @@ from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.scripted_policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
+POLICY = "policy.safetensors"  # of a run
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
@@ -25,7 +26,7 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
 
     Args:
         name: a scripted policy, a stored one (`trained` and others in policies/, or beside the task file), `untrained`,
-            a weights file, or a CSV file of inputs as `brakeline excite` prints them.
+            the folder of a run, a weights file, or a CSV file of inputs as `brakeline excite` prints them.
         seed: of scripted and untrained policies.
 
     Raises:
@@ -45,10 +46,17 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     if name == UNTRAINED:
         return MLP.untrained(robot, seed)
     stored = _stored(robot)
-    path = stored.get(name, Path(name))
+    path = stored.get(name) or _weights(name, robot)
+    if path.is_dir():
+        raise ValueError(
+            f"the folder {path} holds no policy of {robot.kind}: a training writes learner/{POLICY} into its"
+        )
     if not path.is_file():
         names = ", ".join([*sorted(stored), UNTRAINED, *robot.task.policies])
-        raise ValueError(f"no policy is called {name!r} and no such file exists; there are: {names}, or a file's path")
+        raise ValueError(
+            f"no policy is called {name!r} and no such file exists; there are: {names}, or the path of a weights file "
+            "or of a run's folder"
+        )
     if robot.late:
         with suppress(BadWeights):  # the weights may be of a training in lockstep
             return MLP.load(path, robot.in_lockstep())
@@ -59,14 +67,22 @@ def file_named(name: str, robot: RobotWithTask) -> Path | None:
     """Return the file of your own that `policy_named` reads; None if a policy has this name, whatever files exist."""
     if name in robot.task.policies or name == UNTRAINED or name in _stored(robot):
         return None
-    return Path(name)
+    return _weights(name, robot)
 
 
 def policy_hash(name: str, robot: RobotWithTask) -> str:
     """Return a hash of the file of the policy with this name; empty if none is read (see `policy_named`)."""
-    path = _stored(robot).get(name, Path(name))
+    path = _stored(robot).get(name) or _weights(name, robot)
     scripted_or_new = name in robot.task.policies or name == UNTRAINED
     return "" if scripted_or_new else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _weights(name: str, robot: RobotWithTask) -> Path:
+    """Return the path of a file, or of the policy in the folder of a run, which may have a learner for each robot."""
+    path = Path(name)
+    learners = "learner", f"learner-{robot.name.replace('.', '_')}"
+    learned = (path / learner / POLICY for learner in learners)
+    return next((file for file in learned if file.is_file()), path)
 
 
 def _stored(robot: RobotWithTask) -> dict[str, Path]:
