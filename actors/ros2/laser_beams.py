@@ -13,7 +13,7 @@ too near here, since an obstacle at the body is the safer reading.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +42,9 @@ class LaserBeams:
 
     def take(self, chosen: NDArray[np.bool_]) -> LaserBeams:
         """Return the chosen beams (a mask)."""
-        parts = (part[chosen] for part in (self.times, self.angles, self.ranges, self.known, self.too_near))
-        return LaserBeams(*parts, self.gap, self.farthest, self.beyond)
+        times, angles, ranges = self.times[chosen], self.angles[chosen], self.ranges[chosen]
+        known, too_near = self.known[chosen], self.too_near[chosen]
+        return replace(self, times=times, angles=angles, ranges=ranges, known=known, too_near=too_near)
 
 
 def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
