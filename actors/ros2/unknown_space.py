@@ -2,8 +2,9 @@
 
 A beam without information leaves a gap between its neighbours. As in a `Scan` with dropped beams, the gap is free up to
 a distance F (`safety/perception/scan_coverage.py`): up to there, an obstacle of the least width would reach into a
-beam beside the gap. The visibility memory extends F by what earlier scans showed to be free. Beyond F the gap counts as
-occupied. A turn of the robot against the lidar's turn also leaves a gap, between the last beam and the first.
+beam beside the gap. The visibility memory extends F by what the scans of the last seconds showed to be free. Beyond F
+the gap counts as occupied. A turn of the robot against the lidar's turn also leaves a gap, between the last beam and
+the first.
 
 If unknown space comes as near as the body, the scan is refused: the filter would lead the robot away from it, and
 nobody knows whether something touches the robot there.
@@ -29,6 +30,7 @@ from brakeline.safety.perception.visibility_memory import FanMemory
 FEWER_BEAMS = MAX_BEAMS // 2  # of a scan with more, every second, third, … counts: gaps need room for added beams
 LEFT_OUT = 1.5  # gaps of the scan: two neighbours that are farther apart leave out beams
 WIDEST = math.radians(6.0)  # of a box; a wider gap has several
+LONGEST = 2.0  # s for which a scan stays in the memory: what is dark may have been put there since
 AT_SENSOR = 1e-3  # m: range of a beam that hit something too near to be measured
 
 
@@ -39,7 +41,7 @@ class UnknownSpace:
         """least_width: of all obstacles [m], see `Scan`."""
         self._robot, self._errors, self._least_width = robot, errors, least_width
         # Nothing around the body counts as free at the start: nobody looked when the node started.
-        self._memory = FanMemory(robot.footprint - FanMemory.START)
+        self._memory, self._last = FanMemory(-FanMemory.START, LONGEST), -math.inf  # s, of the last scan
 
     def reset(self) -> None:
         """Forget all space: the poses are in another frame from here on."""
@@ -56,7 +58,9 @@ class UnknownSpace:
         """
         scan, moved = self._scan(beams, poses, mount)
         unknown = scan.angles[~scan.valid_beams]
-        filled = self._memory.fill(scan, 0.0)  # nothing moves, so no time passes
+        elapsed = max(float(beams.times[-1]) - self._last, 0.0)
+        self._last = float(beams.times[-1])
+        filled = self._memory.fill(scan, min(elapsed, 2.0 * LONGEST))
         if not len(unknown):
             return ()
         angles, width, free = gaps(_where_better(filled, scan))

@@ -12,6 +12,7 @@ from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.actors.ros2.unknown_space import UnknownSpace
 from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
+from brakeline.messaging.ros2 import cdr_messages as cdr
 from tests.actors.ros2.test_ros_inputs import BEAMS, scan_of
 from tests.robots import GROUND
 from tests.safety.ray_casting import cast
@@ -82,6 +83,14 @@ def test_what_an_earlier_scan_showed_to_be_free_is_free_until_the_poses_jump():
     unknown.reset()
     with pytest.raises(BadScan):
         boxes_of(unknown, glass)
+
+
+def test_the_memory_ends_after_two_seconds():
+    """Something dark that was put before a standing robot was free space: an older scan showed none."""
+    unknown, later = space(), cdr.header(12.5, "base_scan")
+    boxes_of(unknown, free_but())
+    with pytest.raises(BadScan):
+        boxes_of(unknown, replace(free_but(*range(20)), header=later))
 
 
 def test_nothing_around_the_body_is_free_at_the_start_if_nobody_saw_it():
@@ -164,7 +173,7 @@ def drive_among_posts(rng, periods=6):
         silent &= period >= 2  # what the first scans show is in the memory
         ranges[silent] = math.nan
         wrong = poses + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3] * [0.7, 0.7, 1.0]
-        beams = read(scan_of(ranges, range_min=0.0))
+        beams = read(scan_of(ranges, range_min=0.0, header=cdr.header(10.0 + TURN * period, "base_scan")))
         try:
             boxes = unknown.boxes(beams, wrong, MOUNT, wrong[-1, :2])
         except BadScan:
