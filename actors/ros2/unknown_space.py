@@ -16,6 +16,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.actors.ros2.laser_beams import LaserBeams
 from brakeline.actors.ros2.laser_obstacles import EXTRA_SIGHT, HitErrors
@@ -34,14 +35,23 @@ LONGEST = 2.0  # s for which a scan stays in the memory: what is dark may have b
 AT_SENSOR = 1e-3  # m: range of a beam that hit something too near to be measured
 
 
+class _RecentScans(FanMemory):
+    """The last scans' memory. Of the space around the body, it takes only the body's own place as free."""
+
+    START = 0.0
+
+    def _near_start(self, points: Array, scan: Scan, step: Array | float) -> NDArray[np.bool_]:
+        away = np.linalg.norm(points - np.asarray(scan.pose[:2]), axis=-1)
+        return np.asarray(away <= self._start_radius - scan.position_error - step)
+
+
 class UnknownSpace:
     """The unknown space around one robot, and the memory of what its scans showed to be free."""
 
     def __init__(self, robot: Robot, errors: HitErrors, least_width: float) -> None:
         """least_width: of all obstacles [m], see `Scan`."""
         self._robot, self._errors, self._least_width = robot, errors, least_width
-        # Nothing around the body counts as free at the start: nobody looked when the node started.
-        self._memory, self._last = FanMemory(-FanMemory.START, LONGEST), -math.inf  # s, of the last scan
+        self._memory, self._last = _RecentScans(robot.footprint, LONGEST), -math.inf  # s, of the last scan
 
     def reset(self) -> None:
         """Forget all space: the poses are in another frame from here on."""
