@@ -196,7 +196,6 @@ class ActorRunner:
         return self.proposer.ready(self.runner.index + 1, self.next_episode, stop)
 
     def begin(self, episode: pb.Episode) -> None:
-        """Publish an episode that has begun."""
         self.episodes.put(episode)
         self.next_episode = episode.episode + 1
         self.proposer.begin(self.runner.rng)
@@ -250,7 +249,6 @@ class ActorStats:
     contacts_robots: int = 0
 
     def count(self, step: pb.Step) -> None:
-        """Add a step."""
         self.steps += 1
         self.fallbacks += step.fallback
         self.collisions += step.collision

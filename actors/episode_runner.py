@@ -294,7 +294,6 @@ class RobotGroup:
 
     @property
     def running(self) -> bool:
-        """Whether the episode of any robot is running."""
         return any(runner.running for runner in self.runners)
 
     def begin(self, episode: int) -> list[pb.Episode]:

@@ -69,7 +69,6 @@ class BackgroundPublisher:
         self._thread.start()
 
     def wrap(self, publisher: MessageSink) -> MessageSink:
-        """Return a sink that publishes in the background."""
         return QueuedSink(publisher, self._queue)
 
     def close(self) -> None:
@@ -209,7 +208,6 @@ class FlightRunner(ActorRunner):
         self.vehicle.vehicle.wait(self.vehicle.current_period.number + self.runner.robot.horizon)
 
     def figures(self) -> dict[str, float]:
-        """Return figures for Health."""
         if self._vehicle is None:
             return {}
         needed = max(self.answers.total() - self.answers["not needed"], 1)

@@ -45,7 +45,6 @@ class LearnerClient:
 
     @property
     def done(self) -> bool:
-        """Whether the learner has ended the run."""
         return self.flow.done
 
     @property

@@ -33,7 +33,6 @@ class LearnedPolicy(LearnerClient):
         return self.wait(index, episode, stop)
 
     def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode."""
         self._rng, self._random = rng, scripted("random", self.robot, rng)
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
@@ -70,14 +69,12 @@ class FixedPolicy:
         return episode
 
     def ready(self, index: int, episode: int, stop: Stop) -> bool:
-        """Return whether steps are left."""
         return not stop() and not 0 < self._steps < index
 
     def begin(self, rng: np.random.Generator) -> None:
         """Do nothing: scripted policies detect a new episode by themselves."""
 
     def propose(self, observation: NDArray[np.float32], info: dict[str, Any]) -> Array:
-        """Return the policy's action."""
         return np.asarray(self.policy(observation, info), dtype=float)
 
 

@@ -47,7 +47,6 @@ def run() -> Figures:
 
 
 def _by_kind(name: str, model: ModelSet, asked: list[pb.Request]) -> Figures:
-    """Return the times of each kind of decision."""
     ready, times = Filter(model), defaultdict(list)
     for i, request in enumerate(situations.requests(ready, asked)):
         before = perf_counter()

@@ -66,7 +66,6 @@ class Containment:
         self.largest = max(self.largest, score)
 
     def step(self, contained: bool) -> None:
-        """Add a step."""
         self.steps += 1
         self.steps_outside += not contained
 

@@ -216,7 +216,6 @@ class Flights:
         return "--at-start", "--pictures", "0", "--out", str(self.run(name))
 
     def run(self, name: str) -> Path:
-        """Return the folder of a flight."""
         return self._folder / name
 
     def _figures(
@@ -315,7 +314,6 @@ def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
 
 
 def _own(flight: dict[str, Any]) -> dict[str, float | str]:
-    """Return the figures of one vehicle."""
     row: dict[str, float | str] = {name: flight[name] for name in TRUE if name in flight}
     return row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
 

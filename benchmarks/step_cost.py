@@ -53,7 +53,6 @@ class Run:
         self.used: dict[str, list[tuple[float, float]]] = {}
 
     def take(self, sample: Sample) -> None:
-        """Take a sign of life."""
         message = sample.message()
         if message.process.startswith("actor") and message.figures["steps"]:
             self.steps.setdefault(message.process, []).append((time.monotonic(), message.figures["steps"]))

@@ -54,8 +54,6 @@ class Stopwatch:
         self._mark = 0
 
     def timed(self, stage: str, call: Callable[P, T]) -> Callable[P, T]:
-        """Return the function, timed as a stage."""
-
         def timed(*args: P.args, **kwargs: P.kwargs) -> T:
             self._switch()
             self._running.append(stage)

@@ -49,5 +49,4 @@ def missing_extra(error: ModuleNotFoundError, needed: Collection[str] = ()) -> M
 
 
 def _installed(extra: str) -> bool:
-    """Return whether all packages of an extra are installed."""
     return all(find_spec(package) is not None for package in EXTRAS[extra])

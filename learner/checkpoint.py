@@ -67,7 +67,6 @@ class PartState:
         return value
 
     def value(self, name: str) -> Any:
-        """Return a value."""
         if name not in self.values:
             raise ValueError(f"{name}: missing")
         return self.values[name]

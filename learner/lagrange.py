@@ -32,7 +32,6 @@ class LagrangeMultiplier:
         self.value = max(0.0, self.value + self.rate * (float(collided) - self.limit))
 
     def state(self) -> PartState:
-        """Return the state for a checkpoint."""
         return PartState({}, {"value": self.value})
 
     def restore(self, state: PartState) -> None:

@@ -163,12 +163,10 @@ class Learner:
 
     @property
     def steps(self) -> int:
-        """Number of steps."""
         return self._limiter.inserts
 
     @property
     def updates(self) -> int:
-        """Number of updates."""
         return self._td3.updates
 
     @property
@@ -213,7 +211,6 @@ class Learner:
         )
 
     def weights(self) -> pb.Weights:
-        """Return the latest version of the weights."""
         return self._weights
 
     def flow(self) -> pb.Flow:

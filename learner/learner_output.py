@@ -70,7 +70,6 @@ class LearnerOutput:
             self.publish(waiting)
 
     def publish(self, waiting: int = 0) -> None:
-        """Publish the metrics now."""
         self._metrics_at = self._clock()
         metrics = self._learner.metrics()
         self._process.figures = {

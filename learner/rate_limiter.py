@@ -25,7 +25,6 @@ class RateLimiter:
 
     @property
     def error(self) -> float:
-        """The error in samples."""
         return (self.inserts - self.warmup) * self.samples_per_insert - self.samples
 
     @property
@@ -42,15 +41,12 @@ class RateLimiter:
         return max(0, math.ceil((self.ceiling - self.error) / self.samples_per_insert) - 1)
 
     def insert(self) -> None:
-        """Count an insert."""
         self.inserts += 1
 
     def sample(self) -> None:
-        """Count a batch."""
         self.samples += self.batch
 
     def state(self) -> PartState:
-        """Return the state for a checkpoint."""
         return PartState({}, {"inserts": self.inserts, "samples": self.samples})
 
     def restore(self, state: PartState) -> None:

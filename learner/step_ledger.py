@@ -96,7 +96,6 @@ class StepLedger:
         return place.next_episode
 
     def state(self) -> PartState:
-        """Return the state for a checkpoint."""
         actors = sorted(self.places.items())
         rows = [
             (number, episode, first, last)

@@ -65,7 +65,6 @@ class TD3:
         self._target = torch.zeros(1, batch, 1)
 
     def update(self, batch: Batch) -> None:
-        """Learn from a batch."""
         torch.set_flush_denormal(True)  # the moments of inactive units decay to denormals, which double the time
         self._update_critics(batch)
         self.updates += 1
@@ -136,7 +135,6 @@ class TD3:
         }
 
     def state(self) -> PartState:
-        """Return the state for a checkpoint."""
         tensors = {name: tensor.numpy() for name, tensor in self._tensors().items()}
         tensors["generator"] = self._generator.get_state().numpy()
         counts = {"updates": self.updates, "actor_adam": self.actor_adam.count, "critic_adam": self.critic_adam.count}

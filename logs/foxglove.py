@@ -98,11 +98,9 @@ class FoxgloveConverter:
         }
 
     def from_sample(self, sample: Sample) -> list[Entry]:
-        """Convert a message from the bus."""
         return self._convert(sample.topic.name, sample.key, sample.message, sample.received)
 
     def from_record(self, record: Record) -> list[Entry]:
-        """Convert a message from a log."""
         return self._convert(record.topic, record.key, lambda: record.message, record.log_time)
 
     def _convert(self, topic: str, key: str, decode: Decode, time: int) -> list[Entry]:

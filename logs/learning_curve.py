@@ -184,7 +184,6 @@ class LearningCurve:
         }
 
     def _bin(self) -> Bin:
-        """Return the bin of the next step."""
         return self._next() if self.bins[-1]["steps"] >= self.width else self.bins[-1]
 
     def _next(self) -> Bin:

@@ -65,7 +65,6 @@ class ClusteredProportion:
         self._sums = np.zeros(6, dtype=int)  # of 1, x, n, x², x n and n² over the episodes
 
     def add(self, hits: int, trials: int) -> None:
-        """Add an episode."""
         self._sums += (1, hits, trials, hits * hits, hits * trials, trials * trials)
 
     def join(self, other: ClusteredProportion) -> None:

@@ -59,7 +59,6 @@ class QuantileSketch:
     pending: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, value: float) -> None:
-        """Add one value."""
         pending = self.pending
         pending.append(value)
         if len(pending) >= BATCH:

@@ -33,7 +33,6 @@ class StepAdmission:
 
     @property
     def refused(self) -> int:
-        """Number of refused steps."""
         return self._refused + sum(map(len, self._waiting.values()))
 
     def learner(self, metrics: pb.LearnerMetrics) -> list[pb.Step]:

@@ -100,7 +100,6 @@ class DescriptionModel(_Strict):
     accept_bound: Annotated[Number, Field(gt=0.0, lt=1.0, allow_inf_nan=False)] = DEFAULT_ACCEPT_BOUND
 
     def role_names(self, role: str) -> list[str]:
-        """Return the names of the coordinates with a role."""
         return [name for name, coordinate in self.state.items() if coordinate.role == role]
 
 

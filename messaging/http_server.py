@@ -63,7 +63,6 @@ class ConnectionSlots:
                 self._served.add(connection)
 
     def leave(self, connection: socket.socket) -> None:
-        """Free the place of a connection."""
         with self._lock:
             self._waiting.pop(connection, None)
             self._served.discard(connection)
@@ -167,7 +166,6 @@ class BoundedHandler(BaseHTTPRequestHandler):
         return not reason
 
     def reply_text(self, status: int, text: str) -> None:
-        """Send a plain text."""
         body = text.encode(errors="replace")
         self.send_response(status)
         self.send_header("Content-Type", "text/plain; charset=utf-8")

@@ -39,7 +39,6 @@ class MovingObstacles(ComparedByValue):
         )
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> MovingObstacles:
-        """Return the selected obstacles."""
         return MovingObstacles(
             self.shapes.take(index), self.drift[index], self.growth[index], self.age[index], self.consistent[index]
         )

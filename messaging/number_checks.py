@@ -71,5 +71,4 @@ def _numbers(value: Numbers) -> tuple[Number, ...]:
 
 
 def _shown(value: Numbers) -> str:
-    """Return a value as a file has it."""
     return str(list(value)) if isinstance(value, tuple) else str(value)

@@ -82,7 +82,6 @@ def draw_fleet(name: str, rng: np.random.Generator, robot: RobotWithTask, size: 
 def _arena(
     name: str, kind: ArenaKind, obstacles: tuple[Obstacle, ...], start: tuple[float, ...], goal: tuple[float, ...]
 ) -> Arena:
-    """Return the arena of a kind with these obstacles, start and goal."""
     bounds = room_bounds(kind.half_width, kind.height)
     return Arena(name, obstacles, start, goal, kind.goal_radius, kind.step_limit, bounds)
 
@@ -186,7 +185,6 @@ def _draw_candidates(shape: str, kind: ArenaKind, least: float, rng: np.random.G
 
 
 def _outlines(shape: str, candidates: Candidates) -> Outlines:
-    """Return the outlines of candidates."""
     positions, sizes, yaws = candidates
     cos, sin = np.cos(yaws), np.sin(yaws)
     axes = np.stack((cos, -sin, sin, cos), axis=-1).reshape(-1, 2, 2)
@@ -196,7 +194,6 @@ def _outlines(shape: str, candidates: Candidates) -> Outlines:
 
 
 def _joined(outlines: Outlines, others: Outlines, row: int) -> Outlines:
-    """Return outlines and one row of others."""
     center, axes, half, rho = (
         np.concatenate((before, new[row, None])) for before, new in zip(outlines, others, strict=True)
     )

@@ -48,7 +48,6 @@ class FlightEstimator:
         self._left = 0
 
     def advance(self) -> None:
-        """Advance the errors by one step."""
         if self._left == 0:
             self.errors, self._next = self._next, self._draw()
             self._slopes = (self._next - self.errors) / self._steps

@@ -69,7 +69,6 @@ class Crowd:
         return np.asarray(direction * speed[:, None])
 
     def _advance(self) -> None:
-        """Append one tick."""
         position, velocity = self._next
         most_change = self.kind.acceleration * TICK
         changes = self._rng.random(len(position)) < TICK / MEAN_WISH_TIME

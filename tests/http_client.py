@@ -5,7 +5,6 @@ from contextlib import closing
 
 
 def port_of(url: str) -> int:
-    """Return the port in the URL of a server."""
     return int(url.rsplit(":", 1)[1].strip("/"))
 
 

@@ -24,7 +24,6 @@ class FlightTiming:
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_LATENESSES))  # s, of each period's start
 
     def figures(self) -> dict[str, float]:
-        """Return the figures for Health."""
         lateness_ms = 1e3 * np.array([*self.lateness] or [0.0])
         return {
             "periods": self.periods,

@@ -47,7 +47,6 @@ class UdpGroundTruth:
                 self._take(parse_json(data))
 
     def close(self) -> None:
-        """Stop listening."""
         self._socket.close()
 
     def _take(self, values: Any) -> None:

@@ -28,7 +28,6 @@ class MessageSocket:
     """One end of a connection. Two threads may use it at once: one sends, one receives."""
 
     def __init__(self, connection: socket.socket) -> None:
-        """Take over a connected socket."""
         connection.settimeout(SEND_TIMEOUT)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)  # the kernel makes it twice as large
         self._socket = connection
@@ -73,7 +72,6 @@ class MessageSocket:
         self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Free the socket."""
         self._socket.close()
 
 

@@ -125,7 +125,6 @@ class FilterNode:
             self._send(np.zeros(self.robot.action_dim))
 
     def close(self) -> None:
-        """Leave the graph."""
         self.node.close()
 
     def figures(self) -> dict[str, float]:

@@ -78,7 +78,6 @@ class RosInputs:
                     self._odometry.add_pose(seconds(stamped.header.stamp), pose.x, pose.y, pose.yaw)
 
     def on_fixed_transforms(self, message: TFMessage) -> None:
-        """Handle fixed transforms."""
         with self._lock:
             for stamped in message.transforms:
                 self._transforms.add(stamped)

@@ -53,7 +53,6 @@ class AlignedLog:
             self.columns[name] = np.unwrap(self.columns[name])
 
     def runs(self) -> list[Indices]:
-        """Return the row indices of each run."""
         rows = np.arange(len(self.time))
         return np.split(rows, np.flatnonzero(np.diff(self.time) >= BETWEEN_RUNS) + 1)
 

@@ -73,7 +73,6 @@ def record(
 
 
 def _recorded(robot: RobotWithTask, recipe: _Recipe, conditions: Conditions) -> Trajectory:
-    """Record one trajectory."""
     vehicle = vehicle_in_empty_arena(robot, recipe.rng, conditions)
     built = TrajectoryBuilder(vehicle.measured)
     for u in itertools.islice(recipe.inputs(robot), recipe.periods):

@@ -120,7 +120,6 @@ def _cut_at_steps_back(table: Table) -> Table:
 
 
 def _rows(table: Table, rows: NDArray[np.intp]) -> Table:
-    """Return a table of some rows."""
     columns = {name: values[rows] for name, values in table.columns.items()}
     lines = None if table.lines is None else table.lines[rows]
     return replace(table, time=table.time[rows], columns=columns, run=table.run[rows], lines=lines)

@@ -17,7 +17,6 @@ class TrajectoryBuilder:
         self._inputs, self._paths, self._turned = list[Array](), list[Array](), list[float]()
 
     def __len__(self) -> int:
-        """Return the number of periods."""
         return len(self._inputs)
 
     @property
@@ -33,6 +32,5 @@ class TrajectoryBuilder:
         self._turned.append(turned)
 
     def trajectory(self) -> Trajectory:
-        """Return the trajectory so far."""
         arrays = np.array(self._states), np.array(self._inputs), np.array(self._paths), np.array(self._turned)
         return Trajectory(*arrays, self._before)

@@ -90,12 +90,10 @@ class CampaignPart:
 
     @property
     def cell(self) -> str:
-        """The name of the cell."""
         return f"{self.arena}-{Path(self.policy).stem}-{self.model_set}-{self.perturbation}"
 
     @property
     def name(self) -> str:
-        """The name of the part."""
         return f"{self.cell}-{self.first:06d}-{self.episodes}"
 
     def evaluation(self) -> Evaluation:
@@ -160,12 +158,10 @@ class CampaignSearch:
 
     @property
     def robot(self) -> str:
-        """The robot."""
         return self.cell.robot
 
     @property
     def name(self) -> str:
-        """The name of the search."""
         return f"search-{self.cell.arena}-{self.cell.model_set}-{self.cell.perturbation}-{self.episodes}"
 
     @errors_only("brakeline.safety")

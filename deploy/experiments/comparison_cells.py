@@ -78,7 +78,6 @@ class CellConfig:
 
     @property
     def name(self) -> str:
-        """The name of the cell's file."""
         return f"{self.method}-s{self.seed}"
 
     def trials(self) -> list[TrialConfig]:

@@ -39,7 +39,6 @@ class Conservatism:
 
     @property
     def name(self) -> str:
-        """The name of the result."""
         return "conservatism"
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
@@ -68,7 +67,6 @@ class Conservatism:
 
 
 def _figures_of(table: EpisodeTable) -> dict[str, Any]:
-    """Return the figures of the closed loop."""
     columns, steps = table.columns(), table.decisions
     return {
         "goals": sum(columns["goal"]),

@@ -161,12 +161,10 @@ class EvaluationPart:
 
     @property
     def robot(self) -> str:
-        """The name of the robot."""
         return self.robot_with_task.name
 
     @property
     def name(self) -> str:
-        """The name in reports of progress."""
         return f"episodes from {self.first}"
 
     def run(self, folder: Path, say: Callable[[str], object]) -> DrivenEpisodes:

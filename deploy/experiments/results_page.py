@@ -81,7 +81,6 @@ class RobotResults:
             self.cells.setdefault(cell["study"]["method"], []).append(cell)
 
     def evaluations(self, method: str, arena: str) -> list[Result]:
-        """Return the evaluation of each run of a method in an arena."""
         name = f"{TRAINED}-{METHODS[method].filter}-{arena}"
         return [cell["evaluations"][name] for cell in self.cells[method]]
 
@@ -113,7 +112,6 @@ class RobotResults:
         return np.array([steps_to_learn(training["episodes"], training["steps"]) for training in trainings])
 
     def training_collisions(self, method: str) -> list[int]:
-        """Return the collisions in the training of each run."""
         return [sum(cell["training"]["episodes"]["collision"]) for cell in self.cells[method]]
 
 

@@ -108,7 +108,6 @@ def robot_folder(root: Path, robot: str) -> Path:
 
 
 def _run_in_processes(tasks: Sequence[T], workers: int, runs: Path, say: Say) -> Iterator[tuple[T, Any]]:
-    """Run each task in a process of its own."""
     context, failure, others = spawning(), None, set(active_children())
     reader, writer = context.Pipe(duplex=False)
     workers = min(workers, len(tasks))
@@ -160,8 +159,6 @@ def _nothing() -> None:
 
 
 def _run_task(task: StudyTask, folder: Path) -> Any:
-    """Run a task in a worker."""
-
     def say(text: str) -> None:
         # The workers share the pipe, which writes up to 4096 bytes atomically.
         line = json.dumps([task.name, text[:LONGEST_LINE]], ensure_ascii=False)

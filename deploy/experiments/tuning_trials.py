@@ -96,7 +96,6 @@ class FilterTuning:
 
     @property
     def name(self) -> str:
-        """The name of its file."""
         return f"tuning-{self.method}-{self.value:g}"
 
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:
@@ -121,7 +120,6 @@ class LearnerTuning:
 
     @property
     def name(self) -> str:
-        """The name of its file."""
         return f"tuning-{self.method}-{self.value:g}"
 
     def run(self, folder: Path, say: Callable[[str], object]) -> dict[str, Any]:

@@ -216,7 +216,6 @@ class Adaptation:
         return sum(max(0, periods - 1 - robot.committed_steps) // robot.horizon for periods in runs)
 
     def _driving_robots(self) -> dict[str, RobotState]:
-        """Return the robots that are not silent."""
         latest = max((state.heard for state in self._robots.values()), default=0.0)
         return {name: state for name, state in self._robots.items() if latest - state.heard <= SILENT}
 
@@ -225,7 +224,6 @@ class Adaptation:
         return bool(robots) and all(state.changed for state in robots.values())
 
     def _since(self, starts: dict[str, DrivenPeriod]) -> list[pb.Step]:
-        """Return the steps of each robot from its start on."""
         return [
             step
             for step in self._steps

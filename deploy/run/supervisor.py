@@ -70,7 +70,6 @@ class SupervisedProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
         return self.popen is not None and self.popen.poll() is None
 
     def record_sign_of_life(self, pid: int) -> None:
@@ -144,7 +143,6 @@ class SupervisedProcess:
         log.error("%s %s; starting it again in %.1f s (%s)", self.spec.name, ending, backoff, output)
 
     def terminate(self) -> None:
-        """Ask the process to end."""
         if self.popen is not None and self.alive:
             self.popen.terminate()
 

@@ -17,7 +17,6 @@ class LatestEpisodes:
         self._goals: defaultdict[str, deque[bool]] = defaultdict(lambda: deque(maxlen=LATEST))
 
     def step(self, step: pb.Step) -> None:
-        """Add a step."""
         if step.terminated or step.truncated:
             self._goals[step.robot].append(step.goal)
 

@@ -70,7 +70,6 @@ class RobotPanel:
         }
 
     def begin(self, episode: pb.Episode) -> None:
-        """Start an episode."""
         self.reward, self._steps, self._interventions, self._still = 0.0, 0, 0, 0
         self._trail.clear()
         self._anchor = []

@@ -59,7 +59,6 @@ class FoxgloveServer:
         self._server.stop()
 
     def publish(self, sample: Sample) -> None:
-        """Publish a message and its scenes."""
         self._log(stored_entry(sample))
         for picture in self._converter.from_sample(sample):
             if picture.key.startswith(f"{ROOT}/arena/"):

@@ -71,7 +71,6 @@ class ReceiverThreads:
         self.join(1.0)
 
     def join(self, timeout: float) -> None:
-        """Wait for the threads to end."""
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout)

@@ -75,7 +75,6 @@ class RosSettings:
     patience: float = 10.0  # s to wait for a router at the start
 
     def configuration(self) -> zenoh.Config:
-        """Return the configuration of the Zenoh session."""
         router = bool(self.listen)
         return zenoh_config(
             {
@@ -138,7 +137,6 @@ class PublisherWatch:
                 self._types[token] = node, kind
 
     def nodes(self) -> list[str]:
-        """Return the names of these nodes."""
         with self._lock:
             return sorted({node for node, _ in self._types.values()})
 

@@ -46,7 +46,6 @@ class Reservation(ComparedByValue):
         return Reservation(0.5 * (low + high), 0.5 * (high - low), radius)
 
     def later(self) -> Reservation:
-        """Return the reservation one period later."""
         parts = self.center, self.half_width, self.radius
         return Reservation(*(np.concatenate([part[1:], part[-1:]]) for part in parts))
 

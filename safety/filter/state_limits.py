@@ -71,7 +71,6 @@ class StateLimits:
         return other
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return self.count * len(self.ends)
 
     def _nearest(self, heading: float) -> Array:

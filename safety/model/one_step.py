@@ -54,7 +54,6 @@ class Features:
         return np.asarray(products.T)
 
     def subset(self, used: Index) -> Features:
-        """Return the features with these indices."""
         return replace(self, terms=self.terms[used])
 
 

@@ -39,7 +39,6 @@ class OcclusionExits:
     far: Array
 
     def take(self, index: NDArray[np.bool_]) -> OcclusionExits:
-        """Return the chosen edges."""
         return OcclusionExits(self.before[index], self.angle[index], self.near[index], self.far[index])
 
 

@@ -109,7 +109,6 @@ def _hiding_range(width: Array, least_width: float) -> Array:
 
 
 def _ghosts(angles: Array, ranges: Array, scan: Scan) -> NDArray[np.bool_]:
-    """Return which beams are ghosts."""
     gap = np.diff(angles, append=angles[0] + 2.0 * math.pi)
     before, after = _spans(gap, scan.doubt)
     width = np.maximum(np.roll(gap, 1) + after, np.roll(before, 1) + gap)

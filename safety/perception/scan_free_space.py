@@ -40,7 +40,6 @@ class OccupiedCells:
         return len(self.corners)
 
     def take(self, index: NDArray[np.intp]) -> OccupiedCells:
-        """Return the chosen cells."""
         return OccupiedCells(self.corners[index], self.error[index], self.motions[index], self.speed, self.age)
 
     def joined(self, others: OccupiedCells) -> OccupiedCells:

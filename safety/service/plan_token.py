@@ -90,7 +90,6 @@ class PlanAuthenticator:
         return hmac.compare_digest(self.plan_token(request, robot, asker), request.plan_token)
 
     def plan_token(self, request: pb.Request, robot: Robot, asker: str = "") -> bytes:
-        """Return the token that a request needs."""
         in_force = _bytes(_without_feedback(request.input_in_force, robot))
         message = _names(robot.name, asker, request.actor, request.model) + in_force + _bytes(request.plan)
         if request.predicted_center or request.predicted_half_width:

@@ -60,7 +60,6 @@ class AutopilotRules:
         return main << 16 | (sub << 24 if main == PX4_AUTO else 0) if self.has_submodes else main
 
     def custom_mode(self, flight: FlightStateMachine) -> int:
-        """Return the custom mode for HEARTBEAT."""
         return next(number for number, mode in self.modes.items() if mode is flight.mode)
 
     def change(self, flight: FlightStateMachine, custom_mode: int) -> None:

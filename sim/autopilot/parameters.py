@@ -94,7 +94,6 @@ class Parameters:
         self._values[name] = float(round(value)) if parameter.integer else value
 
     def message(self, index: int) -> mavlink.MAVLink_param_value_message:
-        """Return the PARAM_VALUE message of the parameter with this index."""
         parameter = self.table[index]
         value = self._values[parameter.name]
         if parameter.integer and self.bitwise:

@@ -27,7 +27,6 @@ class ObstacleBatch:
         self.count = np.zeros(size, dtype=np.int64)  # (N,): number of the K slots in use
 
     def put(self, row: int, arena: Arena) -> None:
-        """Put the obstacles of an arena into a row."""
         count = self.count[row] = len(arena.obstacles)
         for name, array in self.shapes.items():
             array[row, :count] = getattr(arena.shapes, name)

@@ -39,7 +39,6 @@ def python_of(folder):
 
 
 def last_line(python, script, *words):
-    """Run a script, and return the last line of its output."""
     command, alone = [python, EXAMPLES / "foreign" / script, *words], os.environ | {"OMP_NUM_THREADS": "1"}
     result = subprocess.run(command, check=False, capture_output=True, text=True, env=alone)
     assert result.returncode == 0, result.stderr

@@ -101,7 +101,6 @@ class Fleet:
             self._add(f"actor-{robot}-0", 3 + i, "actor", robot, "--seed", self.seed, *to)
 
     def log(self, recorder: int) -> Path:
-        """Return the log of a recorder."""
         return self.folder / f"recorder-{recorder}" / "run.mcap"
 
     def start(self) -> None:

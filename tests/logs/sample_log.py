@@ -126,7 +126,6 @@ class Writer:
         self.put(f"health/{process}", message, run, always=True)
 
     def write(self, path: Path, portion: int = 100) -> Path:
-        """Write all messages to one file and return its path."""
         segment = open_segment(path, ABOUT)
         for start in range(0, len(self.entries), portion):
             segment.save(self.entries[start : start + portion])

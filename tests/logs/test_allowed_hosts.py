@@ -75,7 +75,6 @@ def test_a_foreign_page_cannot_connect_to_the_foxglove_server(live: FoxgloveServ
 
 
 def listening() -> set[tuple[str, int]]:
-    """Return the addresses at which this process listens."""
     return {tuple(c.laddr) for c in psutil.Process().net_connections("tcp") if c.status == psutil.CONN_LISTEN}
 
 

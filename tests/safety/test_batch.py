@@ -37,7 +37,6 @@ EQUAL = ("kind", "verified", "at_least", "contained", "compared", "for_clearance
 
 @pytest.fixture
 def filters(models, data):
-    """Return a filter by its form."""
     made = {
         "ground recursion": lambda: Filter(models["residual", "recursion"]),
         "two discs": lambda: Filter(fit_model_set(replace(data, robot=replace(data.robot, body=LONG)), ModelConfig())),

@@ -22,7 +22,6 @@ ODD = np.nan, np.inf, -np.inf, -1.0, 1e-9, 0.99e-9, 0.5, 1e30, 2.0 * FARTHEST, 1
 
 
 def usual(robot, seed, predicted):
-    """Return a valid request."""
     rng = np.random.default_rng(seed)
     low, high = robot.low(), robot.high()
     plan = rng.uniform(low, high, (robot.horizon, robot.action_dim))
@@ -42,7 +41,6 @@ def usual(robot, seed, predicted):
 
 
 def with_(request, field, change):
-    """Return the request with another value in a field."""
     if field not in ("center", "half_width", "heading"):
         return replace(request, **{field: change(getattr(request, field))})
     if (sets := request.predicted) is None:

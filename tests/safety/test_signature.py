@@ -69,7 +69,6 @@ def newer(model: ModelSet) -> ModelSet:
 
 
 def claimed(keys: Path, file: bytes, claim: bytes) -> SignedModel:
-    """Return a file with any claim, which a trusted key signed."""
     key = load_pem_private_key((keys / "signer.key").read_bytes(), None)
     assert isinstance(key, Ed25519PrivateKey)
     return SignedModel(file, claim, key.sign(CONTEXT + claim))

@@ -42,7 +42,6 @@ class Unicycle:
         return path, heading - start[2]
 
     def trajectory(self, inputs) -> Trajectory:
-        """Execute the inputs and record the trajectory."""
         states, done, paths, turned = [self.measure()], [], [], []
         for u in inputs:
             path, turn = self.step(u)

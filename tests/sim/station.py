@@ -59,7 +59,6 @@ class Station:
         return "; ".join(message.text for message in self.received if message.get_type() == "STATUSTEXT")
 
     def command(self, number: int, *params: float, system: int = 1) -> int:
-        """Send a command and return its result."""
         self.received.clear()
         self.mav.command_long_send(system, 1, number, 0, *params, *[0.0] * (7 - len(params)))
         ack = self.last("COMMAND_ACK")
@@ -80,7 +79,6 @@ class Station:
         return np.array([north, east, -up])
 
     def follow_setpoints(self) -> None:
-        """Change to the mode that follows setpoints."""
         self.setpoint(0, 0, 0)
         assert self.command(MODE, 1, OFFBOARD if self.autopilot.rules.name == "px4" else GUIDED) == ACCEPTED
 

@@ -25,7 +25,6 @@ SAME = 1e-9  # rounding
 
 
 def compare(batch: dict[str, Any], row: int, single: dict[str, Any]) -> None:
-    """Compare the infos of one robot."""
     for name in COMPARED:
         assert np.abs(np.asarray(batch[name][row], float) - single[name]).max() <= SAME, name
     assert batch["arena"][row] == single["arena"] and batch["robot"][row] == single["robot"]

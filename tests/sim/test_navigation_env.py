@@ -362,7 +362,6 @@ def test_a_tracking_observation_is_the_ground_observation_and_tracks() -> None:
 
 @pytest.fixture
 def tracking() -> RobotWithTask:
-    """Return the ground robot with its tracking task."""
     return robot_with_task("ground+tracks")
 
 

@@ -44,7 +44,6 @@ class Episodes:
         return float(np.mean([infos[-1][key] for infos in self.infos]))
 
     def values(self, key: str) -> np.ndarray:
-        """Return the values of all steps."""
         return np.array([info[key] for infos in self.infos for info in infos])
 
 

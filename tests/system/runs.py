@@ -158,7 +158,6 @@ class Run:
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process has this id."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

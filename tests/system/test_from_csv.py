@@ -11,7 +11,6 @@ from tests.waiting import until
 
 
 def figures(*words):
-    """Return the figures that a command prints."""
     done = brakeline(*words, "--json")
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

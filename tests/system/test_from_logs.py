@@ -22,7 +22,6 @@ from tests.system.runs import brakeline
 
 @pytest.fixture(scope="module")
 def steps(logged_run: Path) -> list[pb.Step]:
-    """Return the steps in the log."""
     return [record.message for record in read(logged_run) if record.topic == "step"]
 
 

@@ -119,7 +119,6 @@ def received(vehicle: Any, kind: str, system: int = 2, more: str = "", timeout: 
 
 
 def heartbeat(vehicle: Any, system: int) -> Any:
-    """Wait for the next heartbeat of a vehicle."""
     return received(vehicle, "HEARTBEAT", system)
 
 

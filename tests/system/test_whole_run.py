@@ -45,7 +45,6 @@ def figures(logged_run: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def analysed(logged_run: Path) -> dict:
-    """The figures of the log."""
     return json.loads(succeeded("analyse", logged_run, "--json"))
 
 

@@ -74,7 +74,6 @@ def test_without_a_terminal_it_says_a_line_now_and_then(view: Launcher, monkeypa
 
 
 def ended(view: Launcher, **changes: object) -> dict[str, object]:
-    """Return the figures of a run that has ended."""
     folder = "/very/long" * 12
     paths = {"folder": folder, "log": f"{folder}/run.mcap", "policies": [f"{folder}/policy.safetensors"]}
     outcome = {"finished": False, "restarts": {"learner": 2, "safety-0": 1}}
