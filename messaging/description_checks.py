@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,33 @@ def inconsistencies(model: DescriptionModel) -> Iterator[Problem]:
             yield f"limit.{i}.weights", f"names of state coordinates ({names}), not {', '.join(unknown)}"
         if limit.name in [other.name for other in model.limit[:i]]:
             yield f"limit.{i}.name", f"another limit is called {limit.name!r}"
+    yield from _heading_limit_problems(model)
+
+
+def _heading_limit_problems(model: DescriptionModel) -> Iterator[Problem]:
+    """Check that limits of the heading bound an arc: a measured heading does not tell one turn from the next."""
+    for heading in model.role_names("heading"):
+        most = {_nonzero(one.weights): one.most for one in model.limit}
+        for i, limit in enumerate(model.limit):
+            if not (weight := abs(limit.weights.get(heading, 0.0))):
+                continue
+            other = most.get(_nonzero({name: -value for name, value in limit.weights.items()}))
+            if other is None:
+                yield (
+                    f"limit.{i}.weights",
+                    f"{heading} comes back to the same value after a turn: also give the limit of the other side, with "
+                    "all weights negated",
+                )
+            elif not limit.most + other < math.tau * weight:
+                yield (
+                    f"limit.{i}.most",
+                    f"{heading} comes back to the same value after a turn: the limits of both sides must be less than "
+                    "2 pi apart. To count turns, add a coordinate without a role",
+                )
+
+
+def _nonzero(weights: Mapping[str, float]) -> frozenset[tuple[str, float]]:
+    return frozenset((name, value) for name, value in weights.items() if value)
 
 
 def _space_problems(model: DescriptionModel, d: int) -> Iterator[Problem]:

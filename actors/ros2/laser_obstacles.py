@@ -7,8 +7,8 @@ A beam that hits at range r becomes a disc of radius
 with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
 may be anywhere in it; the others cover the error of the hit's position. Neighbouring hits that the body cannot pass
 between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
-sensor's range. Something too near to be measured touches the body where the beam leaves it. A scan with a direction
-without information is refused: earlier scans do not count, so nobody knows what is there.
+sensor's range. Something too near to be measured touches the body where the beam leaves it. Beams without information
+are left out here: `unknown_space.py` says what may be there.
 
 Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
 (7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come
@@ -21,18 +21,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brakeline.actors.ros2.laser_beams import LaserBeams
 from brakeline.actors.ros2.sensor_frames import PlanarPose
-from brakeline.errors import BadScan
 from brakeline.messaging.obstacle import BOX, CYLINDER, Obstacle
 from brakeline.messaging.robot import Array, Robot
-from brakeline.messaging.ros2.cdr_messages import LaserScan, seconds
 
 EXTRA_SIGHT = 0.2  # m: hits count up to the robot's sight plus this, since it drives on until the next scan
 STRAIGHT = 0.02  # m: hits that are nearer to a line belong to one wall
-MOST_BEAMS = 10_000
-MORE_BEAMS = 2.5  # than a turn has: some drivers repeat the first beam at the end
 
 
 @dataclass(frozen=True)
@@ -49,45 +45,6 @@ class HitErrors:
         assert robot.heading is not None
         bound = robot.measurement_bound
         return HitErrors(range_error, bound[robot.heading], math.hypot(*bound[: robot.position_dim]))
-
-
-@dataclass(frozen=True)
-class LaserBeams:
-    """The n beams of a scan of a whole turn."""
-
-    times: Array  # (n,) s
-    angles: Array  # (n,) rad, in the sensor's frame
-    ranges: Array  # (n,) m of free space: up to the hit or the sensor's range; NaN for a hit that is too near
-    too_near: NDArray[np.bool_]  # (n,) whether the beam hit something nearer than the sensor can measure
-    gap: float  # rad between two neighbours
-
-
-def read(scan: LaserScan, zero_is_free: bool = False) -> LaserBeams:
-    """Return the beams of a scan. Raises BadScan: its angles or ranges are not valid, or do not show all directions.
-
-    zero_is_free: the driver reports 0 where nothing is within range, as some do (REP 117 demands inf).
-    """
-    ranges = np.asarray(scan.ranges, dtype=float)
-    n, gap = len(ranges), float(scan.angle_increment)
-    limits = (scan.range_min, scan.range_max, scan.angle_min, gap, scan.time_increment)
-    if not (2 <= n <= MOST_BEAMS and all(map(math.isfinite, limits)) and abs(gap) > 1.0 / MOST_BEAMS):
-        raise BadScan(f"{n} beams, {gap:g} rad apart")
-    if n * abs(gap) > 2.0 * math.pi + MORE_BEAMS * abs(gap):
-        raise BadScan(f"{n} beams, {gap:g} rad apart, are more than a turn: are its angles in radians?")
-    if not 0.0 <= scan.range_min < scan.range_max:
-        raise BadScan(f"ranges from {scan.range_min:g} m to {scan.range_max:g} m")
-    times = seconds(scan.header.stamp) + float(scan.time_increment) * np.arange(n)
-    angles = scan.angle_min + gap * np.arange(n)
-    hit = (ranges >= scan.range_min) & (ranges <= scan.range_max)  # NaN is neither
-    free = ranges > scan.range_max
-    if zero_is_free:
-        free |= ranges == 0.0
-    too_near = ((ranges > 0.0) & (ranges < scan.range_min)) | np.isneginf(ranges)  # REP 117
-    left_out = max(math.ceil(2.0 * math.pi / abs(gap) - n - 0.5), 0)  # less than half a gap is rounding
-    if unknown := left_out + int(np.count_nonzero(~(hit | free | too_near))):
-        raise BadScan(f"it has no information in {unknown} of {n + left_out} directions, where anything may be")
-    lengths = np.where(free, scan.range_max, np.where(hit, ranges, np.nan))
-    return LaserBeams(np.asarray(times, float), np.asarray(angles, float), lengths, too_near, abs(gap))
 
 
 def obstacles(

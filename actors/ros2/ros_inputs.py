@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brakeline.actors.ros2.laser_obstacles import HitErrors, LaserBeams, obstacles, read
+from brakeline.actors.ros2.laser_beams import LaserBeams, read
+from brakeline.actors.ros2.laser_obstacles import HitErrors, obstacles
 from brakeline.actors.ros2.odometry import OdometryHistory, StepLimits
 from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings
 from brakeline.actors.ros2.sensor_frames import MOST_LEAN, MOST_TILT, TransformTree, frame_name, pose_of
+from brakeline.actors.ros2.unknown_space import UnknownSpace
 from brakeline.errors import BadScan, InputMissing, PoseJumped
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.rejected_messages import headline
@@ -38,6 +40,7 @@ class RosInputs:
         self.robot, self.settings, self.limits = robot, settings, limits
         self.frame = settings.odometry_frame  # of the state
         self._errors = HitErrors.of(robot, settings.range_error)
+        self._unknown = UnknownSpace(robot, self._errors, settings.least_width)
         self._lock = threading.Lock()
         self._odometry, self._transforms = self._no_odometry(), TransformTree()
         self._bad_odometry = ""
@@ -100,6 +103,7 @@ class RosInputs:
         """Drop everything with a time stamp, since the clock was set."""
         with self._lock:
             self._odometry, self._scan, self._command = self._no_odometry(), None, None
+            self._unknown.reset()
 
     def state(self, at: float, now: float) -> Array:
         """Return the measured state (5,) at a time [s]. Raises InputMissing; PoseJumped: once for each jump."""
@@ -139,7 +143,13 @@ class RosInputs:
                 f"{frame!r} is tilted by {math.degrees(mount.tilt):.1f}° against {base!r}: a lidar may be tilted by at "
                 f"most {math.degrees(MOST_TILT):.0f}°"
             )
-        return obstacles(beams, poses, mount, self.robot, self._errors, around)
+        try:
+            unknown = self._unknown.boxes(beams, poses, mount, around)
+        except BadScan as error:
+            raise InputMissing(f"no valid scan: {error}") from error
+        informed = beams.known | beams.too_near
+        hits = obstacles(beams.take(informed), poses[informed], mount, self.robot, self._errors, around)
+        return (*hits, *unknown)
 
     def command(self, now: float) -> RawCommand | None:
         """Return the last command; None if it is older than its age limit."""
@@ -155,6 +165,7 @@ class RosInputs:
     def _check_jump(self) -> None:
         if why := self._odometry.jump:
             self._odometry.jump = ""
+            self._unknown.reset()
             raise PoseJumped(why)
 
     def _check_age(self, what: str, stamp: float, now: float, limit: float) -> None:

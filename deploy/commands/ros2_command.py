@@ -69,6 +69,9 @@ class Ros2Command:
     """Assume that a range of the lidar is wrong by at most this [m]."""
     zero_is_free: bool = False
     """Read a range of 0 as free space: the driver of the lidar reports 0 where it sees nothing within its range."""
+    least_width: float = SensorSettings.least_width
+    """Assume that no obstacle is narrower than this where beams have no information [m]. With a larger value, the
+    robot drives on with more of such beams."""
     tf: bool = False
     """Take the pose of the robot from /tf instead of odometry messages."""
     odometry_frame: str = SensorSettings.odometry_frame

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array
 from brakeline.messaging.scan import MAX_SCAN_AGE
 from brakeline.safety.filter.constraints import TubeConstraints
@@ -49,6 +50,7 @@ from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
 from brakeline.safety.model.stated_bound import check_bound, stated_bound
 from brakeline.safety.model.turning_in_place import widened
+from brakeline.safety.perception.image_coverage import unseen_poles
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.batch_filter import BatchFilter
@@ -208,6 +210,8 @@ class Filter:
             candidate = self._committed(request, local_map, z_0, record, in_domain)
             if in_domain and not blind and request.reservation is None:  # other robots rely on the reservation
                 candidate = RecoverySearch(self, request, local_map, z_0).candidate() or candidate
+            if isinstance(request.scan, RangeImage) and (lacking := unseen_poles(request.scan)):
+                record.reason += f"; {lacking}"
         return self._decision(request, local_map, candidate, record)
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 
 import numpy as np
@@ -25,6 +26,9 @@ class StateLimits:
     is: without a row for it, a robot that was pushed beyond a limit may return. In that period it exceeds the limit by
     at most the chord deviation and what it is beyond the limit already.
 
+    A measured heading is known up to whole turns. The limits of both sides bound an arc of less than a turn, and θ_0 is
+    the heading that is nearest to the middle of this arc.
+
     In joint space, every limit holds within the periods and after the stop: the chord deviation of a period is how far
     a limit's value exceeds its values at both ends of the period, in units of `Robot.limit_scales`. There the first
     period has a row for its start, too. The order of the rows is: ends, stop, starts; each for all limits.
@@ -38,6 +42,7 @@ class StateLimits:
         self.place, self.turn = weights[:, :d], np.zeros(self.count)
         if robot.heading is not None:
             self.turn = weights[:, robot.heading]
+        self.middle = np.array([_middle_of_arc(robot, i) for i in range(self.count)])
         kept = [i for i in extra_coordinates(robot) if i < n]
         self.other, self.which = weights[:, kept], [extra_coordinates(robot).index(i) for i in kept]
         self.nz, self.extra, self.ends = tube.position.shape[2], np.eye(N + 1), np.append(np.arange(N), N - 1)
@@ -68,6 +73,11 @@ class StateLimits:
     def __len__(self) -> int:
         return self.count * len(self.ends)
 
+    def _nearest(self, heading: float) -> Array:
+        """Return a heading [rad] for each limit, by whole turns as near as possible to the middle of its arc."""
+        off = heading - self.middle
+        return self.middle + off - math.tau * np.rint(off / math.tau)
+
     def rows(self, start: Array, heading: float, turn: Array, widening: float) -> ConstraintRows:
         """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world.
 
@@ -75,13 +85,22 @@ class StateLimits:
         """
         both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L + 1)
         both = (both if self.now is None else np.concatenate([both, self.now]))[self.ends]
-        bound = self.most - self.place @ start - self.turn * heading - both[..., -1]
+        bound = self.most - self.place @ start - self.turn * self._nearest(heading) - both[..., -1]
         # The chord deviation of every period, and the stopping distance at the last end.
         extra = self.extra[:, None, :] * self.way[None, :, None]
         gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)
         spread = widening * np.concatenate([np.abs(both[..., self.nz : -1]), extra], axis=2)
         count = len(gradient)
         return ConstraintRows(gradient, spread.reshape(count, -1), bound.ravel())
+
+
+def _middle_of_arc(robot: Robot, number: int) -> float:
+    """Return the middle [rad] of the headings that a limit and its opposite allow; 0 without an opposite."""
+    limit = robot.limits[number]
+    weight = limit.weights[robot.heading] if robot.heading is not None else 0.0
+    opposite = {other.weights: other.most for other in robot.limits}
+    other = opposite.get(tuple(-value for value in limit.weights))
+    return 0.0 if other is None or not weight else 0.5 * (limit.most - other) / weight
 
 
 def stack_rows(parts: list[ConstraintRows]) -> ConstraintRows:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
 
@@ -97,6 +97,22 @@ def patch_free_ranges(image: RangeImage) -> tuple[BeamGrid, Single]:
 def has_blind_directions(image: RangeImage) -> bool:
     """Return whether an image has directions without information, or with something that touches the sensor."""
     return bool((patch_free_ranges(image)[1] <= 0.0).any())
+
+
+def unseen_poles(image: RangeImage) -> str:
+    """Return what an image without beams up or down lacks, and what to do; empty if its rings reach both poles.
+
+    A body that flies then touches unknown space, and no earlier image shows what is above and below it.
+    """
+    below, above = BeamGrid.of(*image.ranges.shape, image.low, image.high).added
+    sides = [f"above {math.degrees(image.high):.0f}°"] if above else []
+    sides += [f"below {math.degrees(image.low):.0f}°"] if below else []
+    if not sides or not has_blind_directions(replace(image, ranges=np.full_like(image.ranges, image.far))):
+        return ""
+    return (
+        f"the range image has no beams {' and '.join(sides)}, so all space there counts as occupied, up to the body: "
+        "give an image whose rings reach from -90° to 90°, or obstacles from a map and no image"
+    )
 
 
 def by_mesh(of: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:

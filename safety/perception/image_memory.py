@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import deque
 from collections.abc import Mapping
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from brakeline.messaging.range_image import RangeImage, directions
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.image_coverage import GridWindow, Single, by_mesh, patch_free_ranges
+from brakeline.safety.perception.image_coverage import GridWindow, Single, by_mesh, patch_free_ranges, unseen_poles
 from brakeline.safety.perception.visibility_memory import FanMemory, VisibilityMemory
+
+log = logging.getLogger(__name__)
 
 CAPACITY = 4  # images
 SPACING = 0.5  # m: smallest motion between two stored images
@@ -56,6 +59,12 @@ class ImageMemory(VisibilityMemory[RangeImage]):
     def reset(self) -> None:
         super().reset()
         self._stored: deque[_StoredImage] = deque(maxlen=CAPACITY)
+
+    def fill(self, scan: RangeImage | None, elapsed: float) -> RangeImage:
+        """Fill in the image. A log record says so if the first one lacks beams without which nothing can fly."""
+        if scan is not None and self.unused and (lacking := unseen_poles(scan)):
+            log.warning("the robot will not fly: %s", lacking)
+        return super().fill(scan, elapsed)
 
     def _copied(self, scan: RangeImage) -> RangeImage:
         return replace(scan, ranges=scan.ranges.copy())

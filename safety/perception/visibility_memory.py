@@ -163,6 +163,11 @@ class FanMemory(VisibilityMemory[Scan]):
 
     nothing = Scan(np.zeros(0), np.zeros(0), (0.0, 0.0, 0.0))
 
+    def __init__(self, footprint: float, longest: float = math.inf) -> None:
+        """longest: age [s] from which on a stored scan no longer counts. If it is finite, every scan is stored."""
+        self._longest = longest
+        super().__init__(footprint)
+
     def reset(self) -> None:
         super().reset()
         self._stored: deque[_StoredScan] = deque(maxlen=CAPACITY)
@@ -171,6 +176,9 @@ class FanMemory(VisibilityMemory[Scan]):
     def later(self, elapsed: float) -> None:
         super().later(elapsed)
         self._tracker.later(elapsed)
+        while self._ages and self._ages[0] > self._longest:
+            self._stored.popleft()
+            self._ages = self._ages[1:]
 
     def _lose_time(self) -> None:
         super()._lose_time()
@@ -194,7 +202,7 @@ class FanMemory(VisibilityMemory[Scan]):
         return ~scan.valid_beams
 
     def _store(self, scan: Scan) -> None:
-        if self._stored:
+        if self._stored and self._longest == math.inf:
             last = self._stored[-1].scan.pose
             moved = math.dist(last[:2], scan.pose[:2]) + 0.25 * abs(math.remainder(scan.pose[2] - last[2], math.tau))
             if moved < SPACING:

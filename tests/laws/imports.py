@@ -12,7 +12,8 @@ import grimp
 # The parts that a part may import, from top to bottom. `part.module` allows that module alone, and what is below it.
 PARTS: dict[str, tuple[str, ...]] = {
     "deploy": ("actors", "learner", "logs", "safety", "sim", "messaging", "errors", "extras", "robots", "policies"),
-    # An actor knows how to ask the safety service, and what to keep between two questions.
+    # An actor knows how to ask the safety service, and what to keep between two questions. The ROS 2 node also turns
+    # what a scan does not show to be free into obstacles.
     "actors": (
         *(
             "sim",
@@ -21,6 +22,8 @@ PARTS: dict[str, tuple[str, ...]] = {
             "safety.filter.backup_plan",
             "safety.filter.request",
             "safety.perception.image_memory",
+            "safety.perception.scan_coverage",
+            "safety.perception.visibility_memory",
         ),
         *("safety.service.filter_client", "safety.service.client", "safety.service.wire"),
     ),

@@ -41,6 +41,12 @@ CAR = {
 }
 
 
+def turning(left, right=None):
+    """Return limits of the heading [rad]."""
+    sides = ((1.0, left),) if right is None else ((1.0, left), (-1.0, right))
+    return [{"name": f"{weight}", "weights": {"heading": weight, "x": 0.0}, "most": most} for weight, most in sides]
+
+
 def changed(*path_and_value):
     *path, last, value = path_and_value
     description = copy.deepcopy(CAR)
@@ -115,6 +121,8 @@ def test_what_a_description_says_is_what_the_robot_has():
         (changed("limit", 0, "weights", {"z": 1.0}), "limit.0.weights", "names of state coordinates"),
         (changed("limit", 0, "weights", {}), "limit.0.weights", "names of state coordinates"),
         (changed("limit", 2 * CAR["limit"]), "limit.1.name", "another limit is called 'keep in'"),
+        (changed("limit", turning(3.3)), "limit.0.weights", "also give the limit of the other side"),
+        (changed("limit", turning(3.3, 3.0)), "limit.1.most", "must be less than 2 pi apart"),
         (changed("body", 0, "radius", True), "body.0.radius", "a number, not True"),
         (changed("body", 0, "at", [0.0, False]), "body.0.at", "a number, not False"),
         (changed("state", "x", "error", True), "state.x.error", "a number, not True"),

@@ -12,6 +12,7 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.obstacle import Shapes
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.scan import MAX_SCAN_AGE, Scan
+from brakeline.safety.perception.image_coverage import has_blind_directions, unseen_poles
 from brakeline.safety.perception.image_memory import ImageMemory, memory_of
 from brakeline.safety.perception.image_memory import filled as filled_from_memory
 from brakeline.safety.perception.scan_free_space import gaps
@@ -149,3 +150,23 @@ def test_overwriting_the_callers_array_does_not_change_the_memory(memory):
     last = memory.fill(None, 0.2)
     assert (last.ranges == 0.5).all()
     assert beams.ndim == 2 or last.angles[0] == -math.pi
+
+
+@pytest.mark.parametrize("low", [-90.0, -89.0, -45.0])
+@pytest.mark.parametrize("high", [90.0, 89.0, 45.0])
+def test_the_first_image_without_beams_up_or_down_says_that_nothing_will_fly(low, high, caplog):
+    """A ring of depth cameras sees a belt. An aircraft with it braked for ever, and nothing said why."""
+    image = RangeImage(
+        np.full((round(high - low) // 2 + 1, 180), 20.0),
+        (0.0, 0.0, 2.0),
+        low=math.radians(low),
+        high=math.radians(high),
+    )
+    sides = [f"above {high:.0f}°"] * (high < 50.0) + [f"below {low:.0f}°"] * (low > -50.0)
+    assert bool(sides) == bool(unseen_poles(image)) == has_blind_directions(image)
+    memory = ImageMemory(0.3)
+    for _ in range(2):
+        memory.fill(image, 0.1)
+    warnings = [record.getMessage() for record in caplog.records]
+    assert warnings == ([f"the robot will not fly: {unseen_poles(image)}"] if sides else [])
+    assert not sides or f"no beams {' and '.join(sides)}, so" in unseen_poles(image)

@@ -19,11 +19,12 @@ BEAMS = 360
 
 def scan_of(beam_ranges, **more):
     n = len(beam_ranges)
+    first, step = more.get("angle_min", 0.0), more.get("angle_increment", 2.0 * math.pi / n)
     fields = {
         "header": cdr.header(10.0, "base_scan"),
-        "angle_min": 0.0,
-        "angle_max": 2.0 * math.pi * (n - 1) / n,
-        "angle_increment": 2.0 * math.pi / n,
+        "angle_min": first,
+        "angle_max": first + (n - 1) * step,
+        "angle_increment": step,
         "time_increment": 0.0,
         "scan_time": 0.2,
         "range_min": 0.12,

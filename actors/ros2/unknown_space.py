@@ -1,0 +1,194 @@
+"""Where a laser scan shows nothing: boxes for space that neither this scan nor an earlier one shows to be free.
+
+A beam without information leaves a gap between its neighbours. As in a `Scan` with dropped beams, the gap is free up to
+a distance F (`safety/perception/scan_coverage.py`): up to there, an obstacle of the least width would reach into a
+beam beside the gap. The visibility memory extends F by what the scans of the last seconds showed to be free. Beyond F
+the gap counts as occupied. A turn of the robot against the lidar's turn also leaves a gap, between the last beam and
+the first.
+
+If unknown space comes as near as the body, the scan is refused: the filter would lead the robot away from it, and
+nobody knows whether something touches the robot there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brakeline.actors.ros2.laser_beams import LaserBeams
+from brakeline.actors.ros2.laser_obstacles import EXTRA_SIGHT, HitErrors
+from brakeline.actors.ros2.sensor_frames import PlanarPose
+from brakeline.errors import BadScan
+from brakeline.messaging.obstacle import BOX, Obstacle, Shapes
+from brakeline.messaging.robot import Array, Robot
+from brakeline.messaging.scan import MAX_BEAMS, Scan
+from brakeline.safety.perception.scan_coverage import gaps
+from brakeline.safety.perception.visibility_memory import FanMemory
+
+FEWER_BEAMS = MAX_BEAMS // 2  # of a scan with more, every second, third, … counts: gaps need room for added beams
+LEFT_OUT = 1.5  # gaps of the scan: two neighbours that are farther apart leave out beams
+WIDEST = math.radians(6.0)  # of a box; a wider gap has several
+LONGEST = 2.0  # s for which a scan stays in the memory: what is dark may have been put there since
+AT_SENSOR = 1e-3  # m: range of a beam that hit something too near to be measured
+
+
+class _RecentScans(FanMemory):
+    """The last scans' memory. Of the space around the body, it takes only the body's own place as free."""
+
+    START = 0.0
+
+    def _near_start(self, points: Array, scan: Scan, step: Array | float) -> NDArray[np.bool_]:
+        away = np.linalg.norm(points - np.asarray(scan.pose[:2]), axis=-1)
+        return np.asarray(away <= self._start_radius - scan.position_error - step)
+
+
+class UnknownSpace:
+    """The unknown space around one robot, and the memory of what its scans showed to be free."""
+
+    def __init__(self, robot: Robot, errors: HitErrors, least_width: float) -> None:
+        """least_width: of all obstacles [m], see `Scan`."""
+        self._robot, self._errors, self._least_width = robot, errors, least_width
+        self._memory, self._last = _RecentScans(robot.footprint, LONGEST), -math.inf  # s, of the last scan
+
+    def reset(self) -> None:
+        """Forget all space: the poses are in another frame from here on."""
+        self._memory.reset()
+
+    def boxes(self, beams: LaserBeams, poses: Array, mount: PlanarPose, around: Array) -> tuple[Obstacle, ...]:
+        """Return boxes that hold all unknown space near a position, for the next scan.
+
+        Args:
+            beams, poses, mount, around: see `laser_obstacles.obstacles`.
+
+        Raises:
+            BadScan: unknown space comes as near as the body.
+        """
+        scan, moved = self._scan(beams, poses, mount)
+        unknown = scan.angles[~scan.valid_beams]
+        elapsed = max(float(beams.times[-1]) - self._last, 0.0)
+        self._last = float(beams.times[-1])
+        filled = self._memory.fill(scan, min(elapsed, 2.0 * LONGEST))
+        if not len(unknown):
+            return ()
+        angles, width, free = gaps(_where_better(filled, scan))
+        ends = np.searchsorted(unknown, angles - 1e-9), np.searchsorted(unknown, angles + width + 1e-9)
+        beyond = np.searchsorted(unknown, angles + width + 1e-9 - math.tau)  # the last gap goes on after -π
+        blind = (ends[1] > ends[0]) | (beyond > 0)
+        free = free - self._parallax(filled, moved, beams.gap, angles, width)
+        boxes = self._boxes(filled, angles[blind], width[blind], np.maximum(free[blind], 0.0))
+        limit = self._robot.footprint + 2.0 * self._errors.position
+        if boxes and float(Shapes.of(boxes, 2).distance(around[None]).min()) < limit:
+            raise BadScan(_why(beams, len(unknown), len(scan.angles)))
+        return boxes
+
+    def _scan(self, beams: LaserBeams, poses: Array, mount: PlanarPose) -> tuple[Scan, Array]:
+        """Return the beams as a scan from the middle one's pose, and the sensor's way (2,) [m] from first to last.
+
+        The scan has an unknown beam for each that is left out.
+        """
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        sensor = poses[:, :2] + np.stack([cos * mount.x - sin * mount.y, sin * mount.x + cos * mount.y], axis=1)
+        middle = len(poses) // 2
+        x, y, heading = map(float, poses[middle, :3])
+        shift = float(np.linalg.norm(sensor - sensor[middle], axis=1).max())
+        angles = mount.yaw + beams.angles + poses[:, 2] - heading
+        ranges = np.where(beams.known, np.maximum(np.nan_to_num(beams.ranges), AT_SENSOR), 0.0)
+        ranges[beams.too_near] = AT_SENSOR
+        size = math.ceil(len(angles) / FEWER_BEAMS)
+        angles, ranges = _thinned(*_ascending(angles, ranges, beams.gap), size)
+        angles, ranges = _completed(angles, ranges, size * beams.gap)
+        scan = Scan(
+            ranges,
+            angles,
+            (x, y, heading),
+            (mount.x, mount.y),
+            beams.farthest,
+            self._errors.range,
+            self._errors.position + shift,
+            self._errors.heading,
+            self._least_width,
+        )
+        return scan, np.asarray(sensor[-1] - sensor[0])
+
+    @staticmethod
+    def _parallax(scan: Scan, moved: Array, gap: float, angles: Array, width: Array) -> Array:
+        """Return what gaps lose of F [m], because the two beams beside a gap do not begin at one point.
+
+        An obstacle has that much more room between them. The first and the last beam are a whole turn apart. Where the
+        memory filled in beams, it left room for this.
+        """
+        side = scan.pose[2] + angles + 0.5 * width
+        across = np.abs(moved[0] * np.sin(side) - moved[1] * np.cos(side))
+        seam = angles + width > angles[0] + math.tau - 1e-9
+        across = np.where(seam, across, across * width / math.tau)
+        return np.where(width > LEFT_OUT * gap, across / np.sin(np.minimum(width, 0.5 * math.pi)), 0.0)
+
+    def _boxes(self, scan: Scan, angles: Array, width: Array, free: Array) -> tuple[Obstacle, ...]:
+        """Return boxes that hold the gaps from `free` on, as far as the filter looks."""
+        far = self._robot.sight + EXTRA_SIGHT
+        parts = np.maximum(np.ceil(width / WIDEST).astype(int), 1)
+        gap = np.repeat(np.arange(len(angles)), parts)
+        number = np.arange(len(gap)) - np.repeat(np.cumsum(parts) - parts, parts)
+        width, free = width[gap] / parts[gap], free[gap]
+        at, heading = scan.sensor()
+        side = heading + angles[gap] + (number + 0.5) * width
+        arm = math.hypot(*scan.mount)
+        boxes = []
+        for middle, half, near in zip(side.tolist(), (0.5 * width).tolist(), free.tolist(), strict=True):
+            if near >= far:
+                continue
+            error = scan.position_error + scan.heading_error * (far + arm)
+            begin = near * math.cos(half) - scan.position_error - scan.heading_error * (near + arm)
+            length, across = far - begin, 2.0 * (far * math.sin(half) + error)
+            center = 0.5 * (far + begin)
+            x, y = float(at[0]) + center * math.cos(middle), float(at[1]) + center * math.sin(middle)
+            boxes.append(Obstacle(BOX, (x, y), (length, across), middle))
+        return tuple(boxes)
+
+
+def _where_better(filled: Scan, scan: Scan) -> Scan:
+    """Return the filled scan without the beams of which the memory knows less than the beams beside them show."""
+    if len(filled.angles) != len(scan.angles):
+        return filled
+    angles, _, free = gaps(scan)
+    unknown = np.flatnonzero(~scan.valid_beams)
+    ranges = filled.ranges.copy()
+    ranges[unknown[ranges[unknown] - scan.range_error <= free[np.searchsorted(angles, scan.angles[unknown]) - 1]]] = 0.0
+    return replace(filled, ranges=ranges)
+
+
+def _ascending(angles: Array, ranges: Array, gap: float) -> tuple[Array, Array]:
+    """Return the beams in ascending order, within a turn: of two that look the same way, the later one counts."""
+    if angles[-1] < angles[0]:
+        last = angles > angles[-1] + math.tau - 0.5 * gap
+        return angles[~last][::-1], ranges[~last][::-1]
+    last = angles < angles[-1] - math.tau + 0.5 * gap
+    return angles[~last], ranges[~last]
+
+
+def _thinned(angles: Array, ranges: Array, size: int) -> tuple[Array, Array]:
+    """Return one beam of each group of `size` neighbours: the first one with information, if there is one."""
+    starts = np.arange(0, len(angles), size)
+    index = np.minimum(starts[:, None] + np.arange(size), len(angles) - 1)
+    chosen = index[np.arange(len(starts)), (ranges[index] > 0.0).argmax(axis=1)]
+    return angles[chosen], ranges[chosen]
+
+
+def _completed(angles: Array, ranges: Array, gap: float) -> tuple[Array, Array]:
+    """Return the beams with unknown ones where some are left out."""
+    step = np.diff(angles, append=angles[0] + math.tau)
+    parts = np.where(step > LEFT_OUT * gap, np.rint(step / gap), 1.0).astype(int)
+    beam = np.repeat(np.arange(len(step)), parts)
+    number = np.arange(len(beam)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return angles[beam] + number * (step / parts)[beam], np.where(number == 0, ranges[beam], 0.0)
+
+
+def _why(beams: LaserBeams, unknown: int, directions: int) -> str:
+    """Return why a scan is refused."""
+    why = f"it has no information in {unknown} of {directions} directions, and nobody knows what is beside the robot"
+    if beams.beyond:
+        why += f" ({beams.beyond} ranges are above range_max, {beams.farthest:g} m: REP 117 wants inf for no hit)"
+    return why
