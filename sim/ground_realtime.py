@@ -16,8 +16,12 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
 from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
+from brakeline.sim.range_sensors import with_faults
+from brakeline.sim.sim_conditions import SensorFaults
 
 BEAMS = 360  # of the lidar, in a turn
+FLAWLESS = SensorFaults()
+TOUCHING = 1e-6  # m, a range that is not 0, which would say that a beam has no information
 
 
 class RealtimeEstimator(Estimator):
@@ -97,17 +101,31 @@ class RealtimeGroundRobot(GroundRobot):
 class SpinningLidar:
     """A lidar that measures beam after beam, one turn in `SAMPLES` samples: the ranges of a turn have different times.
 
-    A beam that hits nothing reports inf, one that hits something too near reports -inf (REP 117).
+    A beam that hits nothing reports inf, one that hits something too near reports -inf, and one without information
+    reports NaN (REP 117).
     """
 
     farthest = 3.5  # m, limit of a range
     mount = -0.032  # m, its position on the robot's x axis
     gap = 2.0 * math.pi / BEAMS  # rad between two beams
 
-    def __init__(self, arena: Arena, rng: np.random.Generator, noise: float, nearest: float = 0.12) -> None:
-        """Start the first turn. noise: standard deviation of a range [m]; nearest: the other limit of a range [m]."""
-        self.nearest = nearest
-        angles = self.gap * np.arange(BEAMS)
+    def __init__(
+        self,
+        arena: Arena,
+        rng: np.random.Generator,
+        noise: float,
+        nearest: float = 0.12,
+        faults: SensorFaults = FLAWLESS,
+    ) -> None:
+        """Start the first turn.
+
+        Args:
+            noise: standard deviation of a range [m].
+            nearest: the other limit of a range [m].
+            faults: of its beams; a scan is never late.
+        """
+        self.nearest, self._faults, self._rng = nearest, faults, rng
+        self._angles = angles = self.gap * np.arange(BEAMS)
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         sectors = np.array_split(directions, SAMPLES)
         self._sectors = [Lidar(arena, LidarRays(sector, self.farthest), noise, rng) for sector in sectors]
@@ -121,10 +139,11 @@ class SpinningLidar:
         """
         heading = float(true[2])
         origin = true[:2] + self.mount * np.array([math.cos(heading), math.sin(heading)])
-        ranges = self._sectors[len(self._measured)].ranges(origin, heading)
-        ranges = np.where(ranges >= self.farthest, np.inf, np.where(ranges < self.nearest, -np.inf, ranges))
-        self._measured.append(ranges)
+        self._measured.append(self._sectors[len(self._measured)].ranges(origin, heading))
         if len(self._measured) < len(self._sectors):
             return None
         turn, self._measured = np.concatenate(self._measured), []
-        return turn
+        limits = self.nearest, self.farthest
+        turn = with_faults(np.maximum(turn, TOUCHING), self._angles, limits, self._faults, self._rng)
+        reported = np.where(turn >= self.farthest, np.inf, np.where(turn < self.nearest, -np.inf, turn))
+        return np.where(turn == 0.0, np.nan, reported)

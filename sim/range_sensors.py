@@ -21,10 +21,35 @@ from brakeline.messaging.scan import Scan
 from brakeline.sim.arena import Arena
 from brakeline.sim.ground_estimator import CUT
 from brakeline.sim.lidar import Lidar
-from brakeline.sim.sim_conditions import Perception
+from brakeline.sim.sim_conditions import Perception, SensorFaults
 from brakeline.sim.traffic import Crowd
 
 S = TypeVar("S", Scan, RangeImage)
+
+
+def with_faults(
+    ranges: Array, azimuths: Array, limits: tuple[float, float], faults: SensorFaults, rng: np.random.Generator
+) -> Array:
+    """Return ranges (R,) [m] with the faults of a sensor; 0 for a beam without information.
+
+    Args:
+        ranges: of a sensor without faults; 0 for a beam without information.
+        azimuths (R,): directions of the beams [rad], 0 ahead, up to whole turns.
+        limits: smallest and largest range [m].
+        faults: what to draw, and from rng.
+    """
+    (near, far), draw, count = limits, rng.random, len(ranges)
+    if faults.far:
+        ranges = np.where((draw(count) < faults.far) & (ranges > 0.0), far, ranges)
+    if faults.ghosts:
+        ghosts = np.maximum(near, ranges * draw(count))
+        ranges = np.where((draw(count) < faults.ghosts) & (ranges > 0.0), ghosts, ranges)
+    if faults.dropped:
+        ranges = np.where(draw(count) < faults.dropped, 0.0, ranges)
+    if faults.blind:
+        ahead = np.abs(np.mod(azimuths + math.pi, 2.0 * math.pi) - math.pi)
+        ranges = np.where(ahead > math.pi - 0.5 * faults.blind, 0.0, ranges)
+    return np.asarray(ranges)
 
 
 class Scanner(ABC, Generic[S]):
@@ -73,18 +98,8 @@ class Scanner(ABC, Generic[S]):
 
     def _faulty(self, ranges: Array) -> Array:
         """Return ranges with the sensor's faults."""
-        faults, draw, count = self._faults, self._rng.random, len(ranges)
         ranges = np.where(ranges < self.NEAR, 0.0, ranges)
-        if faults.far:
-            ranges = np.where((draw(count) < faults.far) & (ranges > 0.0), self._lidar.max_range, ranges)
-        if faults.ghosts:
-            ghosts = np.maximum(self.NEAR, ranges * draw(count))
-            ranges = np.where((draw(count) < faults.ghosts) & (ranges > 0.0), ghosts, ranges)
-        if faults.dropped:
-            ranges = np.where(draw(count) < faults.dropped, 0.0, ranges)
-        if faults.blind:
-            ranges = np.where(np.abs(self._azimuths) > math.pi - 0.5 * faults.blind, 0.0, ranges)
-        return np.asarray(ranges)
+        return with_faults(ranges, self._azimuths, (self.NEAR, self._lidar.max_range), self._faults, self._rng)
 
 
 class FanScanner(Scanner[Scan]):

@@ -57,7 +57,11 @@ class BridgeSettings:
     timeout: float = 0.3  # s without a command after which the base stops
     stamped: bool = False  # commands are TwistStamped
     seconds: float = 0.0  # duration; 0: until the stop event
-    conditions: Conditions = field(default_factory=Conditions)
+    conditions: Conditions = field(default_factory=Conditions)  # the robot always scans, and no scan is late
+
+    def __post_init__(self) -> None:
+        if self.conditions.perception.faults.late:
+            raise ValueError("a simulated ROS 2 robot has no late scans: leave out --late")
 
 
 @dataclass
@@ -87,7 +91,7 @@ class Bridge:
         arena = draw_arena(settings.arena, np.random.default_rng(settings.seed), robot_with_task("ground"))
         c = settings.conditions
         self.robot = RealtimeGroundRobot(arena, rng, c.noise, process_noise=c.process_noise, **changes_of(c))
-        self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False))
+        self._lidar = SpinningLidar(arena, rng, c.lidar_noise(flies=False), faults=c.perception.faults)
         self._start_time = 1.0 if settings.sim_time else time.time()  # s, the robot's time at the first sample
         self._samples = 0
         self._received = threading.Condition()

@@ -102,9 +102,12 @@ class Bench:
         return self.said("bridge"), self.said("filter"), self.said("driver")
 
 
-def rammed(folder: Path, arena: str, seed: int, seconds: float, *node: object) -> tuple[dict[str, Any], ...]:
+def rammed(
+    folder: Path, arena: str, seed: int, seconds: float, *node: object, dropped: float = 0.0
+) -> tuple[dict[str, Any], ...]:
     """Return the last output of robot, filter and driver after `seconds` of simulated time."""
     bridge = ("--arena", arena, "--seed", seed, "--seconds", seconds)
+    bridge += ("--perception", "scan", "--dropped", dropped) if dropped else ()
     with Bench(folder, *SIMULATED, *bridge, node=("--sim-time", *node)) as bench:
         figures = bench.end(PATIENCE + 2.0 * seconds)
     assert figures[0], bench.errors("bridge")
@@ -195,6 +198,21 @@ def test_in_real_time_it_hits_nothing_and_says_what_delay_it_adds(late_folder: P
     delays = sorted(driver["delays"])
     print(robot, node, f"{len(delays)} delays: p50 {delays[len(delays) // 2]:.3f} s, worst {delays[-1]:.3f} s")
     assert robot["collisions"] == 0 and delays[len(delays) // 2] < 0.4
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_with_beams_without_information_it_drives_on_and_hits_nothing(late_folder: Path, tmp_path: Path) -> None:
+    """Four arenas, two of them dense, a simulated minute in each, for each share of such beams."""
+    for dropped in (0.0, 0.01, 0.05, 0.1):
+        total: Counter[str] = Counter()
+        for seed in range(4):
+            arena, folder = "dense" if seed % 2 else "default", tmp_path / f"{dropped:g}-{seed}"
+            robot, node, _ = rammed(folder, arena, seed, 60.0, dropped=dropped)
+            assert robot["collisions"] == 0, (dropped, seed)
+            total.update({name: node[name] for name in ("periods", "allowed", "adjusted", "failsafe")})
+        print(dropped, dict(total), f"{total['allowed'] / total['periods']:.1%} allowed")
+        assert total["allowed"] > 0.5 * total["periods"]
 
 
 @pytest.mark.long
