@@ -125,8 +125,8 @@ class SpinningLidar:
             faults: of its beams; a scan is never late.
         """
         self.nearest, self._faults, self._rng = nearest, faults, rng
-        self._angles = angles = self.gap * np.arange(BEAMS)
-        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        self._angles: Array = np.asarray(self.gap * np.arange(BEAMS), float)
+        directions = np.stack([np.cos(self._angles), np.sin(self._angles)], axis=1)
         sectors = np.array_split(directions, SAMPLES)
         self._sectors = [Lidar(arena, LidarRays(sector, self.farthest), noise, rng) for sector in sectors]
         self._measured: list[Array] = []
