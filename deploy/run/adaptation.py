@@ -207,7 +207,8 @@ class Adaptation:
         each = minutes / plans if plans else SPARE * self.robot.horizon * self.robot.period / 60.0
         left = max((needed - plans) * each, FEWEST_MINUTES - minutes)
         bound = percent(accepted_bound(self.robot, self.accept_bound))
-        return f"{WAITING}: {min(plans, needed)} of the {needed} plans since the change that state {bound}, {left:.1f} minutes left"
+        have = f"{min(plans, needed)} of the {needed} plans since the change that state {bound}"
+        return f"{WAITING}: {have}, {left:.1f} minutes left"
 
     def _plans(self, steps: list[pb.Step]) -> int:
         """Return how many plans that do not overlap these steps hold. A trajectory begins with its second step."""

@@ -54,16 +54,17 @@ class Features:
         return np.asarray(products.T)
 
     def subset(self, used: Index) -> Features:
+        """Return the features with these indices."""
         return replace(self, terms=self.terms[used])
 
 
-def features_for(robot: Robot, v: Array, degree: int, lags: int, braking: bool = False) -> Features:
+def features_for(robot: Robot, v: Array, degree: int, lags: int) -> Features:
     """Return the features from which the fit selects.
 
     These are all monomials up to a degree, and two kinds of features that monomials cannot represent:
 
     - the tanh of the difference of an input and the speed that follows it: so an autopilot that limits its acceleration
-      answers. With `braking`, also times either of them: so a robot answers that brakes faster than it accelerates;
+      answers;
     - the absolute value of a speed, |s| = s · sign s, alone or times one more variable: slip and drag depend on it.
 
     Args:
@@ -71,23 +72,19 @@ def features_for(robot: Robot, v: Array, degree: int, lags: int, braking: bool =
         v (T, v): recorded variables. They set the scales.
         degree: the highest degree of the monomials, 1 to 4.
         lags: 1 to use the input of the period before, 0 to leave it out.
-        braking: whether to include the features of a robot that brakes faster than it accelerates.
     """
     measured = len(robot.regressor)
     count = measured + robot.action_dim * (1 + lags)
     scale = np.abs(v).max(0)
     scale[scale <= 0.0] = 1.0
-    first = 1 + v.shape[1]  # index of the first saturation
     rows: list[tuple[float, float, float]] = []
-    bent: list[tuple[int, ...]] = []
     for i, index in enumerate(robot.follows):
         if index in robot.regressor:
             a, b = measured + i, robot.regressor.index(index)
             most = float(np.abs(v[:, a] - v[:, b]).max())
-            for share in WIDTHS if most > 0.0 else ():
-                saturation = first + len(rows)
-                rows.append((a, b, share * most))
-                bent += [(saturation,), *([(1 + a, saturation), (1 + b, saturation)] if braking else [])]
+            rows += [(a, b, share * most) for share in WIDTHS if most > 0.0]
+    first = 1 + v.shape[1]  # index of the first saturation
+    bent: list[tuple[int, ...]] = [(first + e,) for e in range(len(rows))]
     for a in range(measured):
         sign = first + len(rows)
         rows.append((a, -1.0, SIGN * float(scale[a])))

@@ -38,7 +38,7 @@ from brakeline.safety.model.set_shape import (
 Progress = Callable[[float], None]  # called with the share of the work that is done
 TRIED, CHOSEN, SCORED = 0.4, 0.8, 0.95  # shares of the work that are done after each part
 
-DEGREES, LAGS, BRAKING = (1, 2, 3, 4), (0, 1), (False, True)
+DEGREES, LAGS = (1, 2, 3, 4), (0, 1)
 MOST_FEATURES, FEWEST_PERIODS_A_FEATURE = 600, 5  # to select from
 GOOD, MOST_GOOD = 1.25, 4  # of candidates up to this factor above the least error, the best: their sets are compared
 SIMPLER = 1.03  # a simpler candidate wins if its sets are at most this factor wider
@@ -84,15 +84,15 @@ def choose(
     found: list[tuple[Candidate, Regression]] = []
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
     few_windows = replace(s, z=s.z[some], after=s.after[some], fold=s.fold[some])
-    families = [*product(DEGREES, LAGS, BRAKING)]
-    for number, (degree, lags, braking) in enumerate(families):
+    families = [*product(DEGREES, LAGS)]
+    for number, (degree, lags) in enumerate(families):
         progress(TRIED * number / len(families))
-        features = features_for(robot, s.v, degree, lags, braking)
+        features = features_for(robot, s.v, degree, lags)
         if degree > 1 and len(features.terms) > min(MOST_FEATURES, len(s.v) / FEWEST_PERIODS_A_FEATURE):
             continue
         regression = Regression(robot, features, s)
         for penalty, instruments in product(PENALTIES, (False, True)):
-            candidate = Candidate(degree, lags, penalty, instruments, braking=braking)
+            candidate = Candidate(degree, lags, penalty, instruments)
             off = _distances(robot, regression.out_of_fold(candidate, few_windows))
             with np.errstate(invalid="ignore"):
                 error = float(np.quantile(off, QUANTILE))

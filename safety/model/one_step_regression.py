@@ -24,7 +24,7 @@ class Candidate:
     """A way to fit the predictor, and its out-of-fold error.
 
     Attributes:
-        degree, lags, braking: of the features to select from (`features_for`).
+        degree, lags: of the features to select from (`features_for`).
         penalty: of the selection (`SelectionPath`).
         instruments: whether the coefficients come from instrumental variables.
         error [m]: the 99 % quantile of the distance between predicted and measured position, over all windows and
@@ -39,7 +39,6 @@ class Candidate:
     instruments: bool
     error: float = np.nan
     features: int = 0
-    braking: bool = False
 
 
 class Regression:

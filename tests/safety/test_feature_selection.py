@@ -35,17 +35,14 @@ def test_of_features_that_say_the_same_one_is_taken_and_of_noise_none():
     assert not len(path(np.zeros((10, 2)), np.zeros(10)).order)
 
 
-def driving(slip, noise, periods=4000, rise=np.inf):
-    """Return samples of a robot whose speeds follow the inputs, the first one less while it turns.
-
-    rise: the most by which a speed grows in a period. Nothing limits how much it falls.
-    """
+def driving(slip, noise, periods=4000):
+    """Return samples of a robot whose speeds follow the inputs, the first one less while it turns."""
     rng = np.random.default_rng(2)
     inputs = np.repeat(rng.uniform(ROBOT.low(), ROBOT.high(), (periods // 4, M)), 4, axis=0)
     speeds = np.zeros((periods + 1, R))
     for k, u in enumerate(inputs):
         asked = u * [1.0 - slip * abs(speeds[k, 1]), 1.0]
-        speeds[k + 1] = speeds[k] + np.minimum(0.4 * (asked - speeds[k]), rise)
+        speeds[k + 1] = 0.6 * speeds[k] + 0.4 * asked
     measured = speeds + noise * rng.normal(size=speeds.shape)
     y = np.zeros((periods, ROBOT.state_dim))
     y[:, list(ROBOT.regressor)] = measured[1:]
@@ -74,13 +71,3 @@ def test_slip_that_grows_with_the_size_of_a_speed_is_a_feature():
     off = one_step.features(np.hstack([speeds[:-1], v[:, R:]])) @ one_step.C[list(ROBOT.regressor)].T - speeds[1:]
     assert np.quantile(np.abs(off[:, 0]), 0.99) < 0.005
     assert np.count_nonzero(one_step.C[ROBOT.regressor[0]]) <= 8
-
-
-def test_a_robot_that_brakes_faster_than_it_accelerates_has_features():
-    s, speeds, v = driving(slip=0.0, noise=0.001, rise=0.02)
-    largest = {}
-    for braking in (False, True):
-        one_step = Regression(ROBOT, features_for(ROBOT, v, 2, 0, braking), s).fit(Candidate(2, 0, 3.0, False))
-        off = one_step.features(np.hstack([speeds[:-1], v[:, R:]])) @ one_step.C[list(ROBOT.regressor)].T - speeds[1:]
-        largest[braking] = np.quantile(np.abs(off[:, 0]), 0.99)
-    assert largest[True] < 0.6 * largest[False]
