@@ -175,6 +175,7 @@ class Takeoff:
             if velocity is not None:
                 self._hold(np.zeros(3))
             if not self._wait(lambda: not self._stale(), LONGEST_PAUSE):
+                why = self._stale() or why  # as it is by now
                 break
             if velocity is not None:
                 self._hold(velocity)
