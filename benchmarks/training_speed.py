@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.timing import Figures, processor_times
-from brakeline.learner.learner_output import POLICY
-from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.policy_weights import MLP, POLICY
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.gym_batch import BatchSafetyWrapper

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.errors import BadWeights, NoSource
-from brakeline.messaging.policy_weights import MLP
+from brakeline.messaging.policy_weights import MLP, POLICY
 from brakeline.messaging.task import RobotWithTask
 from brakeline.sim.scripted_policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
-POLICY = "policy.safetensors"  # of a run
 POLICY_FOLDER = Path(__file__).parents[1] / "policies"
 
 
@@ -49,7 +48,7 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     path = stored.get(name) or _weights(name, robot)
     if path.is_dir():
         raise ValueError(
-            f"the folder {path} holds no policy of {robot.kind}: a training writes learner/{POLICY} into its"
+            f"the folder {path} holds no policy of {robot.kind}: name the folder of a training, or a weights file"
         )
     if not path.is_file():
         names = ", ".join([*sorted(stored), UNTRAINED, *robot.task.policies])

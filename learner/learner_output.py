@@ -11,12 +11,12 @@ from brakeline.errors import CheckpointError
 from brakeline.learner.checkpoint import CHECKPOINT
 from brakeline.learner.learner import Learner
 from brakeline.messaging.atomic_files import write_atomically
+from brakeline.messaging.policy_weights import POLICY
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.topics import LEARNER
 
 log = logging.getLogger("brakeline.learner")
 
-POLICY = "policy.safetensors"
 METRICS_PERIOD = 1.0  # [s]
 RETRY = 30.0  # time to the next attempt after a failed checkpoint [s]
 

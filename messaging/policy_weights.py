@@ -24,6 +24,7 @@ from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.structured_text import parse_json
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 
+POLICY = "policy.safetensors"  # name of the file with a trained policy
 Matrix = NDArray[np.float32]
 Layers = Sequence[Layer]  # weight (out, in), bias (out,)
 

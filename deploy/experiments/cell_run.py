@@ -34,7 +34,7 @@ from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.logs.figure_tables import analyse
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.messaging.policy_weights import MLP, decode
+from brakeline.messaging.policy_weights import MLP, POLICY, decode
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.messaging.topics import EPISODE
 from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -43,7 +43,6 @@ from brakeline.safety.model.model_config import DDPC, SAILR
 from brakeline.safety.rivals.pretrained import Pretrained
 
 PACKAGES = ("brakeline", "mujoco", "proxsuite", "numpy", "torch")
-POLICY = "policy.safetensors"
 COUNTED = {"goals": "goal", "timeouts": "timeout", "contacts_moving": "contact_moving"}
 COUNTED["contacts_standing"] = "contact_standing"  # figures of a log, and the columns that count the same
 LOGGED = ("collisions", "interventions", "failsafes", "mean_speed", "max_speed", "mean_reward", "containment")

@@ -22,5 +22,5 @@ def test_the_folder_of_a_run_stands_for_its_policy(tmp_path, learner):
 
 
 def test_a_folder_without_a_policy_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="holds no policy of ground"):
+    with pytest.raises(ValueError, match="holds no policy of ground: name the folder of a training"):
         network_named(str(tmp_path), GROUND, 0)
