@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.messaging.scan import Scan
-from brakeline.safety.perception.visibility_memory import REACH, STEP, Array, FanMemory
+from brakeline.safety.perception.visibility_memory import STEP, Array, FanMemory
 
 CELLS = 128  # along each side of the grid
 CELLS_PER_RADIUS = 10  # of the body's disc
@@ -99,7 +99,7 @@ class GridMemory(FanMemory):
         Unlike in `FanMemory`, the errors of this scan's pose are not subtracted.
         """
         at, heading = scan.sensor()
-        away = STEP * np.arange(1, round(REACH / STEP) + 1)
+        away = STEP * np.arange(1, round(0.5 * CELLS * self._cell / STEP) + 1)
         turned = heading + scan.angles[beams]
         points = at + away[:, None, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)  # (S, B, 2)
         cells = np.floor(points / self._cell).astype(int) - self._corner

@@ -221,7 +221,7 @@ def test_all_that_beams_without_information_may_have_missed_is_in_an_obstacle(de
     for _ in range(8 if degrees == 360.0 else 4):
         accepted, points = drive_among_posts(rng, degrees, 6 if degrees == 360.0 else 8)
         scans, covered = scans + accepted, covered + points
-    assert scans > 20 and covered > 100, (scans, covered)
+    assert scans > (20 if degrees == 360.0 else 10) and covered > 100, (scans, covered)
 
 
 def drive_among_posts(rng, degrees, periods):
@@ -250,8 +250,9 @@ def drive_among_posts(rng, degrees, periods):
             break
         sensors = poses[:, :2] + MOUNT.x * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         ways = np.stack([np.cos(poses[:, 2] + angles), np.sin(poses[:, 2] + angles)], axis=1)
-        ranges = np.array([cast(posts, at, way[None], FAR)[0] for at, way in zip(sensors, ways, strict=True)])
-        dark = np.array([cast(black, at, way[None], FAR)[0] for at, way in zip(sensors, ways, strict=True)])
+        ranges, dark = np.full((2, BEAMS), FAR)
+        for i in np.flatnonzero(~outside):
+            ranges[i], dark[i] = (cast(hit, sensors[i], ways[i : i + 1], FAR)[0] for hit in (posts, black))
         ranges = np.where(ranges < FAR, np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 1e-3), np.inf)
         silent = ((dark < FAR) & (dark <= ranges + 0.021)) | (rng.random(BEAMS) < share)
         silent &= period >= 2  # what the first scans show is in the memory
