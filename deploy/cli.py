@@ -209,8 +209,8 @@ def unwrap_help(options: Any) -> None:
     changes the docstrings of this process, so call it only where the process prints help and ends.
     """
     for parent in options.__mro__[:-1]:
-        found = docstring_parser.parse_from_object(parent).params
-        texts = [f"    {text.arg_name}: {' '.join((text.description or '').split())}" for text in found]
+        attributes = docstring_parser.parse_from_object(parent).params
+        texts = [f"    {text.arg_name}: {' '.join((text.description or '').split())}" for text in attributes]
         if texts and "\nAttributes:\n" not in (parent.__doc__ or ""):
             parent.__doc__ = "\n".join([(parent.__doc__ or "").rstrip(), "", "Attributes:", *texts])
     for hint in get_type_hints(options).values():

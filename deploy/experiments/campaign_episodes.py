@@ -73,14 +73,14 @@ class CampaignDriver:
             robot, what, model, ask, environment(robot, what.arena, FRESH + what.seed, what.conditions)
         )
 
-    def drive(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
-        """Drive episodes and return a row of each, in order. Calls `each` after every episode."""
+    def drive(self, first: int, episodes: int, after_episode: Callable[[], object]) -> list[Row]:
+        """Drive episodes and return a row of each, in order. Calls `after_episode` after every one."""
         if self._in_a_batch():
-            return self._drive_batch(first, episodes, each)
+            return self._drive_batch(first, episodes, after_episode)
         rows = []
         for number in range(first, first + episodes):
             rows.append(self.row(number))
-            each()
+            after_episode()
         return rows
 
     def row(self, number: int, log: TrialLog | None = None, policy: Policy | None = None) -> Row:
@@ -130,14 +130,14 @@ class CampaignDriver:
             return False
         return True
 
-    def _drive_batch(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
+    def _drive_batch(self, first: int, episodes: int, after_episode: Callable[[], object]) -> list[Row]:
         table, rows = EpisodeTable(ROWS), dict[int, Row]()
 
         def take(step: pb.Step) -> None:
             table.step(step)
             if step.terminated or step.truncated:
                 rows[step.episode] = table.pop()
-                each()
+                after_episode()
 
         drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take, independent=True)
         return [rows[number] for number in range(first, first + episodes)]

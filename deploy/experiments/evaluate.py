@@ -33,7 +33,7 @@ EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
 EPISODES_OF_A_BATCH = 1000  # the same for a batch, which waits for its last episodes at the end of a part
 POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
 
-Each = Callable[[EpisodeStats], Any]
+AfterEpisode = Callable[[EpisodeStats], Any]
 Backend = Literal["single", "batch"]
 
 
@@ -177,11 +177,11 @@ class EvaluationPart:
             what = replace(what, policy=str(path))
         return replace(self, what=what).drive(lambda stats: say(progress_line(stats)))
 
-    def drive(self, each: Each) -> DrivenEpisodes:
-        """Drive the episodes. Calls `each` after every episode with the statistics so far."""
+    def drive(self, after_episode: AfterEpisode) -> DrivenEpisodes:
+        """Drive the episodes. Calls `after_episode` after every one with the statistics so far."""
         robot, what, world = self.robot_with_task, self.what, None
         if what.backend == "batch":
-            return self._drive_batch(each)
+            return self._drive_batch(after_episode)
         if what.fleet:
             group, world, policies, question = prepare_fleet(robot, what, self.first)
         else:
@@ -194,10 +194,10 @@ class EvaluationPart:
                 for step in steps:
                     stats[step.actor].step(step)
             for actor in stats.values():
-                each(actor)
+                after_episode(actor)
         return DrivenEpisodes(stats, periods, 0 if world is None else world.touches)
 
-    def _drive_batch(self, each: Each) -> DrivenEpisodes:
+    def _drive_batch(self, after_episode: AfterEpisode) -> DrivenEpisodes:
         from brakeline.deploy.experiments.batch_evaluation import drive_batch
 
         stats: defaultdict[str, EpisodeStats] = defaultdict(EpisodeStats)
@@ -205,7 +205,7 @@ class EvaluationPart:
         def take(step: pb.Step) -> None:
             stats[step.actor].step(step)
             if step.terminated or step.truncated:
-                each(stats[step.actor])
+                after_episode(stats[step.actor])
 
         drive_batch(self.robot_with_task, self.what, self.first, self.rounds, take)
         return DrivenEpisodes(dict(stats), sum(one.steps for one in stats.values()), 0)
@@ -232,13 +232,15 @@ def parts_of(robot: RobotWithTask, what: Evaluation) -> list[EvaluationPart]:
     return [EvaluationPart(robot, what, first, min(size, rounds - first), content) for first in firsts]
 
 
-def evaluate(robot: RobotWithTask, what: Evaluation, each: Each = lambda stats: None) -> dict[str, Any]:
+def evaluate(
+    robot: RobotWithTask, what: Evaluation, after_episode: AfterEpisode = lambda stats: None
+) -> dict[str, Any]:
     """Run `what.episodes` episodes in this process, and return their closed-loop metrics.
 
-    The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls `each` after every
-    episode with the statistics of its part (`parts_of`) so far.
+    The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls
+    `after_episode` after every episode with the statistics of its part (`parts_of`) so far.
     """
-    return _figures(robot, what, [part.drive(each) for part in parts_of(robot, what)])
+    return _figures(robot, what, [part.drive(after_episode) for part in parts_of(robot, what)])
 
 
 def evaluate_with(engine: Engine, robot: RobotWithTask, what: Evaluation, say: Say = unsaid) -> dict[str, Any]:

@@ -90,10 +90,10 @@ def search(
     """
     import cma
 
-    found = _Search(robot, what)
+    progress = _Search(robot, what)
     size = MOVED * robot.position_dim + PIECES * robot.action_dim
     number = 0
-    while found.episodes < episodes:
+    while progress.episodes < episodes:
         options = {
             "bounds": [-1.0, 1.0],
             "seed": what.seed + number + 1,
@@ -101,15 +101,15 @@ def search(
             "maxfevals": EPISODES_OF_AN_ARENA,
         }
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
-        while not strategy.stop() and found.episodes < episodes:
+        while not strategy.stop() and progress.episodes < episodes:
             candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
-            strategy.tell([one.values for one in candidates], list(map(found.score, candidates)))
-            say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
+            strategy.tell([one.values for one in candidates], list(map(progress.score, candidates)))
+            say(f"{progress.episodes} of {episodes} episodes, closest {1e3 * progress.closest:.1f} mm")
         number += 1
-        if not found.episodes and number == MOST_ARENAS:
+        if not progress.episodes and number == MOST_ARENAS:
             raise NoArena(f"every candidate in {number} arenas {what.arena!r} began too near to something")
-    found.write_worst(path)
-    return found.figures()
+    progress.write_worst(path)
+    return progress.figures()
 
 
 class _Search:
