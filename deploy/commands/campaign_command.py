@@ -102,16 +102,18 @@ class CampaignCommand:
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
         searches = [search_of(cell, self.search) for cell in searched.values()]
         worst = complete(searches, self.runs, self.runs, self.engine, self.again, say)
-        found = [one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)]
+        worst_cases = [
+            one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)
+        ]
         driven = cells_of(parts, results, self.runs)
         own = robot.task.name  # additional tasks of a robot have tables of their own
-        table = {"robot": own, "cells": driven, "searches": found}
-        write_atomically(self.results / f"{own}.md", campaign.markdown(own, driven, found).encode())
+        table = {"robot": own, "cells": driven, "searches": worst_cases}
+        write_atomically(self.results / f"{own}.md", campaign.markdown(own, driven, worst_cases).encode())
         write_atomically(self.results / f"{own}.json", f"{json.dumps(table, indent=1)}\n".encode())
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
-            if found:
-                console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
+            if worst_cases:
+                console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(worst_cases)))
             console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
         return table
 

@@ -96,6 +96,15 @@ def test_gymnasium_makes_the_environment_by_its_id_in_every_render_mode(
         check_env(env.unwrapped)
 
 
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_gymnasium_makes_many_robots_at_once_by_the_id(name: str) -> None:
+    register()
+    envs = gymnasium.make_vec(name, num_envs=2, arena="dense")
+    assert isinstance(envs, BatchNavigationEnv) and envs.robot.name == ENVIRONMENTS[name]
+    assert [arena.name for arena in envs.reset(seed=0)[1]["arena"]] == ["dense"] * 2
+    envs.close()
+
+
 def test_an_environment_takes_a_robot_by_its_name() -> None:
     assert NavigationEnv("ground").robot == GROUND
     with pytest.raises(UnknownRobot, match="grond"):
