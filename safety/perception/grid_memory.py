@@ -64,9 +64,9 @@ class GridMemory(FanMemory):
                 self._shown_at[away <= self._stated - scan.position_error - self._spacing] = 0.0
             return
         turn = abs(math.remainder(scan.pose[2] - self._counted[2], math.tau))
-        moved = math.dist(scan.pose[:2], self._counted[:2])
-        if moved > 2.0 * scan.position_error or turn > 2.0 * scan.heading_error:  # less may be errors; it counts later
-            self._way, self._counted = self._way + moved + self._footprint * turn, scan.pose
+        distance = math.dist(scan.pose[:2], self._counted[:2])
+        if distance > 2.0 * scan.position_error or turn > 2.0 * scan.heading_error:  # less may be errors; counts later
+            self._way, self._counted = self._way + distance + self._footprint * turn, scan.pose
 
     def _middles(self) -> Array:
         """Return the middles (CELLS, CELLS, 2) of the cells [m]."""
