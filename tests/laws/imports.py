@@ -21,6 +21,7 @@ PARTS: dict[str, tuple[str, ...]] = {
             "errors",
             "safety.filter.backup_plan",
             "safety.filter.request",
+            "safety.perception.grid_memory",
             "safety.perception.image_memory",
             "safety.perception.scan_coverage",
             "safety.perception.visibility_memory",
