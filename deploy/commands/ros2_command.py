@@ -73,8 +73,8 @@ class Ros2Command:
     """Assume that no obstacle is narrower than this where beams have no information [m]. With a larger value, the
     robot drives on with more of such beams."""
     free_at_start: float = 0.0
-    """State that the space within this distance of the robot's origin is free at the start, and that nothing comes into
-    space that the lidar does not see [m]. Give it if the lidar does not see all round. 0 states nothing."""
+    """State that the space within this distance of the robot's origin is free at the start [m], for a lidar that does
+    not see all round. Nothing may come into space that the lidar does not see. 0 states nothing."""
     tf: bool = False
     """Take the pose of the robot from /tf instead of odometry messages."""
     odometry_frame: str = SensorSettings.odometry_frame
