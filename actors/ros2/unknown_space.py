@@ -79,7 +79,7 @@ class UnknownSpace:
         self._kept = GridMemory(robot.footprint, free_at_start) if free_at_start else None
         self._informed = np.zeros(SECTORS, dtype=bool)  # sectors of the sensor's turn in which it has seen something
         self._stated = free_at_start
-        least = robot.footprint + 5.0 * errors.position
+        least = 1.2 * robot.footprint + 7.0 * errors.position  # of a disc in which, less all errors, a body can stand
         if 0.0 < free_at_start < least:
             raise Mismatch(
                 f"a free disc of {free_at_start:g} m at the start is too small, because the body reaches "
