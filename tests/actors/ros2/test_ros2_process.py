@@ -279,6 +279,41 @@ def test_an_answer_for_a_past_period_does_not_count():
         node_under_test.close()
 
 
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.1, 2.5])
+def test_no_decision_rests_on_an_input_that_the_base_executed_for_part_of_a_period(share):
+    """A period begins late by a share of its length: the base went on with the input before."""
+    stop, requests, period, sent = threading.Event(), [], ROBOT.period, []
+
+    def ask(asked):
+        requests.extend(asked)
+        return allow(asked)
+
+    node_under_test = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), ask, stop)
+    try:
+        gate, clock = node_under_test.gate, Stalling()
+        command = lambda number: RawCommand(np.array([0.05 + 0.1 * (number % 2), 0.0]), clock.time, number)  # noqa: E731
+        node_under_test.clock = clock
+        node_under_test._decide = lambda began, number: gate.decide(np.zeros(5), (), command(number), began, number)
+        node_under_test._send = lambda action: sent.append((clock.now(), action[0]))
+        due, before = 100.0, 0
+        for number in range(12):
+            if number == 5:
+                clock.stall, before = share * period, len(requests)
+            due = node_under_test._period(due, stop)
+            assert number != 5 or gate.kind == LATE
+        sent.append((due, 0.0))
+        assert requests[before].model != "m" and requests[-1].model == "m"
+        for request in requests:
+            end = request.time + period
+            spans = [
+                (max(t, request.time), min(u, end), value) for (t, value), (u, _) in zip(sent, sent[1:], strict=False)
+            ]
+            others = [until - since for since, until, value in spans if value != request.plan[0]]
+            assert max(others) < 0.02 + 1e-9, request.time
+    finally:
+        node_under_test.close()
+
+
 def test_clocks_that_differ_stop_the_robot():
     with steered(stamped=True) as (robot, _):
         robot.drives()
