@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -305,11 +306,9 @@ def test_no_decision_rests_on_an_input_that_the_base_executed_for_part_of_a_peri
         assert requests[before].model != "m" and requests[-1].model == "m"
         for request in requests:
             end = request.time + period
-            spans = [
-                (max(t, request.time), min(u, end), value) for (t, value), (u, _) in zip(sent, sent[1:], strict=False)
-            ]
-            others = [until - since for since, until, value in spans if value != request.plan[0]]
-            assert max(others) < 0.02 + 1e-9, request.time
+            for (since, value), (until_, _) in pairwise(sent):
+                if value != request.plan[0]:
+                    assert min(until_, end) - max(since, request.time) < 0.02 + 1e-9, request.time
     finally:
         node_under_test.close()
 
