@@ -368,6 +368,8 @@ def test_show_prints_a_description(command, figures, robot):
         ("autopilot --vehicles -1", "--vehicles is a number from 1 on, not -1"),
         ("autopilot --setpoint-timeout nan", "--setpoint-timeout is a number above 0, not nan"),
         ("bridge-sim --timeout inf", "--timeout is a number above 0, not inf"),
+        ("train --deadline nan --out runs/none", "deadline = nan is not finite"),
+        ("train --practice -1 --out runs/none", "practice = -1.0 is not 0 or more"),
         ("status --wait -1", "--wait is a number from 0 on, not -1"),
     ],
 )

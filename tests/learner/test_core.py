@@ -306,3 +306,9 @@ def test_a_resumed_run_keeps_the_multiplier(tmp_path):
     for wrong in ("3.6", float("nan"), -1.0):
         with pytest.raises(ValueError, match="no multiplier"):
             LagrangeMultiplier(0.1, 1.0).restore(PartState({}, {"value": wrong}))
+
+
+@pytest.mark.parametrize("name", ["updates_per_step", "actor_rate", "exploration_noise", "reward_scale"])
+def test_a_setting_that_is_no_number_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} = nan is not finite"):
+        TD3Config(**{name: float("nan")})
