@@ -78,12 +78,12 @@ def run() -> Words:
 def flight(robot: RobotWithTask, model: ModelSet, change: Conditions) -> list[FlightPeriod]:
     """Fly one changed vehicle from goal to goal behind a model set."""
     stages = goal_sequence(flight_arena("default", 0), GOALS, np.random.default_rng(0), robot)
-    make, made, order = simulated_vehicle(robot, change, None), list[Vehicle](), cycle(stages)
+    make, vehicles, order = simulated_vehicle(robot, change, None), list[Vehicle](), cycle(stages)
 
     def vehicle(arena: Arena, rng: np.random.Generator) -> Vehicle:
-        if not made:  # it flies on from where it is
-            made.append(make(arena, rng))
-        return made[0]
+        if not vehicles:  # it flies on from where it is
+            vehicles.append(make(arena, rng))
+        return vehicles[0]
 
     env = NavigationEnv(robot, "default", vehicle, conditions=change, seed_key=ARENA_KEY, draw=lambda *_: next(order))
     ask, runner = in_process(model, 1.0), EpisodeRunner(robot, env, ActorIdentity("actor-0", 0, 0), continuous=True)

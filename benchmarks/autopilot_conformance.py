@@ -46,9 +46,9 @@ def run() -> Words:
             with embedded(kind) as url:
                 columns[f"{kind}, embedded"] = manners(url, 1, kind)
     rows: Words = {}
-    for who, found in columns.items():
-        for what, answer in found.items():
-            rows.setdefault(what, {})[who] = answer
+    for name, answers in columns.items():
+        for what, answer in answers.items():
+            rows.setdefault(what, {})[name] = answer
     return rows
 
 
@@ -64,10 +64,10 @@ def manners(url: str, system: int, kind: str) -> Manners:
     link = open_link(url)
     try:
         station = Station(link, system)
-        found = on_the_ground(station, kind)
-        found |= up(station, kind)
-        found |= in_the_air(station, kind)
-        return found | down(station, kind)
+        answers = on_the_ground(station, kind)
+        answers |= up(station, kind)
+        answers |= in_the_air(station, kind)
+        return answers | down(station, kind)
     finally:
         link.close()
 
@@ -75,28 +75,28 @@ def manners(url: str, system: int, kind: str) -> Manners:
 def on_the_ground(station: Station, kind: str) -> Manners:
     """Send requests to the autopilot on the ground."""
     station.listen(READY, lambda: "HEARTBEAT" in station.last)
-    found: Manners = {"boots in mode": station.mode}
+    answers: Manners = {"boots in mode": station.mode}
     started = time.monotonic()
-    found["arm, at once"] = switch(station, True)
+    answers["arm, at once"] = switch(station, True)
     while switch(station, True) != "accepted" and time.monotonic() - started < READY:
         station.listen(1.0)
-    found["arms after [s]"] = round(time.monotonic() - started, 1)
+    answers["arms after [s]"] = round(time.monotonic() - started, 1)
     station.listen(2.0, lambda: station.armed)
-    found["arm, armed already"] = switch(station, True)
-    found["disarm"] = switch(station, False)
+    answers["arm, armed already"] = switch(station, True)
+    answers["disarm"] = switch(station, False)
     station.listen(2.0, lambda: not station.armed)
     for name in ASKED:
-        found[f"{name} at 20 Hz"] = interval(station, name)
-    found["interval of message 9999"] = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 50_000)
-    found["command USER_1"] = station.command(m.MAV_CMD_USER_1)
-    found["mode 99"] = station.command(m.MAV_CMD_DO_SET_MODE, 1, 99, 0)
+        answers[f"{name} at 20 Hz"] = interval(station, name)
+    answers["interval of message 9999"] = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 50_000)
+    answers["command USER_1"] = station.command(m.MAV_CMD_USER_1)
+    answers["mode 99"] = station.command(m.MAV_CMD_DO_SET_MODE, 1, 99, 0)
     station.listen(1.2)
-    found["mode after mode 99"] = station.mode
-    found["guided (offboard) without setpoints"] = to_offboard(station, kind)
+    answers["mode after mode 99"] = station.mode
+    answers["guided (offboard) without setpoints"] = to_offboard(station, kind)
     station.listen(1.2)
-    found["mode after that"] = station.mode
-    found["take off, disarmed"] = take_off(station, kind)
-    return found
+    answers["mode after that"] = station.mode
+    answers["take off, disarmed"] = take_off(station, kind)
+    return answers
 
 
 def up(station: Station, kind: str) -> Manners:
@@ -109,64 +109,64 @@ def up(station: Station, kind: str) -> Manners:
     station.listen(1.5)
     while to_offboard(station, kind) != "accepted" and time.monotonic() - started < READY:
         station.listen(1.0)
-    found: Manners = {"guided (offboard) with setpoints": to_offboard(station, kind)}
-    found["its mode"] = station.mode
-    found["arm"] = switch(station, True)
+    answers: Manners = {"guided (offboard) with setpoints": to_offboard(station, kind)}
+    answers["its mode"] = station.mode
+    answers["arm"] = switch(station, True)
     while not station.armed and time.monotonic() - started < READY:
         switch(station, True)
         station.listen(1.0)
-    found["flies after [s]"] = round(time.monotonic() - started, 1)
+    answers["flies after [s]"] = round(time.monotonic() - started, 1)
     ground = place(station)[2]
     station.velocity = None if kind == "ardupilot" else STILL  # a setpoint would end ArduCopter's climb
-    found["take off"] = take_off(station, kind)
+    answers["take off"] = take_off(station, kind)
     if kind == "px4":  # takeoff is a mode of its own there
         station.listen(CLIMB, lambda: ground - place(station)[2] > 1.5)
         to_offboard(station, kind)
         station.velocity = (0.0, 0.0, -1.0)
-    found["at 4.5 m after [s]"] = round(station.listen(CLIMB, lambda: ground - place(station)[2] > 0.9 * HEIGHT), 1)
+    answers["at 4.5 m after [s]"] = round(station.listen(CLIMB, lambda: ground - place(station)[2] > 0.9 * HEIGHT), 1)
     station.velocity = STILL
     station.listen(2.0)
-    return found
+    return answers
 
 
 def in_the_air(station: Station, kind: str) -> Manners:
     """Send requests to the flying autopilot, and setpoints that it follows or refuses."""
-    found: Manners = {
+    answers: Manners = {
         "arm, in the air": switch(station, True),
         "disarm, in the air": switch(station, False),
         "still armed": str(station.armed),
         "mode 99, in the air": station.command(m.MAV_CMD_DO_SET_MODE, 1, 99, 0),
     }
     station.listen(1.2)
-    found["mode after mode 99, in the air"] = station.mode
+    answers["mode after mode 99, in the air"] = station.mode
     to_offboard(station, kind)
-    found |= driven(station)
+    answers |= driven(station)
     station.velocity = STILL
-    found |= braked(station, "setpoint zero", BRAKE)
+    answers |= braked(station, "setpoint zero", BRAKE)
     cruise(station)
     station.velocity = None
-    found |= braked(station, "silence", SILENCE)
-    found["mode after silence"] = station.mode
+    answers |= braked(station, "silence", SILENCE)
+    answers["mode after silence"] = station.mode
     station.velocity = STILL
     station.listen(3.0)
-    found["mode when setpoints come again"] = station.mode
-    found["guided (offboard) again"] = to_offboard(station, kind)
+    answers["mode when setpoints come again"] = station.mode
+    answers["guided (offboard) again"] = to_offboard(station, kind)
     # Not NaN: it ends ArduCopter's simulator by a floating point exception.
     for what, frame, mask in (
         ("of a global frame", int(m.MAV_FRAME_GLOBAL), VELOCITY_ONLY),
         ("that hold nothing", station.frame, VELOCITY_ONLY | VELOCITY),
     ):
-        found[f"speed after 2 s of setpoints {what} [m/s]"] = after(station, frame, mask)
-        found[f"mode after setpoints {what}"] = station.mode
+        answers[f"speed after 2 s of setpoints {what} [m/s]"] = after(station, frame, mask)
+        answers[f"mode after setpoints {what}"] = station.mode
         station.listen(3.0)
         to_offboard(station, kind)
-    return found
+    return answers
 
 
 def down(station: Station, kind: str) -> Manners:
     """Land."""
     main, sub = LAND[kind]
-    found: Manners = {"mode land": station.command(m.MAV_CMD_DO_SET_MODE, 1, main, sub)}
+    answers: Manners = {"mode land": station.command(m.MAV_CMD_DO_SET_MODE, 1, main, sub)}
     station.velocity = None
 
     def landed() -> bool:
@@ -174,21 +174,21 @@ def down(station: Station, kind: str) -> Manners:
         return state is not None and state.landed_state == m.MAV_LANDED_STATE_ON_GROUND
 
     station.listen(LANDING, landed)
-    found["disarms after landing [s]"] = round(station.listen(LANDING, lambda: not station.armed), 1)
-    found["mode after landing"] = station.mode
-    found["arm, in mode land"] = switch(station, True)
+    answers["disarms after landing [s]"] = round(station.listen(LANDING, lambda: not station.armed), 1)
+    answers["mode after landing"] = station.mode
+    answers["arm, in mode land"] = switch(station, True)
     switch(station, False)
-    return found
+    return answers
 
 
 def driven(station: Station) -> Manners:
     """Return how the speed rises with a setpoint of `SPEED`."""
     station.velocity = NORTH
-    found: Manners = {}
+    answers: Manners = {}
     for second in (1, 2, 4):
         station.listen(1.0 if second < 4 else 2.0)
-        found[f"speed after {second} s at {SPEED:g} m/s [m/s]"] = round(speed(station), 2)
-    return found
+        answers[f"speed after {second} s at {SPEED:g} m/s [m/s]"] = round(speed(station), 2)
+    return answers
 
 
 def cruise(station: Station) -> None:
@@ -216,9 +216,9 @@ def after(station: Station, frame: int, mask: int) -> float:
     ordinary = station.frame
     station.frame, station.mask = frame, mask
     station.listen(2.0)
-    found = round(speed(station), 1)
+    reached = round(speed(station), 1)
     station.velocity, station.frame, station.mask = STILL, ordinary, VELOCITY_ONLY
-    return found
+    return reached
 
 
 def switch(station: Station, on: bool) -> str:
@@ -243,12 +243,12 @@ def take_off(station: Station, kind: str) -> str:
 
 def interval(station: Station, name: str, seconds: float = 1.5) -> str:
     """Request a message at 20 Hz. Returns the answer, and whether the message then comes."""
-    said = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, getattr(m, f"MAVLINK_MSG_ID_{name}"), 50_000)
+    answer = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, getattr(m, f"MAVLINK_MSG_ID_{name}"), 50_000)
     if seconds:
         station.heard[name] = 0
         station.listen(seconds)
-        said += ", comes" if station.heard[name] > 0.5 * seconds / 0.05 else ", does not come"
-    return said
+        answer += ", comes" if station.heard[name] > 0.5 * seconds / 0.05 else ", does not come"
+    return answer
 
 
 def place(station: Station) -> tuple[float, float, float]:

@@ -141,15 +141,15 @@ class Polytope:
     @staticmethod
     def of(rows: Array, limits: Array, directions: Array) -> Polytope:
         """Keep the rows that bound some of these directions (D, F), or their opposites."""
-        found = linprog(-directions[0], A_ub=rows, b_ub=limits, bounds=(None, None), method="highs-ds")
-        if found.status != 0:
-            raise ValueError(f"the samples do not bound the models: {found.message}")
-        last = np.argsort(limits - rows @ found.x)[: rows.shape[1]]
-        kept = last.copy()
+        optimum = linprog(-directions[0], A_ub=rows, b_ub=limits, bounds=(None, None), method="highs-ds")
+        if optimum.status != 0:
+            raise ValueError(f"the samples do not bound the models: {optimum.message}")
+        last = np.argsort(limits - rows @ optimum.x)[: rows.shape[1]]
+        bounding = last.copy()
         for direction in np.vstack([directions, -directions]):
             climb(rows, limits, direction, last)
-            kept = np.union1d(kept, last)
-        return Polytope(np.ascontiguousarray(rows[kept]), limits[kept], np.searchsorted(kept, last))
+            bounding = np.union1d(bounding, last)
+        return Polytope(np.ascontiguousarray(rows[bounding]), limits[bounding], np.searchsorted(bounding, last))
 
     def supports(self, directions: Array) -> Array:
         """Return the largest p · x (D,) for the directions p (D, F)."""
@@ -187,9 +187,9 @@ class ConsistentModels:
         some = white[np.linspace(0, len(white) - 1, min(DIRECTIONS, len(white))).astype(int)]
         outputs = []
         for errors, size in zip(off.T, sizes.T, strict=True):
-            kept = np.abs(errors) <= size
-            rows = np.vstack([white[kept], -white[kept]])
-            limits = np.concatenate([size[kept] + errors[kept], size[kept] - errors[kept]])
+            consistent = np.abs(errors) <= size
+            rows = np.vstack([white[consistent], -white[consistent]])
+            limits = np.concatenate([size[consistent] + errors[consistent], size[consistent] - errors[consistent]])
             outputs.append(Polytope.of(rows, limits, np.vstack([some, basis.T])))
         box = [np.maximum(output.supports(basis.T), output.supports(-basis.T)) for output in outputs]
         return ConsistentModels(C, np.array(box), basis, tuple(outputs))

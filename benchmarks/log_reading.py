@@ -89,8 +89,8 @@ def measured(what: str, path: Path) -> dict[str, float]:
     words = [*PYTHON, "-m", "benchmarks.log_reading", what, str(path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}  # nothing installs the benchmarks
     run = subprocess.run(words, check=True, capture_output=True, text=True, env=environment)
-    found: dict[str, float] = json.loads(run.stdout)
-    return found
+    figures: dict[str, float] = json.loads(run.stdout)
+    return figures
 
 
 def ours(path: Path, pictures: bool) -> int:
@@ -112,11 +112,11 @@ def of_size(size: int) -> Figures:
         path = Path(folder) / "run.mcap"
         synthesise(path, size)
         name = f"{size // MB} MB"
-        found = {
+        rows = {
             f"all figures, {name}": measured("figures", path),
             f"and what the report draws, {name}": measured("report", path),
         }
-        return found if size > SMALL else found | {f"mcap, decoded only, first {PEER}": measured("mcap", path)}
+        return rows if size > SMALL else rows | {f"mcap, decoded only, first {PEER}": measured("mcap", path)}
 
 
 def run() -> Figures:

@@ -257,8 +257,8 @@ def barrier_for(robot: Robot, tuning: BarrierConfig) -> UnicycleBarrier:
 
 def tuned() -> BarrierConfig:
     """Return the settings with the fewest collisions, most goals and nearest approach, in episodes of other seeds."""
-    robot, found = robot_named(str(OWN_LOG / "diff.toml")), {}
+    robot, errors_of = robot_named(str(OWN_LOG / "diff.toml")), {}
     for tuning in TUNINGS:
         had = decisions("diff", barrier_for(robot, tuning), TUNING_EPISODES, SEED + 5000)
-        found[tuning] = had["collisions"], -int(str(had["goals"]).split()[0]), float(had["nearest cm"])
-    return min(found, key=found.__getitem__)
+        errors_of[tuning] = had["collisions"], -int(str(had["goals"]).split()[0]), float(had["nearest cm"])
+    return min(errors_of, key=errors_of.__getitem__)

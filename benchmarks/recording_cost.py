@@ -54,11 +54,11 @@ def run() -> Figures:
     pairs, shares = [], []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(PAIRS):
-            found = {}
+            rates = {}
             for record in (True, False) if number % 2 else (False, True):
-                found[record], share = training(Path(folder) / f"{number}-{record}", record)
+                rates[record], share = training(Path(folder) / f"{number}-{record}", record)
                 shares += [share] if record else []
-            pairs.append((found[True], found[False]))
+            pairs.append((rates[True], rates[False]))
     recorded, bare = np.array(pairs).T
     cost = 100.0 * (1.0 - recorded / bare)
     recorder = {"% of the run's processor time": 100 * float(np.mean(shares))}

@@ -108,8 +108,8 @@ def configure(url: str, system: int, parameters: Mapping[str, float]) -> None:
 @contextmanager
 def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
     """Run an autopilot with its saved parameters. Yields its URL and its system id."""
-    said = folder / f"{kind}.log"
-    with _free(kind) as instance, said.open("wb") as output:
+    log_file = folder / f"{kind}.log"
+    with _free(kind) as instance, log_file.open("wb") as output:
         command = [sys.executable, "-c", KEEPER, str(start), str(folder / kind), str(instance)]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
@@ -118,7 +118,7 @@ def _running(kind: str, start: Path, folder: Path) -> Iterator[tuple[str, int]]:
             deadline = time.monotonic() + STARTS_IN
             while not _taken(kind, instance):  # without a connection: its first one is its only one
                 if time.monotonic() > deadline:
-                    raise NoAutopilot(f"{kind} does not listen: {said.read_text(errors='replace')[-500:]}")
+                    raise NoAutopilot(f"{kind} does not listen: {log_file.read_text(errors='replace')[-500:]}")
                 time.sleep(0.1)
             if kind == "px4":
                 yield f"udpin:127.0.0.1:{14540 + instance}", instance + 1

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks import situations
 from benchmarks.decide import SCANS
-from benchmarks.timing import Figures, each
+from benchmarks.timing import Figures, timed_each
 from brakeline.messaging.task import RobotWithTask, robot_with_task
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
@@ -74,6 +74,6 @@ def run() -> Figures:
         seen = programs(certificate, robot, conditions)
         count, size = {"count": float(len(seen))}, f"{name} ({len(seen[0].h)} variables)"
         beside = disagreements(seen, robot.action_dim)
-        figures[f"{size}: ProxQP"] = each([partial(solve, program) for program in seen]) | count | beside
-        figures[f"{size}: DAQP"] = each([partial(by_daqp, program) for program in seen]) | count
+        figures[f"{size}: ProxQP"] = timed_each([partial(solve, program) for program in seen]) | count | beside
+        figures[f"{size}: DAQP"] = timed_each([partial(by_daqp, program) for program in seen]) | count
     return figures

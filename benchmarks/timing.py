@@ -26,10 +26,10 @@ def milliseconds(seconds: Sequence[float]) -> dict[str, float]:
 
 def timed(call: Callable[[], object], count: int) -> dict[str, float]:
     """Return the times of `count` calls of one function, after a warm-up."""
-    return each([call] * (count + min(WARM_UP, count)))
+    return timed_each([call] * (count + min(WARM_UP, count)))
 
 
-def each(calls: Sequence[Callable[[], object]]) -> dict[str, float]:
+def timed_each(calls: Sequence[Callable[[], object]]) -> dict[str, float]:
     """Return the times of one call of each function. The first calls are a warm-up and do not count."""
     seconds = []
     for call in calls:
@@ -101,14 +101,14 @@ class Stalls:
 @contextmanager
 def stalls(pause: float) -> Iterator[Stalls]:
     """Measure the stalls of a thread that asks for pauses of `pause` s, until the end of the block."""
-    found = Stalls()
+    measured = Stalls()
 
     def sleep() -> None:
         before = time.monotonic()
         time.sleep(pause)
         passed = time.monotonic() - before
-        found.worst = max(found.worst, passed - pause)
-        found.beyond, found.passed = found.beyond + passed - pause, found.passed + passed
+        measured.worst = max(measured.worst, passed - pause)
+        measured.beyond, measured.passed = measured.beyond + passed - pause, measured.passed + passed
 
     with repeated(sleep, 0.0):
-        yield found
+        yield measured

@@ -72,9 +72,9 @@ def trained(out: Path, backend: str, seed: int, more: Sequence[str] = ()) -> lis
             time.sleep(0.2)
             spent |= processor_times(process.pid)
             if policy.exists() and (written := policy.stat().st_mtime_ns) != seen:
-                seen, kept = written, out / f"{len(snapshots)}.safetensors"
-                kept.write_bytes(policy.read_bytes())
-                snapshots.append(Snapshot(kept, sum(spent.values()), time.monotonic() - started))
+                seen, snapshot = written, out / f"{len(snapshots)}.safetensors"
+                snapshot.write_bytes(policy.read_bytes())
+                snapshots.append(Snapshot(snapshot, sum(spent.values()), time.monotonic() - started))
     if process.returncode:
         raise RuntimeError(f"{' '.join(command)} failed: see {out}/logs")
     return snapshots

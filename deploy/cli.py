@@ -185,8 +185,7 @@ def print_overview(console: Console) -> None:
         console.print(f"[bold]{title}[/]")
         console.print(table)
         console.print()
-    console.print("`brakeline COMMAND --help` lists the options of a command. With --json a command prints one JSON")
-    console.print("object on stdout.")
+    console.print("`brakeline COMMAND --help` lists the options of a command. With --json, it prints one JSON object.")
 
 
 def command_class(name: str) -> Any:
@@ -211,8 +210,8 @@ def unwrap_help(options: Any) -> None:
     changes the docstrings of this process, so call it only where the process prints help and ends.
     """
     for parent in options.__mro__[:-1]:
-        found = docstring_parser.parse_from_object(parent).params
-        texts = [f"    {text.arg_name}: {' '.join((text.description or '').split())}" for text in found]
+        attributes = docstring_parser.parse_from_object(parent).params
+        texts = [f"    {text.arg_name}: {' '.join((text.description or '').split())}" for text in attributes]
         if texts and "\nAttributes:\n" not in (parent.__doc__ or ""):
             parent.__doc__ = "\n".join([(parent.__doc__ or "").rstrip(), "", "Attributes:", *texts])
     for hint in get_type_hints(options).values():

@@ -34,8 +34,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in the quoted parts, and turn links that are right in the repository into links of the site."""
-    markdown = QUOTED.sub(lambda found: readme_section(found["title"]), markdown)
-    markdown = NOTEBOOK.sub(lambda found: cells_of(ROOT / found[1]), markdown)
+    markdown = QUOTED.sub(lambda match: readme_section(match["title"]), markdown)
+    markdown = NOTEBOOK.sub(lambda match: cells_of(ROOT / match[1]), markdown)
     if "<!-- HELP -->" in markdown:
         markdown = markdown.replace("<!-- HELP -->", help_of_commands())
     return OUTSIDE.sub(r"\1", markdown).replace("](../results/", "](results/")

@@ -138,15 +138,15 @@ class Learner:
 
     def work(self, most: int) -> int:
         """Make at most `most` of the updates that are due. Return how many it made."""
-        made = 0
-        while made < most and self._update_due():
+        updates = 0
+        while updates < most and self._update_due():
             self._replay.sample(self._draws, self._batch)
             if self._images is not None:
                 self._images.apply(self._batch)
             self._td3.update(self._batch)
             self._limiter.sample()
-            made += 1
-        return made
+            updates += 1
+        return updates
 
     def _update_due(self) -> bool:
         """Return whether an update is due, and there is a step to learn from: windows of n steps fill late."""

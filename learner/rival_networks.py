@@ -104,18 +104,18 @@ def _fit(
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(inputs))
     aside = max(1, int(how.held_out * len(inputs)))
-    apart, kept = order[:aside], order[aside:]
-    if len(kept) < how.batch:
+    apart, fitted = order[:aside], order[aside:]
+    if len(fitted) < how.batch:
         raise BadData(f"{len(inputs)} samples are fewer than one batch ({how.batch})")
     count, outputs = shape
     network = Network((inputs.shape[1], *how.hidden, outputs), count, how.batch)
     network.initialise(torch.Generator().manual_seed(int(rng.integers(2**31))))
     adam = Adam(network.parameters, how.rate)
     torch.set_flush_denormal(True)
-    for rows in _batches(kept, how, rng):
+    for rows in _batches(fitted, how, rng):
         drawn = inputs[rows] if images is None else torch.from_numpy(images.rows(inputs[rows].numpy()))
-        found = network.forward(drawn[None])
-        adam.step(network.parameter_gradient(gradient(found, rows)))
+        predictions = network.forward(drawn[None])
+        adam.step(network.parameter_gradient(gradient(predictions, rows)))
     torch.set_flush_denormal(False)
     layers = [(layer.weight.numpy().copy(), layer.bias[:, 0].numpy().copy()) for layer in network.layers]
     return Perceptrons(layers), apart

@@ -26,7 +26,7 @@ class Explanation:
     """Why the filter changed a proposal. Lengths in m, in the world frame.
 
     Attributes:
-        said: the sentence.
+        sentence: why the filter decided so.
         inputs: (name, unit, proposed value, executed value) of each input.
         proposed, executed: (d,), arrows of the inputs.
         at, normal: (d,), a point on the edge of the half-space that blocks the proposal, and the normal from the free
@@ -35,7 +35,7 @@ class Explanation:
         limited: which of the robot's own limits changed an allowed proposal; empty: none.
     """
 
-    said: str
+    sentence: str
     inputs: list[tuple[str, str, float, float]]
     proposed: Array
     executed: Array
@@ -167,8 +167,8 @@ def _why(robot: Robot, request: pb.Request, decision: pb.Decision) -> str:
         return f"the stop could have come within {_length(stopped.room)} of the end of sight: {NEARER}"
     if stopped.by == "sight":
         return "the stop could have been beyond what is seen"
-    thing = "what is not seen" if stopped.by == "unseen" else f"the {stopped.by}"
-    place = f"{thing}{_where(robot, request, stopped)}"
+    blocker = "what is not seen" if stopped.by == "unseen" else f"the {stopped.by}"
+    place = f"{blocker}{_where(robot, request, stopped)}"
     if not stopped.normal:
         return f"{place} is touched already"
     if stopped.room < 0.0:

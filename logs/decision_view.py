@@ -48,7 +48,7 @@ class DecisionView:
         if (about := self.explanation) is None:
             return {}
         return {
-            "said": about.said,
+            "said": about.sentence,
             "trust": about.trust,
             "limited": about.limited,
             "inputs": [[name, unit, *rounded((proposed, done))] for name, unit, proposed, done in about.inputs],

@@ -169,7 +169,7 @@ def _explanation(exchange: pb.Exchange | None, robot: Robot | None) -> str:
     if exchange is None or robot is None or exchange.reply.decision.kind not in INTERVENTIONS:
         return ""
     explanation = explain(robot, exchange.request, exchange.reply.decision)
-    return "" if explanation is None else explanation.said
+    return "" if explanation is None else explanation.sentence
 
 
 def _tubes(

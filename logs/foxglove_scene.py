@@ -136,7 +136,7 @@ def decision(
         if exchange.reply.HasField("decision"):
             _draw_tube(entity, view, start, robot.footprint, color)
         if view.explanation is not None and kind in INTERVENTIONS and not step.fallback:
-            words = f"{KINDS[kind]}: {view.explanation.said}"
+            words = f"{KINDS[kind]}: {view.explanation.sentence}"
             _draw_explanation(entity, start, view.explanation, robot.footprint)
         if view.perceived is not None:
             _draw_perceived(entity, view.perceived, view.reservations)

@@ -240,8 +240,8 @@ def by_run(paths: Sequence[Path]) -> dict[str, tuple[Path, ...]]:
     for (folder, name), files in groupby(paths, key=_run_of):
         place = folder.resolve().name
         label = place if name == "run" else f"{place}/{name}"
-        taken = sum(other == label or other.startswith(f"{label} (") for other in runs)
-        runs[f"{label} ({taken + 1})" if taken else label] = tuple(files)
+        namesakes = sum(other == label or other.startswith(f"{label} (") for other in runs)
+        runs[f"{label} ({namesakes + 1})" if namesakes else label] = tuple(files)
     return runs
 
 

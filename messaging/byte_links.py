@@ -41,7 +41,7 @@ class Udp:
 
     def send(self, data: bytes, peer: str = "") -> None:
         now = time.monotonic()
-        recent = [address for address, heard in self._peers.items() if now - heard < FORGET]
+        recent = [address for address, last_heard in self._peers.items() if now - last_heard < FORGET]
         for address in [self._fixed] if self._fixed else recent:
             if self._fixed or peer in ("", _name(address)):
                 with contextlib.suppress(OSError):

@@ -47,8 +47,10 @@ def normalised(robot: Robot) -> ActionMapping:
 
     def action_to_control(action: ArrayLike) -> Array:
         given = np.asarray(action, float)
-        kept = np.where(np.isfinite(given), np.clip(given, -1.0, 1.0), given)  # the filter must see what is not finite
-        return np.asarray(low + 0.5 * width * (kept + 1.0))
+        clipped = np.where(
+            np.isfinite(given), np.clip(given, -1.0, 1.0), given
+        )  # the filter must see what is not finite
+        return np.asarray(low + 0.5 * width * (clipped + 1.0))
 
     return ActionMapping(action_to_control, lambda control: np.clip(2.0 * (control - low) / width - 1.0, -1.0, 1.0))
 

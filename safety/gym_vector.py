@@ -212,8 +212,8 @@ def with_earlier_rows(infos: dict[str, Any], before: dict[str, Any], which: NDAr
         elif now is None:
             joined[name] = values
         elif f"_{name}" in infos and now.shape == values.shape:
-            kept = (which & given & ~infos[f"_{name}"]).reshape(-1, *[1] * (values.ndim - 1))
-            joined[name] = np.where(kept, values, now)
+            earlier = (which & given & ~infos[f"_{name}"]).reshape(-1, *[1] * (values.ndim - 1))
+            joined[name] = np.where(earlier, values, now)
         else:
             continue
         joined[f"_{name}"] = infos.get(f"_{name}", False) | (which & given)

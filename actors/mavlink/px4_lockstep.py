@@ -248,8 +248,8 @@ class Px4Vehicle(LockstepVehicle):
     def _check(self) -> None:
         """Raise AutopilotGone: PX4 did not follow the setpoint, or its state does not count."""
         if why := self._flight.lost:
-            said = "; it says: " + "; ".join(texts) if (texts := self._flight.client.texts[-3:]) else ""
-            raise AutopilotGone(f"{why}{said}")
+            messages = "; it says: " + "; ".join(texts) if (texts := self._flight.client.texts[-3:]) else ""
+            raise AutopilotGone(f"{why}{messages}")
 
     def _fly(self) -> Array:
         flight, path = self._flight, self._flight.client.path

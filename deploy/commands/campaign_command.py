@@ -106,17 +106,20 @@ class CampaignCommand:
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
         searches = [search_of(cell, self.search) for cell in searched.values()]
         worst = complete(searches, self.runs, self.runs, self.engine, self.again, say)
-        found = [one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)]
+        worst_cases = [
+            one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)
+        ]
         driven = cells_of(parts, results, self.runs)
-        table = {name: campaign.added(earlier[name], new) for name, new in (("cells", driven), ("searches", found))}
+        new = {"cells": driven, "searches": worst_cases}
+        table = {name: campaign.added(earlier[name], entries) for name, entries in new.items()}
         write_atomically(self.results / f"{own}.md", campaign.markdown(own, **table).encode())
         write_atomically(path, f"{json.dumps({'robot': own} | table, indent=1)}\n".encode())
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
-            if found:
-                console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(found)))
+            if worst_cases:
+                console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(worst_cases)))
             console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
-        return {"robot": own, "cells": driven, "searches": found}
+        return {"robot": own} | new
 
     def _perturbations(self, dimensions: int) -> list[str]:
         """Return the perturbations that this kind of robot has. Raises ValueError for an unknown one."""

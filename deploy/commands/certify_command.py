@@ -236,12 +236,12 @@ def unrecorded(model: ModelSet) -> str:
     robot, units = model.robot, column_units(model.robot)
     inputs = PlanInputs(robot, recorded_inputs(model))
     parts = zip(column_names(robot)[1], inputs.low, inputs.high, robot.low(), robot.high(), strict=True)
-    told = [
+    ranges = [
         f"{name} from {low:.3g} to {high:.3g} {units[name]} ({percent((high - low) / (most - least))} of its range)"
         for name, low, high, least, most in parts
         if low > least or high < most
     ]
-    return f"the filter verifies recorded inputs alone: {', '.join(told)}" if told else ""
+    return f"the filter verifies recorded inputs alone: {', '.join(ranges)}" if ranges else ""
 
 
 def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:

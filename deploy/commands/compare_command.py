@@ -202,8 +202,8 @@ class CompareCommand:
         write_atomically(folder / "table.json", f"{json.dumps(plain(figures), indent=1)}\n".encode())
         learning_curves(cells, folder / "curves.png")
         seeds_as_points(figures, folder / "seeds.png")
-        found = RobotResults(folder.name, cells)
-        profiles({method: found.goals(method) for method in found.cells}, folder / "profiles.png")
+        robot_results = RobotResults(folder.name, cells)
+        profiles({method: robot_results.goals(method) for method in robot_results.cells}, folder / "profiles.png")
         for result in others:
             rows = conservatism.markdown(result)
             write_atomically(folder / "conservatism.md", f"{rows}\n".encode())

@@ -97,15 +97,15 @@ def _seen(name: str, unit: str, low: float, high: float, values: Array) -> Value
 def _begun(data: Dataset) -> Array:
     """Return the strongest inputs (stops, m) in the `brake_steps` periods before each stop."""
     robot = data.robot
-    found = []
+    strongest = []
     for t in data.trajectories:
         before = np.zeros(robot.action_dim) if t.before is None else t.before
         inputs = np.vstack([before, t.inputs])
         rests = robot.is_stop_input(inputs)
         for i in np.flatnonzero(rests[1:] & ~rests[:-1]):
             last = inputs[max(i + 1 - max(robot.brake_steps, 1), 0) : i + 1]
-            found.append(last[np.abs(last).argmax(0), np.arange(robot.action_dim)])
-    return np.array(found).reshape(-1, robot.action_dim)
+            strongest.append(last[np.abs(last).argmax(0), np.arange(robot.action_dim)])
+    return np.array(strongest).reshape(-1, robot.action_dim)
 
 
 def _stops_missing(robot: Robot, stops: int, rested: int) -> list[str]:

@@ -33,8 +33,8 @@ def stands_somewhere(robot: Robot) -> bool:
     moves = [label.endswith(("/s]", "/s2]")) and k not in held for k, label in enumerate(robot.state)]
     rows, most = [limit.weights for limit in robot.limits], [limit.most for limit in robot.limits]
     bounds = [(0.0, 0.0) if moving else (None, None) for moving in moves]
-    found = linprog(np.zeros(len(moves)), A_ub=rows, b_ub=most, bounds=bounds, method="highs")
-    return int(found.status) != INFEASIBLE
+    solution = linprog(np.zeros(len(moves)), A_ub=rows, b_ub=most, bounds=bounds, method="highs")
+    return int(solution.status) != INFEASIBLE
 
 
 def remarks(robot: Robot) -> list[str]:

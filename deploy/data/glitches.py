@@ -108,5 +108,5 @@ def _short(flags: NDArray[np.bool_]) -> Rows:
     """Return the flagged rows in stretches of at most `LONGEST`; none if they are too many for glitches."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     rows = [np.arange(i, j) for i, j in zip(edges[::2], edges[1::2], strict=True) if j - i <= LONGEST]
-    found = np.concatenate(rows) if rows else np.zeros(0, np.intp)
-    return found if len(found) <= max(MOST * len(flags), 1) else np.zeros(0, np.intp)
+    short = np.concatenate(rows) if rows else np.zeros(0, np.intp)
+    return short if len(short) <= max(MOST * len(flags), 1) else np.zeros(0, np.intp)

@@ -150,16 +150,16 @@ def _at_edges(edges: Array, time: Array, values: Array, changes: Array) -> Array
         edges (T,), time (S,), changes (C,): times in s; of the samples, and of the changes of any input.
         values (S,): samples.
     """
-    found = np.interp(edges, time, values)
+    at_edges = np.interp(edges, time, values)
     if len(time) < 3:
-        return found
+        return at_edges
     last = np.clip(np.searchsorted(time, edges, "right") - 1, 1, len(time) - 2)
     between = np.searchsorted(changes, time[last + 1] - SAME) > np.searchsorted(changes, time[last] + SAME)
     late = np.flatnonzero(between & (edges > time[last] + SAME) & (edges < time[last + 1] - SAME))
     at = last[late]
     slope = (values[at] - values[at - 1]) / (time[at] - time[at - 1])
-    found[late] = values[at] + slope * (edges[late] - time[at])
-    return found
+    at_edges[late] = values[at] + slope * (edges[late] - time[at])
+    return at_edges
 
 
 def _phase(r: GapFreeRecording, period: float) -> float:
@@ -224,12 +224,12 @@ def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) ->
 
 def _delays(recordings: list[GapFreeRecording], robot: Robot) -> dict[str, float]:
     names = column_names(robot)[1]
-    found = {}
+    delays = {}
     for i, follower in followed_inputs(robot):
         series = [(r.inputs[i], r.states[follower], r.begin, r.end) for r in recordings]
         if (seen := estimate_delay(series, robot.period)) is not None:
-            found[names[i]] = seen
-    return found
+            delays[names[i]] = seen
+    return delays
 
 
 def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, delays: dict[str, float]) -> list[str]:

@@ -13,7 +13,7 @@ from inspect import signature
 import numpy as np
 
 from brakeline.deploy.data.recording_origin import VERSION, simulator_changed
-from brakeline.deploy.data.rival_rollouts import Each, SailrConfig, SecasConfig, costs, transitions
+from brakeline.deploy.data.rival_rollouts import AfterStep, SailrConfig, SecasConfig, costs, transitions
 from brakeline.errors import UnknownTask
 from brakeline.learner.rival_networks import fit_cost, fit_linear
 from brakeline.messaging.perceptrons import Perceptrons
@@ -76,8 +76,8 @@ def made_by(model: Pretrained, robot: RobotWithTask, config: RivalConfig) -> boo
     return model.about.get("recipe") == json.dumps(asdict(config)) and not simulator_changed(robot, model.about)
 
 
-def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: None) -> Pretrained:
-    """Record rollouts, fit the networks, and store the cost in `about`. Call `each` after every step.
+def pretrain(robot: RobotWithTask, config: RivalConfig, after_step: AfterStep = lambda: None) -> Pretrained:
+    """Record rollouts, fit the networks, and store the cost in `about`. Call `after_step` after every step.
 
     Raises:
         BadData: there are too few samples.
@@ -85,9 +85,9 @@ def pretrain(robot: RobotWithTask, config: RivalConfig, each: Each = lambda: Non
     """
     started = time.perf_counter()
     if isinstance(config, SecasConfig):
-        method, (networks, settings, about) = SECAS, _secas(robot, config, each)
+        method, (networks, settings, about) = SECAS, _secas(robot, config, after_step)
     elif isinstance(config, SailrConfig):
-        method, (networks, settings, about) = SAILR, _sailr(robot, config, each)
+        method, (networks, settings, about) = SAILR, _sailr(robot, config, after_step)
     else:
         return _by_hand(robot, config)
     about |= {"recipe": json.dumps(asdict(config)), "seconds": f"{time.perf_counter() - started:.0f}"}
@@ -104,8 +104,8 @@ def _by_hand(robot: RobotWithTask, config: BarrierConfig | VelocityBarrierConfig
     return Pretrained(robot, PSF if isinstance(config, PredictiveConfig) else CBF, {}, settings, about)
 
 
-def _secas(robot: RobotWithTask, config: SecasConfig, each: Each) -> Made:
-    data = transitions(robot, config, each)
+def _secas(robot: RobotWithTask, config: SecasConfig, after_step: AfterStep) -> Made:
+    data = transitions(robot, config, after_step)
     g, errors = fit_linear(data.observation, data.action, data.change, config.fit, config.seed)
     about = {
         "collisions": str(data.collisions),
@@ -114,10 +114,10 @@ def _secas(robot: RobotWithTask, config: SecasConfig, each: Each) -> Made:
     return {"g": g}, {"clearance": robot.footprint + config.margin}, about
 
 
-def _sailr(robot: RobotWithTask, config: SailrConfig, each: Each) -> Made:
+def _sailr(robot: RobotWithTask, config: SailrConfig, after_step: AfterStep) -> Made:
     """Fit V to the cost-to-go of braking, then Q of each step to the larger V after it."""
     gamma = config.gamma
-    data = costs(robot, config, each)
+    data = costs(robot, config, after_step)
     v, v_error = fit_cost(robot, data.braked, data.braked_cost, 2, config.fit, config.seed)
     after = np.array([1.0 / (1.0 + np.exp(-v(x).astype(float).max())) for x in data.after])
     cost = np.where(data.collided, 1.0, np.minimum(data.step_cost + gamma * after, 1.0))

@@ -21,7 +21,7 @@ from brakeline.safety.rivals.sailr import normalised_input
 from brakeline.safety.rivals.secas import Constraints
 from brakeline.sim.scripted_policies import Policy, scripted
 
-Each = Callable[[], object]
+AfterStep = Callable[[], object]
 
 SEED_OFFSET = 5_000_000  # added to the seed, so that training and evaluation use other episodes
 POLICIES = ("random", "greedy", "adversary")  # for rollouts that end with braking
@@ -84,9 +84,9 @@ class Costs:
 class _Drive:
     """A running environment that starts a new episode when one ends."""
 
-    def __init__(self, robot: RobotWithTask, config: SecasConfig | SailrConfig, each: Each) -> None:
+    def __init__(self, robot: RobotWithTask, config: SecasConfig | SailrConfig, after_step: AfterStep) -> None:
         self._env = environment(robot, config.arena, SEED_OFFSET + config.seed)
-        self._each, self._episode = each, -1
+        self._each, self._episode = after_step, -1
         self.observation: Any = None
         self.info: dict[str, Any] = {}
         self.ended, self.collisions = True, 0
@@ -107,9 +107,9 @@ class _Drive:
         return np.asarray(self.info["input_in_force"])
 
 
-def transitions(robot: RobotWithTask, config: SecasConfig, each: Each = lambda: None) -> Transitions:
+def transitions(robot: RobotWithTask, config: SecasConfig, after_step: AfterStep = lambda: None) -> Transitions:
     """Record `samples` steps of random inputs, each held for some periods (Dalal et al. 2018, section 5.1)."""
-    drive = _Drive(robot, config, each)
+    drive = _Drive(robot, config, after_step)
     policy = scripted("random", robot, np.random.default_rng((config.seed, 1)))
     constraints = Constraints(robot, robot.task.rays)
     rows: list[tuple[Any, Array, Array]] = []
@@ -122,13 +122,13 @@ def transitions(robot: RobotWithTask, config: SecasConfig, each: Each = lambda: 
     return Transitions(seen, inputs, changes, drive.collisions)
 
 
-def costs(robot: RobotWithTask, config: SailrConfig, each: Each = lambda: None) -> Costs:
+def costs(robot: RobotWithTask, config: SailrConfig, after_step: AfterStep = lambda: None) -> Costs:
     """Record about `samples` steps: repeatedly drive up to `lead` periods, then brake to a stop.
 
     The cost of a step is max(0, 1 − clearance/smoothing), with smoothing in m; after a collision it stays 1. Sums are
     discounted by γ and scaled by 1 − γ (Wagener et al. 2021, appendix D).
     """
-    drive, gamma = _Drive(robot, config, each), config.gamma
+    drive, gamma = _Drive(robot, config, after_step), config.gamma
     rng = np.random.default_rng((config.seed, 2))
     drivers = [scripted(name, robot, rng) for name in POLICIES]
     braked: list[tuple[Any, float]] = []

@@ -263,14 +263,14 @@ def _from_messages(tables: Sequence[Table], options: LogOptions) -> _Fields:
     commands = INPUTS if flat else FLYING
     wanted += [(f"{COMMAND} {name}", unit, f"{COMMAND}.{quantity}") for quantity, (name, unit) in commands.items()]
     wanted += [(name, "", "") for name in options.fields if name not in (TIME, *(name for name, _, _ in wanted))]
-    found = {name: (place, unit) for name, unit, quantity in wanted if (place := field_of(quantity, name)) is not None}
-    positions = [axis for axis in AXES if axis in found]
+    fields = {name: (place, unit) for name, unit, quantity in wanted if (place := field_of(quantity, name)) is not None}
+    positions = [axis for axis in AXES if axis in fields]
     if len(positions) < 2:
         raise NoSource(f"no message holds positions (Odometry, PoseStamped, TF). {_content(tables)}")
-    inputs = [name for name in found if name.startswith(f"{COMMAND} ")]
-    places, units = _in_si({name: place for name, (place, _) in found.items()}, options)
-    units = {name: unit for name, (_, unit) in found.items()} | units
-    return _Fields(places, positions, inputs, units, "heading" if "heading" in found else "")
+    inputs = [name for name in fields if name.startswith(f"{COMMAND} ")]
+    places, units = _in_si({name: place for name, (place, _) in fields.items()}, options)
+    units = {name: unit for name, (_, unit) in fields.items()} | units
+    return _Fields(places, positions, inputs, units, "heading" if "heading" in fields else "")
 
 
 def _content(tables: Sequence[Table]) -> str:

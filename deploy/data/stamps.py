@@ -89,8 +89,8 @@ def in_header_units(table: Table) -> Table:
     for name, values in table.columns.items():
         plain, unit = split_header(name)
         scale = factor(unit) if unit else None
-        kept = plain in table.columns or plain in columns or _letters(plain) in NAMES
-        if scale is None or kept or factor(unit, "s") is not None:
+        as_it_is = plain in table.columns or plain in columns or _letters(plain) in NAMES
+        if scale is None or as_it_is or factor(unit, "s") is not None:
             columns[name] = values
             continue
         columns[plain] = values * scale

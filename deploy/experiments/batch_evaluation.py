@@ -33,7 +33,7 @@ ONE_BY_ONE = "evaluate without --backend batch"
 
 def drive_batch(
     robot: RobotWithTask,
-    what: Evaluation,
+    evaluation: Evaluation,
     first: int,
     episodes: int,
     take: Callable[[pb.Step], object],
@@ -49,11 +49,11 @@ def drive_batch(
     """
     from brakeline.deploy.experiments.evaluate import FRESH
 
-    safety, policy = batch_filter(robot, what), network_named(what.policy, robot, what.seed)
+    safety, policy = batch_filter(robot, evaluation), network_named(evaluation.policy, robot, evaluation.seed)
     drive_episodes(
-        *(robot, safety, policy, what.arena, FRESH + what.seed, range(first, first + episodes), take),
-        accept_bound=what.accept_bound,
-        conditions=what.conditions,
+        *(robot, safety, policy, evaluation.arena, FRESH + evaluation.seed, range(first, first + episodes), take),
+        accept_bound=evaluation.accept_bound,
+        conditions=evaluation.conditions,
         independent=independent,
     )
 
@@ -105,15 +105,15 @@ def drive_episodes(
         robots.close()
 
 
-def batch_filter(robot: RobotWithTask, what: Evaluation) -> BatchMethod | None:
+def batch_filter(robot: RobotWithTask, evaluation: Evaluation) -> BatchMethod | None:
     """Return what decides, or None for the method `none`. Raises NoBatch if no batch has this policy or fleet."""
-    if what.fleet:
+    if evaluation.fleet:
         raise NoBatch(f"robots of a fleet see each other, which no batch simulates: {ONE_BY_ONE}")
-    if what.policy in robot.task.policies or what.policy.endswith(".csv"):
-        raise NoBatch(f"a batch is driven by a network, not by {what.policy}: {ONE_BY_ONE}")
-    if what.method == "none":
+    if evaluation.policy in robot.task.policies or evaluation.policy.endswith(".csv"):
+        raise NoBatch(f"a batch is driven by a network, not by {evaluation.policy}: {ONE_BY_ONE}")
+    if evaluation.method == "none":
         return None
-    return batch_method(method_for(robot, what.method, what.model_config, what.accept_bound))
+    return batch_method(method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound))
 
 
 def batch_method(model: Model) -> BatchMethod:

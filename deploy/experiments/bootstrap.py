@@ -78,7 +78,7 @@ def rate(happened: Sequence[ArrayLike], *, crossed: bool = False) -> MeanEstimat
     If it never or always happened, all resamples are alike: then the interval is the exact one of Clopper and Pearson,
     which takes all episodes as independent.
     """
-    estimate, episodes = mean(happened, crossed=crossed), sum(len(np.asarray(each)) for each in happened)
+    estimate, episodes = mean(happened, crossed=crossed), sum(len(np.asarray(of_seed)) for of_seed in happened)
     if 0.0 < estimate.value < 1.0:
         return estimate
     low, high = clopper_pearson(round(estimate.value * episodes), episodes) or (0.0, 1.0)

@@ -128,13 +128,13 @@ class CampaignPart:
         if self.weights and policy_hash(self.policy, robot) != self.weights:
             raise ResultError(f"{self.policy} has changed since the campaign began: run it again")
 
-        def each() -> None:
+        def count_episode() -> None:
             nonlocal ended
             ended += 1
             if ended % 20 == 0:
                 say(f"{ended} of {self.episodes} episodes")
 
-        rows = driver.drive(self.first, self.episodes, each)
+        rows = driver.drive(self.first, self.episodes, count_episode)
         near = []
         for number, row in enumerate(rows, self.first):
             if driver.model is not None and too_near(row, self.near):
@@ -173,9 +173,9 @@ class CampaignSearch:
         from brakeline.messaging.task import robot_with_task
 
         log = "worst.mcap"
-        found = search(robot_with_task(self.robot), self.cell.evaluation(), self.episodes, folder / log, say)
+        worst = search(robot_with_task(self.robot), self.cell.evaluation(), self.episodes, folder / log, say)
         about = {"arena": self.cell.arena, "model_set": self.cell.model_set, "perturbation": self.cell.perturbation}
-        return {"study": configuration(self), **about, **found, "log": log}
+        return {"study": configuration(self), **about, **worst, "log": log}
 
 
 def search_of(cell: CampaignPart, episodes: int) -> CampaignSearch:

@@ -52,40 +52,46 @@ class CampaignDriver:
     """The robot, policy and filter of a cell.
 
     Attributes:
-        what: policy, method, model set, arena, conditions and seed.
+        evaluation: policy, method, model set, arena, conditions and seed.
         model, ask: of the filter; None without one.
     """
 
     robot: RobotWithTask
-    what: Evaluation
+    evaluation: Evaluation
     model: Model | None
     ask: Ask | None
     env: NavigationEnv
 
     @staticmethod
-    def of(robot: RobotWithTask, what: Evaluation) -> CampaignDriver:
+    def of(robot: RobotWithTask, evaluation: Evaluation) -> CampaignDriver:
         """Load the model set and the environment. Raises what `in_process` and `environment` raise."""
         model = None
-        if what.method != "none":
-            model = method_for(robot, what.method, what.model_config, what.accept_bound)
-        ask = None if model is None else in_process(model, what.accept_bound)
+        if evaluation.method != "none":
+            model = method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
+        ask = None if model is None else in_process(model, evaluation.accept_bound)
         return CampaignDriver(
-            robot, what, model, ask, environment(robot, what.arena, FRESH + what.seed, what.conditions)
+            robot,
+            evaluation,
+            model,
+            ask,
+            environment(robot, evaluation.arena, FRESH + evaluation.seed, evaluation.conditions),
         )
 
-    def drive(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
-        """Drive episodes and return a row of each, in order. Calls `each` after every episode."""
+    def drive(self, first: int, episodes: int, after_episode: Callable[[], object]) -> list[Row]:
+        """Drive episodes and return a row of each, in order. Calls `after_episode` after every one."""
         if self._in_a_batch():
-            return self._drive_batch(first, episodes, each)
+            return self._drive_batch(first, episodes, after_episode)
         rows = []
         for number in range(first, first + episodes):
             rows.append(self.row(number))
-            each()
+            after_episode()
         return rows
 
     def row(self, number: int, log: TrialLog | None = None, policy: Policy | None = None) -> Row:
         """Drive an episode, which a log may record with all requests. policy: instead of the cell's."""
-        runner = EpisodeRunner(self.robot, self.env, ActorIdentity(ACTOR, 0, self.what.seed), filtered=bool(self.ask))
+        runner = EpisodeRunner(
+            self.robot, self.env, ActorIdentity(ACTOR, 0, self.evaluation.seed), filtered=bool(self.ask)
+        )
         policy, table = policy or self.policy(number), EpisodeTable(ROWS)
         message = runner.begin(number)
         if log is not None:
@@ -99,20 +105,25 @@ class CampaignDriver:
 
     def policy(self, number: int) -> Policy:
         """Return the policy of an episode. A scripted one draws from the episode's own seed."""
-        name = self.what.policy
+        name = self.evaluation.policy
         if name in self.robot.task.policies:
-            return scripted(name, self.robot, np.random.default_rng((self.what.seed, number)))
-        network = network_named(name, self.robot, self.what.seed)
+            return scripted(name, self.robot, np.random.default_rng((self.evaluation.seed, number)))
+        network = network_named(name, self.robot, self.evaluation.seed)
         return lambda observation, info: network(observation)
 
     def log(self, path: Path, **about: str) -> TrialLog:
         """Open the log of an episode, with all that a replay needs. about: further entries of its `run`."""
-        what, files = self.what, {}
-        run = {"method": what.method, "policy": what.policy, "arena": what.arena, "seed": str(what.seed)} | about
+        evaluation, files = self.evaluation, {}
+        run = {
+            "method": evaluation.method,
+            "policy": evaluation.policy,
+            "arena": evaluation.arena,
+            "seed": str(evaluation.seed),
+        } | about
         if self.model is not None:
             files[model_attachment_name(self.robot.name, self.model.version)] = self.model.encode()
-            run |= {"certificate": what.model_config.certificate, "mode": what.model_config.mode}
-        metadata = {"run": run | {"robots": self.robot.name}, "conditions": what.conditions.describe()}
+            run |= {"certificate": evaluation.model_config.certificate, "mode": evaluation.model_config.mode}
+        metadata = {"run": run | {"robots": self.robot.name}, "conditions": evaluation.conditions.describe()}
         metadata["robots"] = {self.robot.kind: json.dumps(self.robot.description)}
         path.parent.mkdir(parents=True, exist_ok=True)
         return TrialLog(path, metadata, files)
@@ -124,22 +135,22 @@ class CampaignDriver:
 
     def _in_a_batch(self) -> bool:
         try:
-            check_batch(self.robot, self.what.arena, self.what.conditions)
-            batch_filter(self.robot, self.what)
+            check_batch(self.robot, self.evaluation.arena, self.evaluation.conditions)
+            batch_filter(self.robot, self.evaluation)
         except NoBatch:
             return False
         return True
 
-    def _drive_batch(self, first: int, episodes: int, each: Callable[[], object]) -> list[Row]:
+    def _drive_batch(self, first: int, episodes: int, after_episode: Callable[[], object]) -> list[Row]:
         table, rows = EpisodeTable(ROWS), dict[int, Row]()
 
         def take(step: pb.Step) -> None:
             table.step(step)
             if step.terminated or step.truncated:
                 rows[step.episode] = table.pop()
-                each()
+                after_episode()
 
-        drive_batch(self.robot, replace(self.what, backend="batch"), first, episodes, take, independent=True)
+        drive_batch(self.robot, replace(self.evaluation, backend="batch"), first, episodes, take, independent=True)
         return [rows[number] for number in range(first, first + episodes)]
 
 

@@ -101,15 +101,15 @@ def profiles(goals: Mapping[str, Array], png: Path) -> None:
     _save(picture, png)
 
 
-def seeds_as_points(found: dict[str, Any], png: Path) -> None:
+def seeds_as_points(table: dict[str, Any], png: Path) -> None:
     """Plot goal and collision rates of each part: the interval as a line, each seed as a point."""
-    parts = [part for part in found["parts"] if part != "deployment"]
+    parts = [part for part in table["parts"] if part != "deployment"]
     picture = Figure(figsize=(3.4 * len(parts), 5.6), layout="constrained")
     grid = picture.subplots(2, len(parts), squeeze=False)
     for column, part in enumerate(parts):
         for row, name in enumerate(("goal rate", "collision rate")):
             axes: Axes = grid[row][column]
-            methods = {m: figures[name] for m, figures in found["parts"][part].items() if name in figures}
+            methods = {m: figures[name] for m, figures in table["parts"][part].items() if name in figures}
             if not methods:
                 axes.set_axis_off()
                 continue

@@ -58,8 +58,8 @@ def without_cuts(episodes: dict[str, list[float]]) -> dict[str, list[float]]:
     A cut episode says nothing about the goal: most episodes with an intervention reach it in an evaluation, where the
     episode goes on. The other methods have none. Without them, the rest looks easier than it was, in favor of SAILR.
     """
-    kept = np.flatnonzero(~was_cut(episodes))
-    return {name: [values[i] for i in kept] for name, values in episodes.items()}
+    uncut = np.flatnonzero(~was_cut(episodes))
+    return {name: [values[i] for i in uncut] for name, values in episodes.items()}
 
 
 def steps_to_learn(episodes: dict[str, list[float]], steps: int) -> float:

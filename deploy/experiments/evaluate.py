@@ -33,7 +33,7 @@ EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
 EPISODES_OF_A_BATCH = 1000  # the same for a batch, which waits for its last episodes at the end of a part
 POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
 
-Each = Callable[[EpisodeStats], Any]
+AfterEpisode = Callable[[EpisodeStats], Any]
 Backend = Literal["single", "batch"]
 
 
@@ -85,21 +85,21 @@ def asking(models: ModelRegistry) -> Ask:
 
 
 def prepare_evaluation(
-    robot: RobotWithTask, what: Evaluation, first: int = 0
+    robot: RobotWithTask, evaluation: Evaluation, first: int = 0
 ) -> tuple[EpisodeRunner, Policy, Ask | None]:
     """Create the episode runner in a fresh environment, the policy, and the filter's function (None: no filter).
 
     first: number of the first episode, which decides about the seed of scripted policies.
     """
-    policy = policy_named(what.policy, robot, what.seed + POLICY_SEEDS * first)
-    env = environment(robot, what.arena, FRESH + what.seed, what.conditions)
-    question = _question(robot, what)
-    driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, what.seed), filtered=question is not None)
+    policy = policy_named(evaluation.policy, robot, evaluation.seed + POLICY_SEEDS * first)
+    env = environment(robot, evaluation.arena, FRESH + evaluation.seed, evaluation.conditions)
+    question = _question(robot, evaluation)
+    driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, evaluation.seed), filtered=question is not None)
     return driver, policy, question
 
 
 def prepare_fleet(
-    robot: RobotWithTask, what: Evaluation, first: int = 0
+    robot: RobotWithTask, evaluation: Evaluation, first: int = 0
 ) -> tuple[RobotGroup, FleetEnv, list[Policy], Ask | None]:
     """Create the group, the world, the policies and the filter's function for several robots in one world.
 
@@ -109,22 +109,27 @@ def prepare_fleet(
         NoFleet: this robot or this arena has no fleet.
         ValueError: this method supports no reservations.
     """
-    check_reservations(what.method)
-    world = FleetEnv(robot, what.arena, what.fleet, FRESH + what.seed, what.conditions)
-    policies = [policy_named(what.policy, robot, what.seed + POLICY_SEEDS * first + i) for i in range(what.fleet)]
-    question = _question(robot, what)
+    check_reservations(evaluation.method)
+    world = FleetEnv(robot, evaluation.arena, evaluation.fleet, FRESH + evaluation.seed, evaluation.conditions)
+    policies = [
+        policy_named(evaluation.policy, robot, evaluation.seed + POLICY_SEEDS * first + i)
+        for i in range(evaluation.fleet)
+    ]
+    question = _question(robot, evaluation)
     drivers = [
-        EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, what.seed), filtered=question is not None)
+        EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, evaluation.seed), filtered=question is not None)
         for i, member in enumerate(world.members)
     ]
     return RobotGroup(drivers, world, question is not None), world, policies, question
 
 
-def _question(robot: RobotWithTask, what: Evaluation) -> Ask | None:
+def _question(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
     """Return the function that asks the filter, or None for the method `none`."""
-    if what.method == "none":
+    if evaluation.method == "none":
         return None
-    return in_process(method_for(robot, what.method, what.model_config, what.accept_bound), what.accept_bound)
+    return in_process(
+        method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound), evaluation.accept_bound
+    )
 
 
 @dataclass(frozen=True)
@@ -148,13 +153,13 @@ class EvaluationPart:
 
     Attributes:
         robot_with_task: the robot.
-        what: the evaluation.
+        evaluation: the whole evaluation.
         first, rounds: number of its first episode (of a fleet: of its first world), and how many there are.
         policy_file: content of the policy's file, if the policy is one. Another machine may not have it.
     """
 
     robot_with_task: RobotWithTask
-    what: Evaluation
+    evaluation: Evaluation
     first: int
     rounds: int
     policy_file: bytes | None
@@ -169,23 +174,23 @@ class EvaluationPart:
 
     def run(self, folder: Path, say: Callable[[str], object]) -> DrivenEpisodes:
         """Drive the episodes in a process of their own."""
-        what = self.what
+        evaluation = self.evaluation
         if self.policy_file is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / Path(what.policy).name
+            path = folder / Path(evaluation.policy).name
             path.write_bytes(self.policy_file)
-            what = replace(what, policy=str(path))
-        return replace(self, what=what).drive(lambda stats: say(progress_line(stats)))
+            evaluation = replace(evaluation, policy=str(path))
+        return replace(self, evaluation=evaluation).drive(lambda stats: say(progress_line(stats)))
 
-    def drive(self, each: Each) -> DrivenEpisodes:
-        """Drive the episodes. Calls `each` after every episode with the statistics so far."""
-        robot, what, world = self.robot_with_task, self.what, None
-        if what.backend == "batch":
-            return self._drive_batch(each)
-        if what.fleet:
-            group, world, policies, question = prepare_fleet(robot, what, self.first)
+    def drive(self, after_episode: AfterEpisode) -> DrivenEpisodes:
+        """Drive the episodes. Calls `after_episode` after every one with the statistics so far."""
+        robot, evaluation, world = self.robot_with_task, self.evaluation, None
+        if evaluation.backend == "batch":
+            return self._drive_batch(after_episode)
+        if evaluation.fleet:
+            group, world, policies, question = prepare_fleet(robot, evaluation, self.first)
         else:
-            driver, policy, question = prepare_evaluation(robot, what, self.first)
+            driver, policy, question = prepare_evaluation(robot, evaluation, self.first)
             group, policies = RobotGroup([driver]), [policy]
         stats, periods = {runner.identity.actor: EpisodeStats() for runner in group.runners}, 0
         for number in range(self.first, self.first + self.rounds):
@@ -194,10 +199,10 @@ class EvaluationPart:
                 for step in steps:
                     stats[step.actor].step(step)
             for actor in stats.values():
-                each(actor)
+                after_episode(actor)
         return DrivenEpisodes(stats, periods, 0 if world is None else world.touches)
 
-    def _drive_batch(self, each: Each) -> DrivenEpisodes:
+    def _drive_batch(self, after_episode: AfterEpisode) -> DrivenEpisodes:
         from brakeline.deploy.experiments.batch_evaluation import drive_batch
 
         stats: defaultdict[str, EpisodeStats] = defaultdict(EpisodeStats)
@@ -205,9 +210,9 @@ class EvaluationPart:
         def take(step: pb.Step) -> None:
             stats[step.actor].step(step)
             if step.terminated or step.truncated:
-                each(stats[step.actor])
+                after_episode(stats[step.actor])
 
-        drive_batch(self.robot_with_task, self.what, self.first, self.rounds, take)
+        drive_batch(self.robot_with_task, self.evaluation, self.first, self.rounds, take)
         return DrivenEpisodes(dict(stats), sum(one.steps for one in stats.values()), 0)
 
 
@@ -216,68 +221,70 @@ def progress_line(stats: EpisodeStats) -> str:
     return f"goals {stats.goals}, collisions {stats.collisions}, interventions {stats.interventions}"
 
 
-def parts_of(robot: RobotWithTask, what: Evaluation) -> list[EvaluationPart]:
+def parts_of(robot: RobotWithTask, evaluation: Evaluation) -> list[EvaluationPart]:
     """Cut an evaluation into parts, the same ones whatever runs them, for they decide about its figures.
 
     A part begins as an evaluation does: without a widening, and with a seed of its own for scripted policies. Written
-    inputs are one sequence, and stay one part. A fleet drives at least `what.episodes` episodes, counted over all its
-    robots.
+    inputs are one sequence, and stay one part. A fleet drives at least `evaluation.episodes` episodes, counted over
+    all its robots.
     """
-    rounds = -(-what.episodes // max(what.fleet, 1))
-    size = EPISODES_OF_A_BATCH if what.backend == "batch" else EPISODES_A_PART
-    size = max(rounds, 1) if what.policy.endswith(".csv") else size
-    path = file_named(what.policy, robot)
+    rounds = -(-evaluation.episodes // max(evaluation.fleet, 1))
+    size = EPISODES_OF_A_BATCH if evaluation.backend == "batch" else EPISODES_A_PART
+    size = max(rounds, 1) if evaluation.policy.endswith(".csv") else size
+    path = file_named(evaluation.policy, robot)
     content = path.read_bytes() if path is not None and path.is_file() else None
     firsts = range(0, rounds, size)
-    return [EvaluationPart(robot, what, first, min(size, rounds - first), content) for first in firsts]
+    return [EvaluationPart(robot, evaluation, first, min(size, rounds - first), content) for first in firsts]
 
 
-def evaluate(robot: RobotWithTask, what: Evaluation, each: Each = lambda stats: None) -> dict[str, Any]:
-    """Run `what.episodes` episodes in this process, and return their closed-loop metrics.
+def evaluate(
+    robot: RobotWithTask, evaluation: Evaluation, after_episode: AfterEpisode = lambda stats: None
+) -> dict[str, Any]:
+    """Run `evaluation.episodes` episodes in this process, and return their closed-loop metrics.
 
-    The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls `each` after every
-    episode with the statistics of its part (`parts_of`) so far.
+    The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls
+    `after_episode` after every episode with the statistics of its part (`parts_of`) so far.
     """
-    return _figures(robot, what, [part.drive(each) for part in parts_of(robot, what)])
+    return _figures(robot, evaluation, [part.drive(after_episode) for part in parts_of(robot, evaluation)])
 
 
-def evaluate_with(engine: Engine, robot: RobotWithTask, what: Evaluation, say: Say = unsaid) -> dict[str, Any]:
+def evaluate_with(engine: Engine, robot: RobotWithTask, evaluation: Evaluation, say: Say = unsaid) -> dict[str, Any]:
     """Return the same metrics as `evaluate`, by several processes or machines. say: see `Engine.completed`."""
-    parts = parts_of(robot, what)
+    parts = parts_of(robot, evaluation)
     with TemporaryDirectory() as folder:
         driven = {part.first: counted for part, counted in engine.completed(parts, Path(folder), say)}
-    return _figures(robot, what, [driven[part.first] for part in parts])
+    return _figures(robot, evaluation, [driven[part.first] for part in parts])
 
 
-def _figures(robot: RobotWithTask, what: Evaluation, parts: Sequence[DrivenEpisodes]) -> dict[str, Any]:
+def _figures(robot: RobotWithTask, evaluation: Evaluation, parts: Sequence[DrivenEpisodes]) -> dict[str, Any]:
     """Return the metrics of all parts of an evaluation, in the order of their episodes."""
     by_actor: dict[str, list[EpisodeStats]] = {}
     for part in parts:
         for actor, stats in part.stats.items():
             by_actor.setdefault(actor, []).append(stats)
     figures = closed_loop(stats for part in parts for stats in part.stats.values())
-    if what.fleet:
+    if evaluation.fleet:
         periods = sum(part.periods for part in parts)
         seconds = periods * robot.period
         figures |= {
             "robots": {robot.name: dict(figures)},
             "actors": {name: closed_loop(stats) for name, stats in by_actor.items()},
             "worlds": {
-                "count": sum(part.rounds for part in parts_of(robot, what)),
-                "robot_steps": periods * what.fleet,  # includes robots that stand at their goals
+                "count": sum(part.rounds for part in parts_of(robot, evaluation)),
+                "robot_steps": periods * evaluation.fleet,  # includes robots that stand at their goals
                 "touches": sum(part.touches for part in parts),
                 "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
             },
         }
-    filtered = what.method == DDPC
+    filtered = evaluation.method == DDPC
     return figures | {
-        "method": what.method,
-        "certificate": what.model_config.certificate if filtered else None,
-        "mode": what.model_config.mode if filtered else None,
-        "policy": what.policy,
-        "arena": what.arena,
-        "perception": perception_in(what.conditions.describe()),
-        "seed": what.seed,
-        "backend": what.backend,
-        "conditions": what.conditions.describe(),
+        "method": evaluation.method,
+        "certificate": evaluation.model_config.certificate if filtered else None,
+        "mode": evaluation.model_config.mode if filtered else None,
+        "policy": evaluation.policy,
+        "arena": evaluation.arena,
+        "perception": perception_in(evaluation.conditions.describe()),
+        "seed": evaluation.seed,
+        "backend": evaluation.backend,
+        "conditions": evaluation.conditions.describe(),
     }

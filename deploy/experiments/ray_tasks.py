@@ -40,13 +40,13 @@ def run_on_ray(tasks: Sequence[T], address: str, runs: Path, say: Say) -> Iterat
         here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
             ray.get_runtime_context().get_node_id(), soft=True
         )
-        said = ray.remote(num_cpus=0)(_Said).options(scheduling_strategy=here).remote()
+        progress = ray.remote(num_cpus=0)(_Progress).options(scheduling_strategy=here).remote()
         run = ray.remote(num_cpus=1, max_calls=1, max_retries=RETRIES)(_run_remotely)  # a process for each task
-        under_way = {run.remote(task, supplies[task.robot], said): task for task in tasks}
+        under_way = {run.remote(task, supplies[task.robot], progress): task for task in tasks}
         while under_way:
             done, _ = ray.wait(list(under_way), timeout=NEXT_LOOK)
             with suppress(ray.exceptions.RayError):  # without it, only the progress is lost
-                for name, text in ray.get(said.taken.remote()):
+                for name, text in ray.get(progress.take.remote()):
                     say(name, text)
             for reference in done:
                 task = under_way.pop(reference)
@@ -111,7 +111,7 @@ def _connected(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-class _Said:
+class _Progress:
     """The progress that tasks reported and that nobody has taken yet. It runs as an actor of Ray."""
 
     def __init__(self) -> None:
@@ -120,14 +120,14 @@ class _Said:
     def add(self, name: str, text: str) -> None:
         self._lines.append((name, text))
 
-    def taken(self) -> list[tuple[str, str]]:
+    def take(self) -> list[tuple[str, str]]:
         lines, self._lines = self._lines, []
         return lines
 
 
-def _run_remotely(task: StudyTask, supplies: Files, said: Any) -> tuple[Any, Files]:
+def _run_remotely(task: StudyTask, supplies: Files, progress: Any) -> tuple[Any, Files]:
     """Run a task in a worker, with its supplies in a data folder of its own. Returns its result and its files."""
-    say: Callable[[str], object] = lambda text: said.add.remote(task.name, text[:LONGEST_LINE])  # noqa: E731
+    say: Callable[[str], object] = lambda text: progress.add.remote(task.name, text[:LONGEST_LINE])  # noqa: E731
     with tempfile.TemporaryDirectory(prefix="brakeline-") as place:
         data, folder = Path(place) / "data", Path(place) / "run"
         write_files(data, supplies)

@@ -86,38 +86,38 @@ def page(results: Path, robots: Sequence[str]) -> str:
     return "\n".join([HEAD, *sections, THREATS, COMMANDS])
 
 
-def _section(results: Path, found: RobotResults) -> str:
-    robot = robot_with_task(found.study["robot"])
+def _section(results: Path, robot_results: RobotResults) -> str:
+    robot = robot_with_task(robot_results.study["robot"])
     parts = [
-        f"## {found.name}\n\n### Setup\n",
-        _setup(robot, found),
+        f"## {robot_results.name}\n\n### Setup\n",
+        _setup(robot, robot_results),
         "### Methods\n",
-        _methods(found),
+        _methods(robot_results),
         "### Main table\n",
-        MAIN.format(episodes=found.study["episodes"], steps=f"{found.study['steps']:,}"),
-        *_main(found),
+        MAIN.format(episodes=robot_results.study["episodes"], steps=f"{robot_results.study['steps']:,}"),
+        *_main(robot_results),
         "### Probability of improvement\n",
         IMPROVEMENT,
-        *_improvements(found),
+        *_improvements(robot_results),
         "### Performance profiles and learning curves\n",
-        f"![performance profiles]({found.name}/profiles.png)\n",
-        f"![learning curves]({found.name}/curves.png)\n",
+        f"![performance profiles]({robot_results.name}/profiles.png)\n",
+        f"![learning curves]({robot_results.name}/curves.png)\n",
         "### Tuning\n",
-        *_tuning(results, robot, found),
+        *_tuning(results, robot, robot_results),
     ]
     return "\n".join(parts)
 
 
-def _setup(robot: RobotWithTask, found: RobotResults) -> str:
-    study, task = found.study, robot.task
-    td3, first = study["td3"], found.arenas[0]
+def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
+    study, task = robot_results.study, robot.task
+    td3, first = study["td3"], robot_results.arenas[0]
     batch, rays = study.get("backend") == "batch", f"{len(task.rays.directions)} rays up to {task.rays.range:g} m"
     low_high = ", ".join(
         f"{name}: {low:g} to {high:g}"
         for name, low, high in zip(robot.action, robot.action_low, robot.action_high, strict=True)
     )
     errors = ", ".join(f"{name}: {most:g}" for name, most in zip(robot.state, robot.measurement_bound, strict=True))
-    arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in found.arenas)
+    arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in robot_results.arenas)
     rewards = {name: value for name, value in asdict(task.reward).items() if name != "correction_penalty"}
     rows = [
         ("inputs", low_high),
@@ -133,16 +133,16 @@ def _setup(robot: RobotWithTask, found: RobotResults) -> str:
             + (f"{study['robots']} robots at once" if batch else "one robot"),
         ),
         ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
-        *_correction_settings(found),
+        *_correction_settings(robot_results),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])
 
 
-def _correction_settings(found: RobotResults) -> list[tuple[str, str]]:
+def _correction_settings(robot_results: RobotResults) -> list[tuple[str, str]]:
     """Return what a correction costs the learners of the methods with a filter, a row for each setting."""
     methods: dict[str, list[str]] = {}
-    for name, cells in found.cells.items():
+    for name, cells in robot_results.cells.items():
         if METHODS[name].filter != NONE:
             study = cells[0]["study"]
             text = f"penalty for corrections {study.get('penalty', 1.0):g}"
@@ -164,10 +164,10 @@ def _arena(kind: Any) -> str:
     return f"{2.0 * kind.half_width:g} m wide, {counts}, gaps of {kind.gap:g} m and more"
 
 
-def _methods(found: RobotResults) -> str:
+def _methods(robot_results: RobotResults) -> str:
     heads = ["method", "n", "learner", "obstacles for the filter", "the filter's model", "recorded periods", "source"]
     rows = []
-    for name, cells in found.cells.items():
+    for name, cells in robot_results.cells.items():
         method, model = METHODS[name], cells[0]["model"]
         samples = "0" if model is None else f"{int(model['samples']):,}"
         if model is not None and int(model["collisions"]):
@@ -180,33 +180,33 @@ def _methods(found: RobotResults) -> str:
     return "\n".join([*markdown_table(heads, rows), ""])
 
 
-def _main(found: RobotResults) -> list[str]:
+def _main(robot_results: RobotResults) -> list[str]:
     lines = []
-    heads = ["method", "n", *(f"goals, `{arena}`" for arena in found.arenas), "goals, all arenas"]
+    heads = ["method", "n", *(f"goals, `{arena}`" for arena in robot_results.arenas), "goals, all arenas"]
     rows = []
-    for method, cells in found.cells.items():
-        scores = [_iqm(aggregate(found.goals(method, [arena])[0])) for arena in found.arenas]
-        rows.append([METHODS[method].label, str(len(cells)), *scores, _iqm(aggregate(found.goals(method)))])
+    for method, cells in robot_results.cells.items():
+        scores = [_iqm(aggregate(robot_results.goals(method, [arena])[0])) for arena in robot_results.arenas]
+        rows.append([METHODS[method].label, str(len(cells)), *scores, _iqm(aggregate(robot_results.goals(method)))])
     lines += [*markdown_table(heads, rows), ""]
-    heads = ["method", *(f"collisions, `{arena}`" for arena in found.arenas), "collisions in a training"]
+    heads = ["method", *(f"collisions, `{arena}`" for arena in robot_results.arenas), "collisions in a training"]
     rows = []
-    for method in found.cells:
-        counts = [_share(*found.collisions(method, arena)) for arena in found.arenas]
-        trained = found.training_collisions(method)
+    for method in robot_results.cells:
+        counts = [_share(*robot_results.collisions(method, arena)) for arena in robot_results.arenas]
+        trained = robot_results.training_collisions(method)
         rows.append([METHODS[method].label, *counts, f"{np.mean(trained):.1f} ({min(trained)} to {max(trained)})"])
     lines += [*markdown_table(heads, rows), ""]
     heads = ["method", "steps to 90 % of goals", "runs that got there"]
-    heads += [f"interventions, `{arena}`" for arena in found.arenas]
-    heads += [f"decision [ms], `{arena}`" for arena in found.arenas]
+    heads += [f"interventions, `{arena}`" for arena in robot_results.arenas]
+    heads += [f"decision [ms], `{arena}`" for arena in robot_results.arenas]
     rows = []
-    for method, cells in found.cells.items():
-        learned = found.learned(method)
-        got = int((learned < found.study["steps"]).sum())
-        shares = [_percent(found.interventions(method, arena)) for arena in found.arenas]
-        times = [f"{found.decision_ms(method, arena):.2f}" for arena in found.arenas]
+    for method, cells in robot_results.cells.items():
+        learned = robot_results.learned(method)
+        reached = int((learned < robot_results.study["steps"]).sum())
+        shares = [_percent(robot_results.interventions(method, arena)) for arena in robot_results.arenas]
+        times = [f"{robot_results.decision_ms(method, arena):.2f}" for arena in robot_results.arenas]
         figures = aggregate(learned)
         speed = f"{figures['iqm']:,.0f}" + _interval(figures["iqm_interval"], ",.0f")
-        rows.append([METHODS[method].label, speed, f"{got} of {len(cells)}", *shares, *times])
+        rows.append([METHODS[method].label, speed, f"{reached} of {len(cells)}", *shares, *times])
     return [*lines, *markdown_table(heads, rows), ""]
 
 
@@ -229,32 +229,32 @@ def _share(count: int, episodes: int) -> str:
     return f"{count} of {episodes:,}: {100.0 * count / episodes:.2f} % [{100.0 * low:.2f}, {100.0 * high:.2f}]"
 
 
-def _improvements(found: RobotResults) -> list[str]:
-    if DDPC not in found.cells:
+def _improvements(robot_results: RobotResults) -> list[str]:
+    if DDPC not in robot_results.cells:
         return []
     rows = []
-    for method in found.cells:
+    for method in robot_results.cells:
         if method != DDPC:
-            row = probability_of_improvement(found.goals(DDPC), found.goals(method))
+            row = probability_of_improvement(robot_results.goals(DDPC), robot_results.goals(method))
             probability = f"{row['probability']:.2f}" + _interval(row["interval"], ".2f")
             rows.append([f"ours over {METHODS[method].label}", probability])
     return [*markdown_table(["", "probability"], rows), ""]
 
 
-def _tuning(results: Path, robot: RobotWithTask, found: RobotResults) -> list[str]:
+def _tuning(results: Path, robot: RobotWithTask, robot_results: RobotResults) -> list[str]:
     """Return the table of all tried values; nothing is tried for our filter and TD3."""
     tried: dict[str, list[Result]] = {}
-    for path in sorted((results / found.name).glob("tuning-*.json")):
+    for path in sorted((results / robot_results.name).glob("tuning-*.json")):
         result = stored_result(path)
         tried.setdefault(result["study"]["method"], []).append(result)
     if not tried:
-        return [f"No tuning is stored: `brakeline compare {found.name} --tune` runs it.\n"]
+        return [f"No tuning is stored: `brakeline compare {robot_results.name} --tune` runs it.\n"]
     rows = []
     for method, values in tried.items():
         values.sort(key=lambda row: row["value"])
         best = _best(method, values)
-        users = [name for name in found.cells if name == method]
-        used = value_in_use(found.cells[users[0]][0], robot.footprint) if users else None
+        users = [name for name in robot_results.cells if name == method]
+        used = value_in_use(robot_results.cells[users[0]][0], robot.footprint) if users else None
         figures = [_tried(row) for row in values]
         chosen = f"{best:g}", "–" if used is None else f"{used:g}"
         rows.append([METHODS[method].label, METHODS[method].tuned, *figures, *chosen])

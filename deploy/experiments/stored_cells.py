@@ -42,8 +42,8 @@ def stored_cells(results: Path, robot: str) -> list[dict[str, Any]]:
 def check_addable(results: Path, cells: Sequence[CellConfig]) -> None:
     """Raise ResultError if cells to run would not compare with the stored ones that they do not replace."""
     folder, names = robot_folder(results, cells[0].robot), {cell.name for cell in cells}
-    kept = [stored_result(path)["study"] for path in _paths(folder) if path.stem not in names]
-    _check_comparable([*kept, *map(configuration, cells)], folder)
+    studies = [stored_result(path)["study"] for path in _paths(folder) if path.stem not in names]
+    _check_comparable([*studies, *map(configuration, cells)], folder)
 
 
 def _paths(folder: Path) -> list[Path]:

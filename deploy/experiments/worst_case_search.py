@@ -75,11 +75,11 @@ class SearchedEpisode:
 
 
 def search(
-    robot: RobotWithTask, what: Evaluation, episodes: int, path: Path, say: Callable[[str], object]
+    robot: RobotWithTask, evaluation: Evaluation, episodes: int, path: Path, say: Callable[[str], object]
 ) -> dict[str, Any]:
     """Search for so many episodes, and write the log of the worst one.
 
-    what: gives arena, method, model set, conditions and seed.
+    evaluation: gives arena, method, model set, conditions and seed.
 
     Returns:
         `episodes`, `collisions`, `steps`, `closest` [m], `number` and `values` of the worst candidate, and `history`
@@ -90,50 +90,50 @@ def search(
     """
     import cma
 
-    found = _Search(robot, what)
+    progress = _Search(robot, evaluation)
     size = MOVED * robot.position_dim + PIECES * robot.action_dim
     number = 0
-    while found.episodes < episodes:
+    while progress.episodes < episodes:
         options = {
             "bounds": [-1.0, 1.0],
-            "seed": what.seed + number + 1,
+            "seed": evaluation.seed + number + 1,
             "verbose": -9,
             "maxfevals": EPISODES_OF_AN_ARENA,
         }
         strategy = cma.CMAEvolutionStrategy(np.zeros(size), SPREAD, options)
-        while not strategy.stop() and found.episodes < episodes:
+        while not strategy.stop() and progress.episodes < episodes:
             candidates = [SearchedEpisode(number, np.asarray(values)) for values in strategy.ask()]
-            strategy.tell([one.values for one in candidates], list(map(found.score, candidates)))
-            say(f"{found.episodes} of {episodes} episodes, closest {1e3 * found.closest:.1f} mm")
+            strategy.tell([one.values for one in candidates], list(map(progress.score, candidates)))
+            say(f"{progress.episodes} of {episodes} episodes, closest {1e3 * progress.closest:.1f} mm")
         number += 1
-        if not found.episodes and number == MOST_ARENAS:
-            raise NoArena(f"every candidate in {number} arenas {what.arena!r} began too near to something")
-    found.write_worst(path)
-    return found.figures()
+        if not progress.episodes and number == MOST_ARENAS:
+            raise NoArena(f"every candidate in {number} arenas {evaluation.arena!r} began too near to something")
+    progress.write_worst(path)
+    return progress.figures()
 
 
 class _Search:
     """Drives candidates, and remembers the worst one."""
 
-    def __init__(self, robot: RobotWithTask, what: Evaluation) -> None:
+    def __init__(self, robot: RobotWithTask, evaluation: Evaluation) -> None:
         self.episodes = 0
         self.closest = math.inf  # m, of the worst candidate
-        self._robot, self._what = robot, what
+        self._robot, self._evaluation = robot, evaluation
         self._collisions = self._steps = 0
         self._least = math.inf  # the worst candidate's score
         self._worst: SearchedEpisode | None = None
         self._history: list[float] = []
         self._arena: Arena | None = None  # of the candidate that is driven
-        env = environment(robot, what.arena, FRESH + what.seed, what.conditions, draw=self._draw)
-        self._driver = replace(CampaignDriver.of(robot, what), env=env)
+        env = environment(robot, evaluation.arena, FRESH + evaluation.seed, evaluation.conditions, draw=self._draw)
+        self._driver = replace(CampaignDriver.of(robot, evaluation), env=env)
 
     def _draw(self, name: str, generator: np.random.Generator, robot: RobotWithTask) -> Arena:
         assert self._arena is not None
         return self._arena
 
     def _drive(self, candidate: SearchedEpisode, log: TrialLog | None = None) -> tuple[Row, Arena]:
-        generator = np.random.default_rng((self._what.seed, candidate.number))
-        self._arena = arena = candidate.arena(draw_arena(self._what.arena, generator, self._robot), self._robot)
+        generator = np.random.default_rng((self._evaluation.seed, candidate.number))
+        self._arena = arena = candidate.arena(draw_arena(self._evaluation.arena, generator, self._robot), self._robot)
         return self._driver.row(candidate.number, log, candidate.policy(self._robot)), arena
 
     def score(self, candidate: SearchedEpisode) -> float:

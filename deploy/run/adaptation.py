@@ -68,7 +68,7 @@ class RobotState:
             Once the robot has changed, a request counts as long as it asks for more than the stated sets.
         requests: number of these requests.
         widening: of the last request.
-        heard: when its last exchange arrived [s].
+        arrived: when its last exchange arrived [s].
     """
 
     version: str
@@ -76,7 +76,7 @@ class RobotState:
     widened: DrivenPeriod | None = None
     requests: int = 0
     widening: float = 1.0
-    heard: float = 0.0
+    arrived: float = 0.0
 
     @property
     def changed(self) -> bool:
@@ -152,7 +152,7 @@ class Adaptation:
         self._steps.append(step)
         self._driven += 1
 
-    def exchange(self, exchange: pb.Exchange, heard: float) -> None:
+    def exchange(self, exchange: pb.Exchange, arrived: float) -> None:
         """Add an exchange with the safety service; one without a decision names no version, and is left out.
 
         Raises Implausible if there are too many robots.
@@ -172,7 +172,7 @@ class Adaptation:
             state = self._robots[request.actor] = RobotState(decision.model, now)
         elif decision.model != state.version:
             state.version, state.since = decision.model, now
-        state.widening, state.heard = (request.widening if 1.0 <= request.widening < math.inf else 1.0), heard
+        state.widening, state.arrived = (request.widening if 1.0 <= request.widening < math.inf else 1.0), arrived
         if state.widening > (RESERVE if state.changed else WIDENING):
             state.widened, state.requests = state.widened or now, state.requests + 1
         else:
@@ -181,7 +181,7 @@ class Adaptation:
     @property
     def version(self) -> str:
         """The model set of the latest decision."""
-        return max(self._driving_robots().values(), key=lambda state: state.heard).version
+        return max(self._driving_robots().values(), key=lambda state: state.arrived).version
 
     @property
     def widening(self) -> float:
@@ -204,8 +204,8 @@ class Adaptation:
         plans, needed, minutes = self.plans_since_change, self.plans_needed, self.since_change
         if not self._changed() or (plans >= needed and minutes >= FEWEST_MINUTES):
             return ""
-        each = minutes / plans if plans else SPARE * self.robot.horizon * self.robot.period / 60.0
-        left = max((needed - plans) * each, FEWEST_MINUTES - minutes)
+        minutes_a_plan = minutes / plans if plans else SPARE * self.robot.horizon * self.robot.period / 60.0
+        left = max((needed - plans) * minutes_a_plan, FEWEST_MINUTES - minutes)
         bound = percent(accepted_bound(self.robot, self.accept_bound))
         have = f"{min(plans, needed)} of the {needed} plans since the change that state {bound}"
         return f"{WAITING}: {have}, {left:.1f} minutes left"
@@ -217,8 +217,8 @@ class Adaptation:
         return sum(max(0, periods - 1 - robot.committed_steps) // robot.horizon for periods in runs)
 
     def _driving_robots(self) -> dict[str, RobotState]:
-        latest = max((state.heard for state in self._robots.values()), default=0.0)
-        return {name: state for name, state in self._robots.items() if latest - state.heard <= SILENT}
+        latest = max((state.arrived for state in self._robots.values()), default=0.0)
+        return {name: state for name, state in self._robots.items() if latest - state.arrived <= SILENT}
 
     def _changed(self) -> bool:
         robots = self._driving_robots()

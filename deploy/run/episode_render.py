@@ -226,10 +226,10 @@ class _FilmAxes:
         ]
         if explained is None or frame.kind == "allowed":
             return self._title(k, frame.kind)
-        return self._title(k, textwrap.fill(f"{frame.kind}: {explained.said}", self._width))
+        return self._title(k, textwrap.fill(f"{frame.kind}: {explained.sentence}", self._width))
 
-    def _title(self, k: int, said: str) -> None:
-        title = f"{self._name()}{k * self.robot.period:5.1f} s\n{said}"
+    def _title(self, k: int, sentence: str) -> None:
+        title = f"{self._name()}{k * self.robot.period:5.1f} s\n{sentence}"
         self.axes.set_title(title, fontsize=self._font, loc="left")
 
     def _line(self, points: Sequence[Array], **style: Any) -> list[Any]:

@@ -326,8 +326,8 @@ class Launcher:
             process.stop.wait(0.05)
         else:
             if not process.stop.is_set():
-                said = last_line(self.folder / "logs" / "recorder.log")
-                log.error("no recorder, so the run starts without a log: %s", said)
+                message = last_line(self.folder / "logs" / "recorder.log")
+                log.error("no recorder, so the run starts without a log: %s", message)
         if not process.stop.is_set():
             for child in others:
                 child.release()

@@ -117,14 +117,16 @@ class Comparison:
         """Compare two replies to a request, without their times and the ignored fields."""
         self.requests += 1
         self.kinds[NAMES[logged.decision.kind], NAMES[now.decision.kind]] += 1
-        found = differences(logged, now, len(request.input_in_force), (*TIMES, *EXPLANATIONS, *ignored))
-        if not found:
+        differing = differences(logged, now, len(request.input_in_force), (*TIMES, *EXPLANATIONS, *ignored))
+        if not differing:
             self.identical += 1
-        elif all(difference.rounding or name in SOLVER_WORK for name, difference in found.items()):
+        elif all(difference.rounding or name in SOLVER_WORK for name, difference in differing.items()):
             self.equal += 1
-            self.rounding = max(self.rounding, *(d.size for name, d in found.items() if name not in SOLVER_WORK), 0.0)
+            self.rounding = max(
+                self.rounding, *(d.size for name, d in differing.items() if name not in SOLVER_WORK), 0.0
+            )
         else:
-            self._differ(request, logged, now, {name: d.size for name, d in found.items() if not d.rounding})
+            self._differ(request, logged, now, {name: d.size for name, d in differing.items() if not d.rounding})
 
     def _differ(self, request: pb.Request, logged: pb.Reply, now: pb.Reply, sizes: dict[str, float]) -> None:
         for name, size in sizes.items():
@@ -169,17 +171,17 @@ def differences(
         return {} if logged.error.type == now.error.type else {"error": APART}
     before, after = logged.decision, now.decision
     present = {descriptor.name for descriptor, _ in before.ListFields()}
-    found: dict[str, Difference] = {}
+    differing: dict[str, Difference] = {}
     for descriptor in pb.Decision.DESCRIPTOR.fields:
         name = descriptor.name
         one, other = getattr(before, name), getattr(after, name)
         if descriptor.has_presence and not descriptor.message_type and name not in present:
             continue  # the log is older than the field
         if name not in ignored and one != other:
-            found[name] = APART if descriptor.enum_type is not None else _difference(one, other)
+            differing[name] = APART if descriptor.enum_type is not None else _difference(one, other)
     if before.plan[:inputs] != after.plan[:inputs]:
-        found["input"] = _difference(before.plan[:inputs], after.plan[:inputs])
-    return found
+        differing["input"] = _difference(before.plan[:inputs], after.plan[:inputs])
+    return differing
 
 
 APART = Difference(math.inf, False)

@@ -44,12 +44,12 @@ def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[
         robot = robot_maybe_with_task(name)
         model = method_for(robot, config.method, config.model_config, config.accept_bound, build=simulated)
         source = method_path(robot, config.method, config.model_config)
-        kept = archive_path(folder, robot.name, model.version)
-        kept.parent.mkdir(parents=True, exist_ok=True)
+        archived = archive_path(folder, robot.name, model.version)
+        archived.parent.mkdir(parents=True, exist_ok=True)
         for path in (source, seal_of(source)):
             if path.exists():
-                shutil.copyfile(path, kept.with_suffix(path.suffix))
-        write_atomically(kept.with_name(IN_USE), model.version.encode())
+                shutil.copyfile(path, archived.with_suffix(path.suffix))
+        write_atomically(archived.with_name(IN_USE), model.version.encode())
         models.append(model)
     modes = {model.model_config.mode for model in models if isinstance(model, ModelSet)}
     if config.model_config.mode == AUTO and len(modes) == 1:
@@ -67,15 +67,18 @@ def models_of_resumed_run(config: RunConfig, folder: Path) -> list[Model]:
     models = []
     for name in config.robots:
         robot = robot_maybe_with_task(name)
-        kept, in_use = newest_model(folder, robot.name, None), method_path(robot, config.method, config.model_config)
-        if kept is None:
+        archived, in_use = (
+            newest_model(folder, robot.name, None),
+            method_path(robot, config.method, config.model_config),
+        )
+        if archived is None:
             missing = archive_path(folder, robot.name, "*")
             raise BadModel(f"{folder} can't be resumed: no model of {robot.name} in {missing.parent}. Start a new run")
-        model = load(kept)
+        model = load(archived)
         check_bound(model, robot, config.accept_bound)
         if not in_use.exists() or load(in_use).version != model.version:
             console.print(
-                f"{robot.name}: the run goes on with its own model {model.version}, in {kept.parent}. {in_use} is "
+                f"{robot.name}: the run goes on with its own model {model.version}, in {archived.parent}. {in_use} is "
                 "another one: start a new run to use it.",
                 markup=False,
             )

@@ -113,8 +113,8 @@ class SupervisedProcess:
         advice = f"If it hangs, end it with {end}: the launcher starts it again"
         if ends:
             advice = f"After {HANGING_AFTER:.0f} s more, the launcher kills it and starts it again. To do so now: {end}"
-        said = "%s has given no sign of life for %.0f s: it hangs, or the machine is too busy. %s"
-        log.error(said, self.spec.name, seconds, advice)
+        message = "%s has given no sign of life for %.0f s: it hangs, or the machine is too busy. %s"
+        log.error(message, self.spec.name, seconds, advice)
 
     def supervise(self) -> None:
         """Start the process if it is time, and schedule a restart if it has failed.
@@ -140,16 +140,16 @@ class SupervisedProcess:
         self.failures = 1 if now - ready > HEALTHY_AFTER else self.failures + 1
         ending = describe_end(code, lifetime)
         log_file = self.folder / "logs" / f"{self.spec.name}.log"
-        said = last_line(log_file)
-        output = f"its last output: {said or 'none'}"
+        message = last_line(log_file)
+        output = f"its last output: {message or 'none'}"
         if code == HOPELESS and self.spec.needed:
-            raise LaunchError(f"{said}; see {log_file}")
+            raise LaunchError(f"{message}; see {log_file}")
         if self.failures == MOST_FAILURES:
-            said = f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
+            message = f"{self.spec.name} {ending}, the {MOST_FAILURES}th time in a row; {output}; see {log_file}"
             if self.spec.needed:
-                raise LaunchError(said)
+                raise LaunchError(message)
             self.finished = True
-            log.error("%s; the run goes on without it", said)
+            log.error("%s; the run goes on without it", message)
             return
         backoff = min(FIRST_BACKOFF * 2.0 ** (self.failures - 1), LONGEST_BACKOFF)
         self.next_start = now + backoff

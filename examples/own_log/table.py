@@ -69,9 +69,9 @@ def certified(folder: Path, robot: str, log: Path, mode: str) -> tuple[ModelSet,
     brakeline(folder, "robot", "check", description)
     brakeline(folder, "import", str(log), "--robot", description)
     how = [] if mode == "one-step" else ["--mode", mode, "--certificates", "residual"]
-    said = brakeline(folder, "certify", description, "--use", "--accept-bound", "1", "--json", *how)
+    output = brakeline(folder, "certify", description, "--use", "--accept-bound", "1", "--json", *how)
     (path,) = (folder / "data").glob(f"*/residual-{mode}.safetensors")
-    (report,) = (value for value in json.loads(said).values() if isinstance(value, dict) and "windows" in value)
+    (report,) = (value for value in json.loads(output).values() if isinstance(value, dict) and "windows" in value)
     return ModelSet.load(path), report
 
 
@@ -238,9 +238,9 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         kinds = row["fresh"]["kinds"]
         worst = max(kinds, key=lambda name: kinds[name]["outside"], default="")
         stated = row["kinds"].get(worst, {}).get("bound")
-        said = "–" if stated is None else f"{worst}: {100.0 * kinds[worst]['outside']:.2f} % (≤ {percent(stated)})"
+        statement = "–" if stated is None else f"{worst}: {100.0 * kinds[worst]['outside']:.2f} % (≤ {percent(stated)})"
         run = row["adversary"], row["planner"]
-        cells += [said, f"{1e2 * run[0]['nearest']:.1f} cm ({run[0]['episodes']})"]
+        cells += [statement, f"{1e2 * run[0]['nearest']:.1f} cm ({run[0]['episodes']})"]
         cells += [f"{run[0]['collisions']} and {run[1]['collisions']}", f"{run[1]['goals']} of {run[1]['episodes']}"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -62,7 +62,7 @@ def render(figures: Figures, runs: Mapping[str, tuple[Figures, Figures]]) -> str
                 "label": label,
                 "mark": f"run{place}-" if place else "",  # prefix of the element ids of this run
                 "f": own | {"rates": rates(own)},
-                "kept": kept(pictures["galleries"].values()),
+                "kept": episode_counts(pictures["galleries"].values()),
             }
             for place, (label, (own, pictures)) in enumerate(runs.items())
         ],
@@ -97,7 +97,7 @@ def rates(figures: Figures) -> list[Figures]:
     ]
 
 
-def kept(galleries: Iterable[Figures]) -> dict[str, int]:
+def episode_counts(galleries: Iterable[Figures]) -> dict[str, int]:
     """Return how many episodes the page has with every step (`whole`), how many at all, and how many the log has."""
     counts = [(len(gallery["episodes"]), len(gallery["rest"]), gallery["total"]) for gallery in galleries]
     whole, rest, total = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0, 0)

@@ -144,8 +144,8 @@ class PublisherWatch:
         """Return the names of these nodes if none of them publishes this type."""
         wanted = dds_type(type_of(kind))
         with self._lock:
-            found = list(self._types.values())
-        return [] if any(its == wanted for _, its in found) else sorted({node for node, _ in found})
+            publishers = list(self._types.values())
+        return [] if any(its == wanted for _, its in publishers) else sorted({node for node, _ in publishers})
 
 
 class RosNode:

@@ -68,8 +68,8 @@ class Planes:
     def itself(self, which: int, period: int, margin: float = 0.0) -> tuple[Array, float]:
         """Return the half-space (d,), () at the surface of an obstacle with that margin, without the body's radius."""
         normal = self.normals[which, period]
-        kept = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
-        return normal, float(self.offsets[which, period]) + kept
+        distance = max(self.keep_off + margin, 0.0) + float(np.abs(normal) @ self.measured)
+        return normal, float(self.offsets[which, period]) + distance
 
 
 def worst(row: int, room: float, robot: Robot, around: ConstraintSources, planes: list[Planes]) -> BlockingConstraint:

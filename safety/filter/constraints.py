@@ -59,7 +59,7 @@ class _Disc:
 
 def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
     """Return the discs of the body, for tubes with the sets of this one."""
-    d, found = robot.position_dim, []
+    d, discs = robot.position_dim, []
     after = len(extra_coordinates(robot)) - d * sum(disc.arm > 0.0 for disc in robot.body)
     for disc in robot.body:
         at, among, directions, swing = np.asarray(disc.at), None, tube.directions, 0.0
@@ -68,8 +68,8 @@ def _discs(robot: Robot, tube: Tube) -> list[_Disc]:
             directions, after = tube.more_directions[:, among], after + d
             swing = disc.arm * robot.measurement_bound[robot.heading]
         aside = bool(at.any() or swing)
-        found.append(_Disc(at, disc.radius, swing, among, ObstacleRows(directions), aside))
-    return found
+        discs.append(_Disc(at, disc.radius, swing, among, ObstacleRows(directions), aside))
+    return discs
 
 
 def growth_of(model: ModelSet, tube: Tube) -> float:
@@ -269,7 +269,7 @@ class TubeConstraints:
 
         leaving: for an obstacle that contains the disc, take the half-space that leads out of it.
         """
-        found = []
+        planes = []
         for disc in self.discs:
             start, measured = local_map.start, self.measured
             if disc.aside:
@@ -293,8 +293,8 @@ class TubeConstraints:
                     self._let_pass(beside[-1][1])
             normals, offsets = beside[0] if len(beside) == 1 else map(np.concatenate, zip(*beside, strict=True))
             turned = normals if self.robot.heading is None else normals @ local_map.turn
-            found.append(Planes(start, ends, normals, turned, offsets, disc.radius, measured))
-        return found
+            planes.append(Planes(start, ends, normals, turned, offsets, disc.radius, measured))
+        return planes
 
     def _let_pass(self, levels: Array) -> None:
         """Drop the half-spaces (n, N) of moving obstacles for periods in which the robot stands (passive safety, §8).
@@ -320,13 +320,13 @@ class TubeConstraints:
         sizes = tube_kernels.magnitudes(*self._sized, z)
         if self.widening != 1.0:
             sizes *= self.widening
-        found = []
+        parts = []
         for disc, plane in zip(self.discs, planes or self.planes(local_map, z), strict=True):
-            found.append(disc.layout.slack(disc.center(self.tube), plane.turned, plane.offsets, sizes, z))
+            parts.append(disc.layout.slack(disc.center(self.tube), plane.turned, plane.offsets, sizes, z))
         if self.limits is not None or local_map.other_reservations is not None:
             tube = self.tube.affine(z)
-            found += [rows.bound - rows.support(tube, z) for rows in self._further(local_map, tube, z)]
-        return found[0] if len(found) == 1 else np.concatenate(found)
+            parts += [rows.bound - rows.support(tube, z) for rows in self._further(local_map, tube, z)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _further(self, local_map: LocalMap, tube: Tube, z: Array) -> list[ConstraintRows]:
         """Return the rows of reservations and of state limits. tube: with centers that are affine in z."""
@@ -334,10 +334,12 @@ class TubeConstraints:
         if local_map.other_reservations is not None:
             nominal = local_map.start + tube.centers(z) @ local_map.turn.T
             body = self.robot.footprint
-            kept = reservation_half_spaces(local_map.other_reservations, local_map.start, nominal, body, self.measured)
+            planes = reservation_half_spaces(
+                local_map.other_reservations, local_map.start, nominal, body, self.measured
+            )
             boxes = self._boxes or ReservationRows(tube.position, tube.offset, tube.directions)
             self._boxes = boxes if tube is self.tube else None
-            parts.append(boxes.rows(*kept, local_map.turn, self.widening))
+            parts.append(boxes.rows(*planes, local_map.turn, self.widening))
         if self.limits is not None:
             limits = self.limits if tube is self.tube else self.limits.around(tube)
             parts.append(limits.rows(local_map.start, local_map.heading, local_map.turn, self.widening))

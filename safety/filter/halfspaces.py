@@ -82,6 +82,6 @@ def half_spaces_leading_out(
         return planes
     normals, offsets = planes[0].copy(), planes[1].copy()
     normals[inside] = (-out[inside] / depth[inside, None])[:, None]
-    kept = np.maximum(keep_off + near.margin[inside], 0.0) + np.abs(normals[inside, 0]) @ measured
-    offsets[inside] = -(depth[inside] + kept)[:, None]
+    distance = np.maximum(keep_off + near.margin[inside], 0.0) + np.abs(normals[inside, 0]) @ measured
+    offsets[inside] = -(depth[inside] + distance)[:, None]
     return normals, offsets

@@ -47,8 +47,8 @@ class LocalMap:
         ways = [escape_direction(self.near, self.start)[None]] if len(self.near) else []
         if isinstance(self.unseen, OccupiedCells):
             ways.append(self.start - self.unseen.corners.reshape(-1, len(self.start)))
-        each = np.concatenate(ways or [np.zeros((0, len(self.start)))])
-        return each[np.argmin(np.einsum("nd,nd->n", each, each))] if len(each) else None
+        directions = np.concatenate(ways or [np.zeros((0, len(self.start)))])
+        return directions[np.argmin(np.einsum("nd,nd->n", directions, directions))] if len(directions) else None
 
     @property
     def empty(self) -> bool:

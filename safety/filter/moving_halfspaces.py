@@ -26,7 +26,7 @@ def swept_half_spaces(
     n, N = len(near), nominal.shape[0]
     ends, places = viewpoints(start, nominal)
     seen_from = places - near.moved(0.5 * period * np.arange(2 * N + 1))  # (n, q, d), as if the obstacle stood
-    each = np.arange(n)[:, None]
+    rows = np.arange(n)[:, None]
     towards = near.shapes.towards_from_own_points(start + seen_from)
     gap = np.sqrt(np.einsum("nqd,nqd->nq", towards, towards))
     unit = towards / np.maximum(gap, TOUCHING)[..., None]
@@ -38,7 +38,7 @@ def swept_half_spaces(
     room = unit @ ends.T
     room = bound - np.maximum(room[:, :, :-1], room[:, :, 1:])  # (n, q, N)
     choice = roomiest(room.swapaxes(1, 2))
-    normal = unit[each, choice]
-    offset = bound[each, choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
+    normal = unit[rows, choice]
+    offset = bound[rows, choice, np.arange(N)] - np.maximum(keep_off + near.shapes.margin, 0.0)[:, None]
     offset -= np.abs(normal) @ measured
     return normal, np.where(np.isnan(offset), -np.inf, offset)

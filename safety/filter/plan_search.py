@@ -78,7 +78,7 @@ class Linearized:
         constraints: the tube. planes: the half-spaces.
         slack (rows,): bound minus support of each row for the plan.
         kept_off (rows,) [m]: the clearance margin of each row.
-        kept: the rows with the clearance margin, once they are known.
+        tightened: the rows with the clearance margin, once they are known.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Linearized:
     ) -> None:
         self.constraints, self.planes, self.slack, self._local_map, self._z = constraints, planes, slack, local_map, z
         self.kept_off = constraints.kept_off(len(slack))
-        self.kept: ConstraintRows | None = None
+        self.tightened: ConstraintRows | None = None
 
     @cached_property
     def rows(self) -> ConstraintRows:
@@ -143,8 +143,8 @@ class PlanSearch:
         for with_clearance in (True, False):
             if not with_clearance and margin >= 0.0:
                 return allowed
-            found = (self._solve(start, with_clearance) for start in self._starting_points(proposed, committed))
-            adjusted = next((candidate for candidate in found if candidate is not None), None)
+            candidates = (self._solve(start, with_clearance) for start in self._starting_points(proposed, committed))
+            adjusted = next((candidate for candidate in candidates if candidate is not None), None)
             if adjusted is not None:
                 break
         for_clearance = margin >= 0.0 and adjusted is not None
@@ -276,9 +276,9 @@ class PlanSearch:
         Where turning in place would not keep the margin, two rows take the place of one: the row for free space alone,
         and a row that forbids inputs that move the robot nearer than the strongest braking does.
         """
-        if at.kept is None:
-            at.kept = self._tightened(at)
-        return at.kept
+        if at.tightened is None:
+            at.tightened = self._tightened(at)
+        return at.tightened
 
     def _tightened(self, at: Linearized) -> ConstraintRows:
         rows, too_near = at.rows, self._too_near_to_turn(at)

@@ -132,11 +132,11 @@ class RolloutTube(Tube):
     one_step: OneStep = field(kw_only=True)
     # (r + m + N·m, nz): the map from z to the regressors of a window, which hold all inputs
     inputs_of: Array = field(kw_only=True)
-    kept: tuple[int, ...] = field(kw_only=True)  # (r,): indices of the coordinates in `more`
+    further: tuple[int, ...] = field(kw_only=True)  # (r,): indices of the coordinates in `more`
 
     @cached_property
-    def _kept(self) -> NDArray[np.int64]:
-        return np.array(self.kept, dtype=np.int64)
+    def _further(self) -> NDArray[np.int64]:
+        return np.array(self.further, dtype=np.int64)
 
     @cached_property
     def _sets_around(self) -> Callable[[Array], tuple[Array, Array, Array, Array, Array, Array]]:
@@ -144,7 +144,7 @@ class RolloutTube(Tube):
 
         sets = np.ascontiguousarray(self.directions), np.ascontiguousarray(self.more_directions)
         predictor = self.one_step.stretch_arguments(self.robot)
-        return partial(rollout_kernels.sets_around, *predictor, self.inputs_of, self._kept, *sets)
+        return partial(rollout_kernels.sets_around, *predictor, self.inputs_of, self._further, *sets)
 
     @cached_property
     def _arguments(self) -> Predictor:
@@ -166,15 +166,15 @@ class RolloutTube(Tube):
         """Return gradient and offset of the centers, and of the other coordinates: the rollout, linearised at z."""
         from brakeline.safety.filter.kernels import rollout_kernels
 
-        return rollout_kernels.affine(self._arguments, z, self.inputs_of, self._kept)
+        return rollout_kernels.affine(self._arguments, z, self.inputs_of, self._further)
 
     def centers(self, z: Array) -> Array:
         """Return the predicted positions (N, d) for one z (nz,), in the frame of the start."""
         return np.asarray(self.outputs(z[None])[0][0])
 
     def outputs(self, z: Array) -> tuple[Array, Array]:
-        found = self.one_step.rollouts(self.robot, z @ self.inputs_of.T)
-        return found[..., : self.position.shape[1]], found[..., list(self.kept)]
+        outputs = self.one_step.rollouts(self.robot, z @ self.inputs_of.T)
+        return outputs[..., : self.position.shape[1]], outputs[..., list(self.further)]
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def stack_rollout(linear: Tube, robot: Robot, one_step: OneStep, inputs_of: Arra
     """Return the tube around a rollout, with the sets of a tube that was stacked from zero predictors."""
     fields = {name: getattr(linear, name) for name in Tube.__dataclass_fields__}
     whole = np.ascontiguousarray(inputs_of, dtype=float)
-    return RolloutTube(**fields, robot=robot, one_step=one_step, inputs_of=whole, kept=tuple(more))
+    return RolloutTube(**fields, robot=robot, one_step=one_step, inputs_of=whole, further=tuple(more))
 
 
 @dataclass(frozen=True)

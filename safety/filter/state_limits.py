@@ -43,8 +43,8 @@ class StateLimits:
         if robot.heading is not None:
             self.turn = weights[:, robot.heading]
         self.middle = np.array([_middle_of_arc(robot, i) for i in range(self.count)])
-        kept = [i for i in extra_coordinates(robot) if i < n]
-        self.other, self.which = weights[:, kept], [extra_coordinates(robot).index(i) for i in kept]
+        further = [i for i in extra_coordinates(robot) if i < n]
+        self.other, self.which = weights[:, further], [extra_coordinates(robot).index(i) for i in further]
         self.nz, self.extra, self.ends = tube.position.shape[2], np.eye(N + 1), np.append(np.arange(N), N - 1)
         self.way = np.linalg.norm(self.place, axis=1) if d else robot.limit_scales
         self.now: Array | None = None  # the map of the first period's start, in joint space

@@ -94,10 +94,10 @@ def blocked_sectors(search: PlanSearch, backwards: bool = False) -> tuple[Array,
     directions in which the robot would come nearer by more than r on its next `PERIODS`.
     """
     safety, at = search.safety, search.standing
-    each, row, rooms = rows_per_obstacle(safety.robot.horizon), 0, []
+    per_obstacle, row, rooms = rows_per_obstacle(safety.robot.horizon), 0, []
     for planes in at.planes:
-        rows = each * len(planes.normals)
-        rooms.append(at.slack[row : row + rows].reshape(-1, each).min(axis=1, initial=math.inf))
+        rows = per_obstacle * len(planes.normals)
+        rooms.append(at.slack[row : row + rows].reshape(-1, per_obstacle).min(axis=1, initial=math.inf))
         row += rows
     room = np.concatenate(rooms) - safety.clearance_margin
     normals = np.concatenate([planes.normals[:, 0] for planes in at.planes])

@@ -110,9 +110,9 @@ def envelopes(features: Array, values: Array, inflation: float, typical: Array |
     costs = np.column_stack([tight_at, np.ones(len(tight_at))])
     rows = np.column_stack([features, np.ones(len(features))])
     farthest = rows.argmax(0)
-    each = zip(values.T, costs, strict=True)
-    found = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v, cost in each]) * inflation
-    return found[:, :-1], found[:, -1]
+    coordinates = zip(values.T, costs, strict=True)
+    bounds = np.array([_envelope(rows, np.ascontiguousarray(v), cost, farthest) for v, cost in coordinates]) * inflation
+    return bounds[:, :-1], bounds[:, -1]
 
 
 def _envelope(rows: Array, values: Array, cost: Array, active: NDArray[np.int64]) -> Array:
@@ -122,10 +122,10 @@ def _envelope(rows: Array, values: Array, cost: Array, active: NDArray[np.int64]
     active = np.union1d(_largest(values), active)
     scale = float(values.max()) or 1.0
     while True:
-        found = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
-        if found.status != 0:
-            raise ErrorBoundError(f"no envelope of the residuals: {found.message}")
-        bound = np.maximum(found.x, 0.0)
+        solution = linprog(cost, A_ub=-rows[active], b_ub=-values[active] / scale, bounds=(0, None), method="highs")
+        if solution.status != 0:
+            raise ErrorBoundError(f"no envelope of the residuals: {solution.message}")
+        bound = np.maximum(solution.x, 0.0)
         short = values / scale - rows @ bound
         worst = _largest(short)
         more = np.union1d(active, worst[short[worst] > 1e-7])
@@ -195,28 +195,28 @@ def _row_box(white: Array, y: Array, size: Array) -> tuple[Array, Array]:
         for side, sign in enumerate((1.0, -1.0)):
             while True:
                 rows, values, bound = white[active], y[active], size[active]
-                found = linprog(
+                solution = linprog(
                     sign * np.eye(nz)[axis],
                     A_ub=np.vstack([rows, -rows]),
                     b_ub=np.concatenate([values + bound, bound - values]),
                     bounds=(None, None),
                 )
-                if found.status in (3, 4) and len(active) < len(y):  # unbounded, so it seems, on so few samples
+                if solution.status in (3, 4) and len(active) < len(y):  # unbounded, so it seems, on so few samples
                     spread = np.arange(0, len(y), max(1, len(y) // (4 * ROWS_A_ROUND)))
                     more = np.union1d(active, spread)
                     active = more if len(more) > len(active) else np.arange(len(y))
                     continue
-                if found.status == 3:
+                if solution.status == 3:
                     raise ErrorBoundError("the samples do not bound the matrix")
-                if found.status == 2:
+                if solution.status == 2:
                     raise ErrorBoundError("no matrix is consistent with all samples: the noise bound is too small")
-                if found.status != 0:
-                    raise ErrorBoundError(f"no bound of the consistent matrices: {found.message}")
-                over = np.abs(y - white @ found.x) - size
+                if solution.status != 0:
+                    raise ErrorBoundError(f"no bound of the consistent matrices: {solution.message}")
+                over = np.abs(y - white @ solution.x) - size
                 worst = np.argsort(over)[-ROWS_A_ROUND:]
                 more = np.union1d(active, worst[over[worst] > 1e-6])
                 if len(more) == len(active):
                     break
                 active = more
-            corners[side, axis] = found.x[axis] - sign * 1e-6
+            corners[side, axis] = solution.x[axis] - sign * 1e-6
     return unit * corners[0], unit * corners[1]

@@ -99,8 +99,8 @@ def group_violations(excess: Array, parts: list[str], driving: NDArray[np.str_])
     groups: dict[tuple[str, str], list[float]] = {}
     for row in np.flatnonzero(left):
         groups.setdefault((parts[row], str(driving[row])), []).append(float(excess[row]))
-    found = [
+    violations = [
         ViolationGroup(part, regime, len(shares), every[regime], max(shares))
         for (part, regime), shares in groups.items()
     ]
-    return tuple(sorted(found, key=lambda one: (-one.plans, -one.excess)))
+    return tuple(sorted(violations, key=lambda one: (-one.plans, -one.excess)))

@@ -56,14 +56,14 @@ class SelectionPath:
         while len(order) < MOST:
             own = np.diag(left)
             gains = np.where(free & (own > INDEPENDENT), gain_of**2 / np.maximum(own, INDEPENDENT), 0.0)
-            taken = int(gains.argmax())
-            if gains[taken] <= 0.0:
+            chosen = int(gains.argmax())
+            if gains[chosen] <= 0.0:
                 break
-            free[taken] = False
-            order.append(taken)
-            squares.append(max(squares[-1] - float(gains[taken]), 1e-300))
-            column, pivot = left[:, taken].copy(), own[taken]
-            gain_of = gain_of - column * (gain_of[taken] / pivot)
+            free[chosen] = False
+            order.append(chosen)
+            squares.append(max(squares[-1] - float(gains[chosen]), 1e-300))
+            column, pivot = left[:, chosen].copy(), own[chosen]
+            gain_of = gain_of - column * (gain_of[chosen] / pivot)
             left = left - np.outer(column, column / pivot)
             criterion = samples * np.log(squares[-1]) + penalty * np.log(samples) * len(order)
             if criterion < least:

@@ -124,9 +124,9 @@ def _in_place(fit: Dataset, bound: Dataset, model_config: ModelConfig) -> InPlac
         z, z_bound = (np.where(turns, part.z, 0.0) for part in parts)
         y, y_bound = (predicted_outputs(robot, part.y) for part in parts)
         try:
-            for each in (z, z_bound):
+            for regressors in (z, z_bound):
                 check_regressors(
-                    each[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE)
+                    regressors[:, turns], f"windows of {k} periods in place", min(model_config.fewest, FEWEST_IN_PLACE)
                 )
             steps.append(_error_bound(z, y, z_bound, y_bound, model_config, turns, MOST_ATOMS // robot.horizon))
         except (BadData, ErrorBoundError):
@@ -141,14 +141,14 @@ def _range(robot: Robot, z: Array) -> Array:
     """
     known, m = robot.regressor_dim, robot.action_dim
     inputs = z[:, known - m :].reshape(-1, m)
-    found = np.stack([np.append(f(z[:, :known], axis=0), f(inputs, axis=0)) for f in (np.min, np.max)])
-    found[:, known - m : known] = found[:, known:]
+    ranges = np.stack([np.append(f(z[:, :known], axis=0), f(inputs, axis=0)) for f in (np.min, np.max)])
+    ranges[:, known - m : known] = ranges[:, known:]
     for i, index in enumerate(robot.follows):
         if index in robot.regressor:
             at, error = robot.regressor.index(index), robot.measurement_bound[index]
-            found[0, at] = min(found[0, at], found[0, known + i] - error)
-            found[1, at] = max(found[1, at], found[1, known + i] + error)
-    return found
+            ranges[0, at] = min(ranges[0, at], ranges[0, known + i] - error)
+            ranges[1, at] = max(ranges[1, at], ranges[1, known + i] + error)
+    return ranges
 
 
 def _stopping_distance_of_plans(whole: Windows, model_config: ModelConfig) -> tuple[Array, float]:

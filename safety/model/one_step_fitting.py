@@ -81,7 +81,7 @@ def choose(
     Returns:
         The choice, all candidates from the least out-of-fold error to the largest, and the regression of the choice.
     """
-    found: list[tuple[Candidate, Regression]] = []
+    candidates: list[tuple[Candidate, Regression]] = []
     some = np.linspace(0, len(s.z) - 1, min(len(s.z), MOST_TO_CHOOSE)).astype(int)
     few_windows = replace(s, z=s.z[some], after=s.after[some], fold=s.fold[some])
     families = [*product(DEGREES, LAGS)]
@@ -97,9 +97,9 @@ def choose(
             with np.errstate(invalid="ignore"):
                 error = float(np.quantile(off, QUANTILE))
             count = len(regression.fit(candidate).features.terms)
-            found.append((replace(candidate, error=error, features=count), regression))
-    found = sorted((pair for pair in found if np.isfinite(pair[0].error)), key=lambda pair: pair[0].error)
-    good = [pair for pair in found if pair[0].error <= GOOD * found[0][0].error][:MOST_GOOD]
+            candidates.append((replace(candidate, error=error, features=count), regression))
+    candidates = sorted((pair for pair in candidates if np.isfinite(pair[0].error)), key=lambda pair: pair[0].error)
+    good = [pair for pair in candidates if pair[0].error <= GOOD * candidates[0][0].error][:MOST_GOOD]
     choices = []
     for number, (candidate, regression) in enumerate(good):
         progress(TRIED + (CHOSEN - TRIED) * number / len(good))
@@ -107,7 +107,7 @@ def choose(
     least = min(choice.width for choice, _ in choices)
     narrow = [pair for pair in choices if pair[0].width <= SIMPLER * least]
     choice, regression = min(narrow, key=lambda pair: (pair[0].candidate.features, pair[0].width))
-    return choice, [c for c, _ in found], regression
+    return choice, [c for c, _ in candidates], regression
 
 
 def _distances(robot: Robot, errors: Array) -> Array:
@@ -245,11 +245,11 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
                 logs[p] += np.log(wide).mean() / (2 * len(regression.folds))
     with np.errstate(invalid="ignore"):
         widths = np.maximum(np.quantile(scores, 1.0 - outside, axis=1), 1.0) * np.exp(logs)
-    found = dict(zip(pairs, np.where(np.isnan(widths), np.inf, widths), strict=True))  # a rollout may diverge
-    least = {level: min(width for pair, width in found.items() if pair[1] == level) for _, level in pairs}
+    width_of = dict(zip(pairs, np.where(np.isnan(widths), np.inf, widths), strict=True))  # a rollout may diverge
+    least = {level: min(width for pair, width in width_of.items() if pair[1] == level) for _, level in pairs}
     level = max(level for level, width in least.items() if level == 0 or width <= SIMPLER * least[0])
-    weight = max(w for w in WEIGHTS if found[w, level] <= SIMPLER * least[level])
-    return Choice(candidate, weight, level, float(found[weight, level]), full)
+    weight = max(w for w in WEIGHTS if width_of[w, level] <= SIMPLER * least[level])
+    return Choice(candidate, weight, level, float(width_of[weight, level]), full)
 
 
 def _scores(

@@ -110,11 +110,11 @@ class Regression:
 
     def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
         """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""
-        found = np.empty_like(s.after)
+        predictions = np.empty_like(s.after)
         for i in self.folds:
             held = s.fold == i
-            found[held] = s.after[held] - self.fit(candidate, without=i).rollouts(self._robot, s.z[held])
-        return found
+            predictions[held] = s.after[held] - self.fit(candidate, without=i).rollouts(self._robot, s.z[held])
+        return predictions
 
 
 def _solved(places: list[Index], gram: Array, cross: Array) -> Array:

@@ -70,10 +70,10 @@ def without_repeats(robot: Robot, trajectories: Sequence[Trajectory]) -> tuple[t
     seeds drives the same episodes.
     """
     unique = {(t.states.tobytes(), t.inputs.tobytes()): t for t in reversed(trajectories)}
-    kept = list(reversed(unique.values()))
-    while (twice := repeated_driving(robot, kept)) is not None:  # a part of an episode
-        del kept[twice.second]
-    return tuple(kept), len(trajectories) - len(kept)
+    distinct = list(reversed(unique.values()))
+    while (twice := repeated_driving(robot, distinct)) is not None:  # a part of an episode
+        del distinct[twice.second]
+    return tuple(distinct), len(trajectories) - len(distinct)
 
 
 def _chains(trajectories: Sequence[Trajectory]) -> NDArray[np.intp]:

@@ -135,9 +135,9 @@ class Shape:
         fast[others] = FULL_SPEED_OTHERS
         share = np.tile(((1.0 - fast) / (plans.shape[1] - 1))[:, None], plans.shape[1])
         share[:, -1] = fast
-        each = zip(spread[..., level:], np.moveaxis(np.abs(errors), 1, 0), plans[..., level:], strict=True)
-        found = [_tightest(features, values, inflation, some, share) for features, values, some in each]
-        grown, w = np.array([one[0] for one in found]), np.array([one[1] for one in found])
+        coordinates = zip(spread[..., level:], np.moveaxis(np.abs(errors), 1, 0), plans[..., level:], strict=True)
+        fits = [_tightest(features, values, inflation, some, share) for features, values, some in coordinates]
+        grown, w = np.array([one[0] for one in fits]), np.array([one[1] for one in fits])
         return Shape(np.concatenate([np.zeros((*w.shape, level)), grown], axis=2), w)
 
     def bound(self, robot: Robot, k: int, coordinates: slice, factor: Array) -> ErrorBound:

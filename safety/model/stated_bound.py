@@ -83,17 +83,20 @@ def refusal(robot: Robot, about: Mapping[str, str], accept_bound: float | None =
         return ""
     whose = f"the limit of {robot.name}" if accept_bound is None else "what --accept-bound accepts"
     if "bound_plan" not in about:
-        said = "the model set has no statement about held-out plans, so any share may leave their tubes"
+        statement = "the model set has no statement about held-out plans, so any share may leave their tubes"
     elif bound == UNSTATED:
-        said = (
+        statement = (
             f"the model set states no bound (bound_plan is {about['bound_plan']!r}), so any share may leave their tubes"
         )
     else:
-        said = f"the model set states only that at most {percent(bound)} of plans leave their tubes (99 % confidence)"
+        statement = (
+            f"the model set states only that at most {percent(bound)} of plans leave their tubes (99 % confidence)"
+        )
     accepted = f"{rounded_up(bound):g}"
     return (
-        f"{said}; {whose} is {percent(limit)}. {_remedy(about, limit)}. Or accept the bound: --accept-bound {accepted} "
-        f"(in Python accept_bound={accepted}; the limit itself is `accept_bound` in the description of {robot.kind})"
+        f"{statement}; {whose} is {percent(limit)}. {_remedy(about, limit)}. "
+        f"Or accept the bound: --accept-bound {accepted} (in Python accept_bound={accepted}; "
+        f"the limit itself is `accept_bound` in the description of {robot.kind})"
     )
 
 

@@ -74,5 +74,5 @@ def _contiguous(tensors: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 def _metadata(payload: bytes) -> dict[str, str]:
     size = int.from_bytes(payload[:8], "little")
-    found: dict[str, str] = parse_json(payload[8 : 8 + size]).get("__metadata__", {})
-    return found
+    metadata: dict[str, str] = parse_json(payload[8 : 8 + size]).get("__metadata__", {})
+    return metadata

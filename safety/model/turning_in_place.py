@@ -37,19 +37,19 @@ class InPlace:
         return widened(over_plan(self.box, regressors, known))
 
 
-def over_plan(each: Array, regressors: int, known: int) -> Array:
+def over_plan(columns: Array, regressors: int, known: int) -> Array:
     """Repeat the columns of one input for every input of a plan.
 
     Args:
-        each (n, r + m): columns for [x_0; input in force] (r) and for one input of the plan (m).
+        columns (n, r + m): for [x_0; input in force] (r) and for one input of the plan (m).
         regressors: number of columns of the result.
         known: r.
 
     Returns:
         Array (n, regressors).
     """
-    count = (regressors - known) // (each.shape[1] - known)
-    return np.hstack([each[:, :known], np.tile(each[:, known:], count)])
+    count = (regressors - known) // (columns.shape[1] - known)
+    return np.hstack([columns[:, :known], np.tile(columns[:, known:], count)])
 
 
 def widened(domain: Array) -> Array:

@@ -343,23 +343,23 @@ def _excess(model: ModelSet, tube: Tube, w: Windows, k: int) -> tuple[Array, lis
     predicted = state_parts(robot, others.shape[1])
     names = [position_parts(robot)[axis] for axis in np.abs(normals).argmax(1)] + [predicted[i] for i in more]
     names += [PATH, AFTER] if k == tube.horizon else [PATH]
-    found = np.zeros((len(w), len(names)))
+    excess = np.zeros((len(w), len(names)))
     for i in range(0, len(w), CHUNK):
         z = w.z[i : i + CHUNK]
         sizes = tube.magnitudes(z)
-        made = sizes[:, : tube.generators]
+        magnitudes = sizes[:, : tube.generators]
         away = np.abs((w.y[i : i + CHUNK, :d] - z @ tube.position[k - 1].T) @ normals.T)
         off = np.abs(others[i : i + CHUNK] - z @ tube.more[k - 1].T)
         parts = [
-            shares_of(away, made @ spread.T),
-            shares_of(off, made @ np.abs(tube.more_directions[k - 1]).T),
+            shares_of(away, magnitudes @ spread.T),
+            shares_of(off, magnitudes @ np.abs(tube.more_directions[k - 1]).T),
             shares_of(w.chord_deviation[i : i + CHUNK, None], sizes[:, tube.generators + k - 1, None]),
         ]
         if k == tube.horizon:
             stopped = w.stopping_distance[i : i + CHUNK, None]
             parts.append(np.where(np.isnan(stopped), 0.0, shares_of(stopped, sizes[:, -1, None])))  # NaN: no stop
-        found[i : i + CHUNK] = np.concatenate(parts, axis=1)
-    return found, names
+        excess[i : i + CHUNK] = np.concatenate(parts, axis=1)
+    return excess, names
 
 
 def facet_normals(generators: Array) -> Array:

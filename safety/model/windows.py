@@ -104,10 +104,10 @@ def _plans_of(robot: Robot, t: Trajectory, k: int) -> tuple[NDArray[np.intp], Ar
     planned = chosen @ robot.plan_matrix()[: k * m].T
     actual = np.hstack([t.inputs[j : j + count] for j in range(k)]).reshape(count, k * m)
     if robot.feedback:
-        made = _braked(robot, t)
+        braked = _braked(robot, t)
         for j in range(1, k):
             row = slice(j * m, (j + 1) * m)
-            planned[:, row] = np.where(robot.stops_by_feedback, made[j : j + count], planned[:, row])
+            planned[:, row] = np.where(robot.stops_by_feedback, braked[j : j + count], planned[:, row])
         near = np.tile(INPUT_TOLERANCE * (robot.high() - robot.low()), k)
     else:
         near = np.full(k * m, 1e-9)

@@ -55,9 +55,9 @@ class OccupiedCells:
 
 def occupied_cells(scan: Scan, within: float) -> OccupiedCells:
     """Return everything within a distance [m] of the sensor that may be occupied, or that something may come out of."""
-    found = gaps_and_motions(scan)
-    cells = _unseen_cells(scan, within, *found)
-    return cells if scan.tracks is None else cells.joined(_exit_cells(scan, within, *found))
+    gaps = gaps_and_motions(scan)
+    cells = _unseen_cells(scan, within, *gaps)
+    return cells if scan.tracks is None else cells.joined(_exit_cells(scan, within, *gaps))
 
 
 def _unseen_cells(

@@ -75,7 +75,7 @@ class RivalByHand(Rival):
         """
         away = -request.obstacles.towards(points)
         lengths = np.linalg.norm(away, axis=-1)
-        taken = request.obstacles.margin[:, None] + self.robot.footprint
-        return lengths - taken, np.where(
+        radius = request.obstacles.margin[:, None] + self.robot.footprint
+        return lengths - radius, np.where(
             lengths[..., None] > OUTSIDE, away / np.maximum(lengths, OUTSIDE)[..., None], 0.0
         )

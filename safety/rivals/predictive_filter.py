@@ -72,14 +72,14 @@ class PredictiveFilter(RivalByHand):
         robot, count = self.robot, len(plans)
         inputs = np.concatenate([plans, np.tile(self._after, (count, 1, 1))], axis=1)
         dt = robot.period / SAMPLES
-        kept = math.exp(-dt / self.settings["lag"])
-        lag = (1.0 - kept) * self.settings["lag"] / dt  # share of the old speed in the mean of a sample
+        decay = math.exp(-dt / self.settings["lag"])
+        lag = (1.0 - decay) * self.settings["lag"] / dt  # share of the old speed in the mean of a sample
         speeds = np.tile(state[robot.speed_indices], (count, 1))
         travelled = np.empty((count, inputs.shape[1] * SAMPLES, robot.action_dim))
         for i in range(travelled.shape[1]):
             u = inputs[:, i // SAMPLES]
             travelled[:, i] = dt * (u + (speeds - u) * lag)
-            speeds = u + (speeds - u) * kept
+            speeds = u + (speeds - u) * decay
         if robot.heading is not None:
             turned = travelled[..., 1]
             middle = state[robot.heading] + np.cumsum(turned, axis=1) - 0.5 * turned

@@ -43,9 +43,9 @@ class Sailr(Rival):
         except KeyError as error:
             raise BadModel(f"no model of SAILR: {error} is missing") from error
         self.observed = self.v.inputs  # the size of an observation
-        found = (self.q.inputs, self.q.outputs, self.v.inputs, self.v.outputs)
-        if model.method != SAILR or found != (self.observed + self.robot.action_dim, 1, self.observed, 1):
-            raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {found}")
+        sizes = (self.q.inputs, self.q.outputs, self.v.inputs, self.v.outputs)
+        if model.method != SAILR or sizes != (self.observed + self.robot.action_dim, 1, self.observed, 1):
+            raise BadModel(f"no model of SAILR for {self.robot.name}: {model.method}, networks {sizes}")
 
     def advantage(self, observation: NDArray[np.float32], action: Array) -> float:
         """Return max Q(s, a) − min V(s), in [-1, 1]: how much costlier the action is than the backup policy."""

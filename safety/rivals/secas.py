@@ -130,8 +130,8 @@ class Secas(Rival):
         self.observed = self.g.inputs  # the size of an observation
         sized = (self.g.count, self.g.outputs) == (self.constraints.count, self.robot.action_dim)
         if model.method != SECAS or not sized or self.observed < len(rays.directions):
-            found = self.g.count, self.g.inputs, self.g.outputs
-            raise BadModel(f"no model of SECAS for {self.robot.name}: {model.method}, networks {found}")
+            sizes = self.g.count, self.g.inputs, self.g.outputs
+            raise BadModel(f"no model of SECAS for {self.robot.name}: {model.method}, networks {sizes}")
         self.bound = -clearance
         self.scale = self.robot.high()
 

@@ -56,5 +56,5 @@ class UnicycleBarrier(RivalByHand):
             return self.braking(request, started, "no input meets the barrier")
         action = robot.clip_input(solution.x * scale, request.input_in_force)
         reason = f"obstacle {int(h.argmin())} would come near faster than the barrier allows"
-        said = {"reason": reason, "iterations": solution.iterations}
-        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **said)
+        about = {"reason": reason, "iterations": solution.iterations}
+        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **about)

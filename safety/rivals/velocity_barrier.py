@@ -57,5 +57,5 @@ class VelocityBarrier(RivalByHand):
             return self.braking(request, started, "no input meets the barrier")
         action = robot.clip_input(solution.x, before)
         reason = f"obstacle {int(excess.argmax())} would come near faster than the barrier allows"
-        said = {"reason": reason, "iterations": solution.iterations}
-        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **said)
+        about = {"reason": reason, "iterations": solution.iterations}
+        return self.decision(ADJUSTED, braking_plan(robot, action), least, started, **about)

@@ -8,6 +8,7 @@ from brakeline.errors import CheckpointError, DamagedPart, Diverged
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle

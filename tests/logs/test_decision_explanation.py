@@ -122,7 +122,7 @@ def test_what_has_another_robots_sizes_fits_not():
 def test_a_proposal_that_is_not_finite_has_no_arrow():
     question, answer = asked(GROUND, (float("nan"), 0.1)), answered(GROUND, pb.FAILSAFE, (0.0, 0.0), by="")
     about = explain(GROUND, question, answer)
-    assert about.proposed.tolist() == [0.0, 0.0] and about.said.endswith("verified before: why not")
+    assert about.proposed.tolist() == [0.0, 0.0] and about.sentence.endswith("verified before: why not")
 
 
 SLEW = [  # proposed, before, executed, which limits

@@ -174,4 +174,4 @@ def test_verified_is_described_with_its_bound(model):
     assert "at most 26 %" in explain(GROUND, question, decision).trust
     decision.kind, decision.reason = pb.FAILSAFE, "the proposal's tube comes too near"
     about = explain(GROUND, question, decision)
-    assert "verified before (at most 26 % of such plans leave their tube)" in about.said and not about.trust
+    assert "verified before (at most 26 % of such plans leave their tube)" in about.sentence and not about.trust

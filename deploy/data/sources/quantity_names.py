@@ -53,28 +53,28 @@ def quantities(robot: Robot) -> dict[str, str]:
         return {}
     states, inputs = column_names(robot)
     frame = "velocity" if robot.heading is None else "body"
-    found: dict[str, str] = {}
+    quantity_of: dict[str, str] = {}
 
     def next_axis(kind: str) -> str:
-        return f"{kind}.{AXES[min(sum(q.startswith(f'{kind}.') for q in found.values()), 2)]}"
+        return f"{kind}.{AXES[min(sum(q.startswith(f'{kind}.') for q in quantity_of.values()), 2)]}"
 
     for i, name in enumerate(states):
         unit = split(robot.state[i])[1]
         if i < robot.position_dim:
-            found[name] = f"position.{AXES[i]}"
+            quantity_of[name] = f"position.{AXES[i]}"
         elif i == robot.heading:
-            found[name] = "yaw"
+            quantity_of[name] = "yaw"
         elif unit in ("m/s", "m/s2"):
-            found[name] = next_axis(frame if unit == "m/s" else "acceleration")
+            quantity_of[name] = next_axis(frame if unit == "m/s" else "acceleration")
         elif unit == "rad/s":
-            found[name] = "yaw rate"
+            quantity_of[name] = "yaw rate"
     for i, name in enumerate(inputs):
         unit = split(robot.action[i])[1]
         if unit == "m/s":
-            found[name] = next_axis(f"{COMMAND}.{frame}")
+            quantity_of[name] = next_axis(f"{COMMAND}.{frame}")
         elif (kind := {"rad/s": "yaw rate", "rad": "steering", "m/s2": "acceleration"}.get(unit)) is not None:
-            found[name] = f"{COMMAND}.{kind}"
-    return found
+            quantity_of[name] = f"{COMMAND}.{kind}"
+    return quantity_of
 
 
 def resolve(tables: Sequence[Table], robot: Robot, options: LogOptions) -> Places:

@@ -32,7 +32,7 @@ class AsideBatch:
             self._way = way_ahead(robot)
             self._translates = constant([[float(translates)] for translates in robot.translates]) > 0.5
 
-    def turn(self, lanes: LaneBatch, found: CandidateBatch, asks: Array) -> None:
+    def turn(self, lanes: LaneBatch, candidates: CandidateBatch, asks: Array) -> None:
         """Replace the adjusted plans of blocked robots by plans that turn them aside, where such plans are verified.
 
         asks (B,): the request lets the filter do so. A lane whose result rounding could change is no longer adjusted:
@@ -41,20 +41,22 @@ class AsideBatch:
         xp, speed = self._xp, self._speed
         if speed is None:
             return
-        speeds = lanes.proposal[speed], found.z[self._search.known + speed]
-        maybe, surely = (asks & found.adjusted & is_blocked(self._robot, *speeds, near) for near in (NEARLY, -NEARLY))
-        found.adjusted &= surely | ~maybe
+        speeds = lanes.proposal[speed], candidates.z[self._search.known + speed]
+        maybe, surely = (
+            asks & candidates.adjusted & is_blocked(self._robot, *speeds, near) for near in (NEARLY, -NEARLY)
+        )
+        candidates.adjusted &= surely | ~maybe
         blocked = xp.nonzero(surely)[0]
         if not blocked.shape[0]:
             return
         part = taken(xp, lanes, blocked)
         turn, unsure = self._free_turn(part)
-        found.adjusted[blocked[unsure]] = False
+        candidates.adjusted[blocked[unsure]] = False
         aside = xp.nonzero((turn != 0.0) & xp.isfinite(turn) & ~unsure)[0]
         if aside.shape[0]:
-            self._search_aside(taken(xp, part, aside), xp.take(turn, aside, axis=0), blocked[aside], found)
+            self._search_aside(taken(xp, part, aside), xp.take(turn, aside, axis=0), blocked[aside], candidates)
 
-    def _search_aside(self, lanes: LaneBatch, turn: Array, to: Array, found: CandidateBatch) -> None:
+    def _search_aside(self, lanes: LaneBatch, turn: Array, to: Array, candidates: CandidateBatch) -> None:
         """Search near the proposed speed with these turns (B,) [rad]; write the results to the lanes `to`."""
         xp, search = self._xp, self._search
         wanted = xp.where(self._translates, lanes.proposal, turn[None] / self._period)
@@ -68,11 +70,11 @@ class AsideBatch:
             z[:, rest], margin[rest] = part.z, part.margin
             verified[rest] = part.allowed | part.adjusted
             undecided[rest] = ~(part.allowed | part.adjusted | part.hopeless)
-            found.steps[to[rest]] = found.steps[to[rest]] + part.steps
-        found.adjusted[to[undecided]] = False
+            candidates.steps[to[rest]] = candidates.steps[to[rest]] + part.steps
+        candidates.adjusted[to[undecided]] = False
         here = to[verified]
-        found.z[:, here], found.margin[here] = z[:, verified], margin[verified]
-        found.turned[here] = xp.astype(xp.where(turn > 0.0, 1, -1), xp.int64)[verified]
+        candidates.z[:, here], candidates.margin[here] = z[:, verified], margin[verified]
+        candidates.turned[here] = xp.astype(xp.where(turn > 0.0, 1, -1), xp.int64)[verified]
 
     def _free_turn(self, lanes: LaneBatch) -> tuple[Array, Array]:
         """Return the smallest turns (B,) [rad] to directions in which robots can drive on; and unsure lanes (B,)."""

@@ -71,7 +71,7 @@ class RolloutBatch:
         C, scale, saturations, terms, others, heading, arms, d, inputs = one_step.arguments(robot)
         self._xp, self._heading, self._d, self._inputs, self._n = xp, heading, d, inputs, len(C)
         self._others, self._arms, self._weight = others.tolist(), arms.tolist(), one_step.weight
-        self._kept = [*range(d), *tube.kept]
+        self._written = [*range(d), *tube.further]
         self._C, self._scale, self._root = constant(C), constant(scale[:, None]), constant(one_step.root)
         self._terms = [constant(slot) for slot in terms.T]
         self._bent = [(int(a), int(b), float(width)) for a, b, width in saturations]
@@ -86,7 +86,7 @@ class RolloutBatch:
         """Roll out the plans with regressors z (nz, B)."""
         rows, stretch = self.windows(self._T @ z)
         xp = self._xp
-        outputs = xp.stack([xp.stack([row[i] for i in self._kept]) for row in rows])
+        outputs = xp.stack([xp.stack([row[i] for i in self._written]) for row in rows])
         return PathBatch(outputs, stretch, xp.stack(rows[0][: self._n]))
 
     def windows(self, window: Array) -> tuple[list[list[Array]], Array]:
@@ -145,7 +145,7 @@ class RolloutBatch:
         ds = xp.broadcast_to(T[:r], (r, free, B))
         dangle, angle = xp.zeros((free, B), dtype=z.dtype, device=z.device), xp.zeros_like(z[0])
         dplace = [xp.zeros_like(dangle) for _ in range(d)]
-        found = []
+        gradients = []
         for k, _, (primitives, p), y, row in self._periods(self._T @ z):
             now = r + (k + 1) * m
             inputs = xp.concat([T[now : now + m], T[now - m : now]])
@@ -173,9 +173,9 @@ class RolloutBatch:
                 for arm in self._arms:
                     east, north = cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]
                     drow += [dplace[0] - north * dangle, dplace[1] + east * dangle, *dplace[2:]]
-            found.append(xp.stack([drow[i] for i in self._kept]))
+            gradients.append(xp.stack([drow[i] for i in self._written]))
             ds = xp.stack([dy[i] for i in self._others])
-        return xp.stack(found)
+        return xp.stack(gradients)
 
     def _partials(self, primitives: Array, p: list[Array]) -> Array:
         """Return the derivatives (n, V, B) of the outputs y by the variables."""

@@ -73,15 +73,15 @@ class ConstraintBatch:
         return PlanBatch(z, path, sizes, planes, self.slack(planes, path, sizes), self.extent(scene, path, sizes))
 
     def _planes(self, scene: SceneBatch, path: PathBatch) -> list[PlaneBatch]:
-        found = []
+        planes = []
         for at, radius, measured, first, _ in self.discs:
             centers = [path.outputs[:, first + i] for i in range(self.d)]
             nominal = scene.turn.to_world(centers)
             start = scene.start
             if at is not None:
                 start = [a + b for a, b in zip(start, scene.turn.to_world(at), strict=True)]
-            found.append(planes_beside(self._xp, scene.near, start, nominal, scene.turn, radius, measured))
-        return found
+            planes.append(planes_beside(self._xp, scene.near, start, nominal, scene.turn, radius, measured))
+        return planes
 
     def slack(self, planes: list[PlaneBatch], path: PathBatch, sizes: Array) -> Array:
         """Return the slack (R, B) of the half-spaces for the tubes, R = ends · obstacles · discs."""
@@ -140,8 +140,8 @@ class ConstraintBatch:
             zip(self.discs, plan.planes, strict=True)
         ):
             own = [one(part) for part in planes.normals]
-            kept = xp.maximum(radius + margin, xp.zeros_like(margin))
-            level = one(planes.offsets) + kept + sum(abs(own[i]) * measured[i] for i in range(self.d))
+            distance = xp.maximum(radius + margin, xp.zeros_like(margin))
+            level = one(planes.offsets) + distance + sum(abs(own[i]) * measured[i] for i in range(self.d))
             path = xp.concat([xp.zeros_like(plan.path.outputs[:1]), plan.path.outputs])
             moved = [xp.take_along_axis(path[:, first + i], when[None], axis=0)[0] for i in range(self.d)]
             there = scene.turn.to_world(moved)

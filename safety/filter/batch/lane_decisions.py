@@ -225,10 +225,10 @@ class LaneDecisions:
         """Decide lanes whose proposals are not allowed at once; return the indices of those that are decided."""
         xp, c = self._xp, self._constraints
         proposed = self._search.propose(lanes)
-        found = self._search.adjust(lanes, proposed)
-        goes_on = found.hopeless & self._goes_on(requests, rows)
-        self._aside.turn(lanes, found, self._asks_to_turn(requests, rows))
-        done = xp.nonzero(found.allowed | found.adjusted | goes_on)[0]
+        candidates = self._search.adjust(lanes, proposed)
+        goes_on = candidates.hopeless & self._goes_on(requests, rows)
+        self._aside.turn(lanes, candidates, self._asks_to_turn(requests, rows))
+        done = xp.nonzero(candidates.allowed | candidates.adjusted | goes_on)[0]
         if not done.shape[0]:
             return done
         to, scene = xp.take(rows, done, axis=0), taken(xp, lanes.scene, done)
@@ -236,18 +236,18 @@ class LaneDecisions:
         answers["proposal_margin"][to] = margin
         for name, value in self._blocking(taken(xp, proposed.plan, done), scene, margin).items():
             getattr(answers["blocked"], name)[to] = value
-        z = xp.where(goes_on, xp.concat([lanes.z_0, lanes.committed]), found.z)
+        z = xp.where(goes_on, xp.concat([lanes.z_0, lanes.committed]), candidates.z)
         plan = c.around(scene, xp.take(z, done, axis=-1))
-        least, own = c.least(scene, plan.slack, plan.extent), xp.take(found.margin, done, axis=0)
+        least, own = c.least(scene, plan.slack, plan.extent), xp.take(candidates.margin, done, axis=0)
         margin = xp.where(xp.take(goes_on, done, axis=0), least, own)
         self._write(self._general, requests, scene, plan, margin, to, answers)
-        kept = xp.take(rows, xp.nonzero(goes_on)[0], axis=0)
-        answers["plan"][kept] = xp.take(requests.plan, kept, axis=0)
-        kind = xp.where(goes_on, KINDS.index(FAILSAFE), xp.where(found.adjusted, KINDS.index(ADJUSTED), 0))
+        braking = xp.take(rows, xp.nonzero(goes_on)[0], axis=0)
+        answers["plan"][braking] = xp.take(requests.plan, braking, axis=0)
+        kind = xp.where(goes_on, KINDS.index(FAILSAFE), xp.where(candidates.adjusted, KINDS.index(ADJUSTED), 0))
         answers["kind"][to] = xp.astype(xp.take(kind, done, axis=0), xp.int64)
-        answers["for_clearance"][to] = xp.take(found.for_clearance & ~goes_on, done, axis=0)
-        answers["turned"][to] = xp.take(found.turned, done, axis=0)
-        answers["steps"][to] = xp.astype(xp.take(found.steps, done, axis=0), xp.int64)
+        answers["for_clearance"][to] = xp.take(candidates.for_clearance & ~goes_on, done, axis=0)
+        answers["turned"][to] = xp.take(candidates.turned, done, axis=0)
+        answers["steps"][to] = xp.astype(xp.take(candidates.steps, done, axis=0), xp.int64)
         return done
 
     def _asks_to_turn(self, requests: RequestArrays, rows: Array) -> Array:

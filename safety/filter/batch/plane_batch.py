@@ -67,8 +67,8 @@ def planes_beside(
     ]
     _stay_in_force(xp, chosen, parts, blocked)
     *normals, offsets = chosen
-    kept = xp.maximum(keep_off + near.margin, xp.zeros_like(near.margin))
-    offsets = offsets - kept - sum(abs(normals[i]) * measured[i] for i in range(d))
+    distance = xp.maximum(keep_off + near.margin, xp.zeros_like(near.margin))
+    offsets = offsets - distance - sum(abs(normals[i]) * measured[i] for i in range(d))
     normals = [xp.where(near.used, part, 0.0) for part in normals]
     offsets = xp.where(near.used, offsets, UNUSED)
     return PlaneBatch(normals, turn.to_robot(normals), offsets)
@@ -117,11 +117,11 @@ class EndBatch:
     def alongs(self, normals: Axes, stretch: Array) -> list[Array]:
         """Return |a · generator| (E, K, B) for each column of generators. normals: at the ends, robot's frame."""
         factor = self._xp.take(stretch, self.after, axis=0)[:, None]
-        found = []
+        spreads = []
         for directions in self.directions:
             along = sum(normals[i] * directions[i] for i in range(len(normals)))
-            found.append(abs(along) * factor)
-        return found
+            spreads.append(abs(along) * factor)
+        return spreads
 
     def slack(self, planes: PlaneBatch, positions: Axes, stretch: Array, sizes: Array) -> Array:
         """Return the slack (E, K, B) of the half-spaces.

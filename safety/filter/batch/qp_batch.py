@@ -137,9 +137,9 @@ class QPBatch:
         atom = offset + self._W_f[:, : self._m] @ proposal
         index = xp.arange(self._atoms, device=b.device)[:, None]
         solution: BatchSolution = solve_batch(xp, self._h, g, A, b, xp.where(atom > 0.0, index, index + self._atoms))
-        found = solution.solved & ~ruled_out & ~unsure
+        solved = solution.solved & ~ruled_out & ~unsure
         impossible = ruled_out | (solution.infeasible & ~unsure)
-        return solution.x[: self.free] * self._scale[: self.free], found, impossible, solution.steps
+        return solution.x[: self.free] * self._scale[: self.free], solved, impossible, solution.steps
 
     def _matter(self, rows: RowBatch, bound: Array, matter: Array) -> tuple[Array, Array]:
         """Return the rows that some input violates, as A (r, n, B) and b (r, B) in scaled unknowns, of unit length.
@@ -151,9 +151,9 @@ class QPBatch:
         order = xp.argsort(xp.astype(~matter, xp.int8), axis=0, stable=True)[:count]
         parts = [rows.gradient[j] for j in range(self.free)] + [rows.spread[t] for t in range(self._atoms)]
         scaled = [xp.take_along_axis(part, order, axis=0) * self._scale[j] for j, part in enumerate(parts)]
-        kept = xp.take_along_axis(matter, order, axis=0)
+        used = xp.take_along_axis(matter, order, axis=0)
         square = sum(part * part for part in scaled)
         length = xp.maximum(xp.sqrt(square), xp.full_like(square, ROW_TIGHTENING))
-        A = xp.where(kept[:, None], xp.stack(scaled, axis=1) / length[:, None], 0.0)
-        b = xp.where(kept, xp.take_along_axis(bound, order, axis=0) / length, 1.0)
+        A = xp.where(used[:, None], xp.stack(scaled, axis=1) / length[:, None], 0.0)
+        b = xp.where(used, xp.take_along_axis(bound, order, axis=0) / length, 1.0)
         return A, b

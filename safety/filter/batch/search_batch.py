@@ -113,8 +113,8 @@ class SearchBatch:
         plan = self.constraints.around(scene, self.regressors(lanes.z_0, lanes.proposal))
         margin = least(scene, plan.slack, plan.extent)
         empty = scene.near.none(xp, margin)
-        kept = least(scene, plan.slack - self._clearance, plan.extent, self._clearance)
-        room = xp.maximum(margin - max(self._clearance, 0.0), kept)
+        with_clearance = least(scene, plan.slack - self._clearance, plan.extent, self._clearance)
+        room = xp.maximum(margin - max(self._clearance, 0.0), with_clearance)
         allowed = (empty & ~scene.far) | (room >= ROUNDING)
         return ProposalBatch(plan, margin, allowed, ~allowed & ((room > -ROUNDING) | (xp.abs(margin) < ROUNDING)))
 
@@ -125,28 +125,28 @@ class SearchBatch:
         z, margin = (xp.asarray(part, copy=True) for part in (proposed.plan.z, proposed.margin))
         allowed, adjusted, hopeless, for_clearance = (xp.zeros_like(verified) for _ in range(4))
         counts = xp.zeros_like(margin), xp.zeros_like(margin, dtype=xp.int64)
-        found = CandidateBatch(z, margin, allowed, adjusted, hopeless, for_clearance, *counts)
-        open_ = self._neither_nearer(lanes, proposed.plan, stay, xp.nonzero(verified)[0], found)
+        candidates = CandidateBatch(z, margin, allowed, adjusted, hopeless, for_clearance, *counts)
+        open_ = self._neither_nearer(lanes, proposed.plan, stay, xp.nonzero(verified)[0], candidates)
         for with_clearance in (True, False):
             if not with_clearance:  # a verified proposal that no input betters
                 settled = xp.take(verified, open_, axis=0)
-                found.allowed[open_[settled]] = True
+                candidates.allowed[open_[settled]] = True
                 open_ = open_[~settled]
             for number in range(1 if self.constraints.tube.linear else 3):
                 if open_.shape[0] < (1 if number == 0 and with_clearance else FEW):
-                    return found
+                    return candidates
                 part, own = taken(xp, lanes, open_), xp.take(stay, open_, axis=-1)
                 start = self._starting_point(number, part, taken(xp, proposed.plan, open_))
                 z, least, solved, unsure, steps = self._solve(part, start, own, with_clearance)
-                found.steps[open_] = found.steps[open_] + steps
+                candidates.steps[open_] = candidates.steps[open_] + steps
                 to = open_[solved]
-                found.z[:, to], found.margin[to] = z[:, solved], least[solved]
+                candidates.z[:, to], candidates.margin[to] = z[:, solved], least[solved]
                 changed = self._changed(part, z)[solved]
-                found.adjusted[to], found.allowed[to] = changed, ~changed
-                found.for_clearance[to] = xp.take(verified, to, axis=0) & changed
+                candidates.adjusted[to], candidates.allowed[to] = changed, ~changed
+                candidates.for_clearance[to] = xp.take(verified, to, axis=0) & changed
                 open_ = open_[~solved & ~unsure]
-        found.hopeless[open_] = True
-        return found
+        candidates.hopeless[open_] = True
+        return candidates
 
     def _changed(self, lanes: LaneBatch, z: Array) -> Array:
         """Return which plans (B,) begin with another input than the proposal: with one chosen input, all do."""
@@ -156,16 +156,16 @@ class SearchBatch:
         return xp.any(first != lanes.proposal, axis=0)
 
     def _neither_nearer(
-        self, lanes: LaneBatch, plan: PlanBatch, stay: Array, verified: Array, found: CandidateBatch
+        self, lanes: LaneBatch, plan: PlanBatch, stay: Array, verified: Array, candidates: CandidateBatch
     ) -> Array:
         """Allow verified proposals that come no nearer where the clearance margin is lost; return the lanes left."""
-        xp, open_ = self._xp, self._xp.ones_like(found.allowed)
+        xp, open_ = self._xp, self._xp.ones_like(candidates.allowed)
         if verified.shape[0]:
             part, own = taken(xp, lanes, verified), taken(xp, plan, verified)
             rows = self._qp.rows(part.scene, own, part.z_0)
             tight, inside, unsure = self._tightened(part, own, rows, xp.take(stay, verified, axis=-1))
             keeps = self._keeps(part, own, tight, inside)
-            found.allowed[verified[(keeps >= ROUNDING) & ~unsure]] = True
+            candidates.allowed[verified[(keeps >= ROUNDING) & ~unsure]] = True
             open_[verified[unsure | (keeps > -ROUNDING)]] = False
         return xp.nonzero(open_)[0]
 

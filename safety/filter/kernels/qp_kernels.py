@@ -95,7 +95,7 @@ def reachable(low: Array, high: Array, change: Array, before: Array) -> tuple[Ar
 @compiled("f8[:,::1](f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1])")
 def atom_range(W_known: Array, W_f: Array, z_0: Array, center: Array, radius: Array) -> Array:
     """Return the least and the largest |W z| (2, q) over all free inputs within `radius` of `center` (F·m,)."""
-    found = np.empty((2, len(W_f)))
+    ranges = np.empty((2, len(W_f)))
     for i in range(len(W_f)):
         atom, deviation = 0.0, 0.0
         for j in range(len(z_0)):
@@ -103,8 +103,8 @@ def atom_range(W_known: Array, W_f: Array, z_0: Array, center: Array, radius: Ar
         for j in range(len(center)):
             atom += W_f[i, j] * center[j]
             deviation += abs(W_f[i, j]) * radius[j]
-        found[0, i], found[1, i] = max(abs(atom) - deviation, 0.0), abs(atom) + deviation
-    return found
+        ranges[0, i], ranges[1, i] = max(abs(atom) - deviation, 0.0), abs(atom) + deviation
+    return ranges
 
 
 @compiled(

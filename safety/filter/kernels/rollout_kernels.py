@@ -148,19 +148,19 @@ def rollout(predictor: Predictor, z: Array) -> Array:
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r = len(C), len(others)
     N = (len(z) - r) // inputs - 1
-    found, v, y = np.zeros((N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
+    outputs, v, y = np.zeros((N, n + len(arms) * d)), np.empty(r + 2 * inputs), np.empty(n)
     p, total = np.empty(1 + len(v) + len(saturations)), np.zeros(len(terms))
-    pose, flat = np.zeros(1 + d), np.empty((found.shape[1], 0))  # no gradient
+    pose, flat = np.zeros(1 + d), np.empty((outputs.shape[1], 0))  # no gradient
     v[:r] = z[:r]
     for k in range(N):
         now = r + (k + 1) * inputs
         v[r : r + inputs], v[r + inputs :] = z[now : now + inputs], z[now - inputs : now]
         _predict(C, scale, saturations, terms, v, p, total, y)
         _move(y, flat[:n], pose, flat[: 1 + d], heading)
-        _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, found[k], flat)
+        _write(y, flat[:n], pose, flat[: 1 + d], others, heading, arms, outputs[k], flat)
         for i in range(r):
             v[i] = y[others[i]]
-    return found
+    return outputs
 
 
 @compiled(f"f8[::1]({PREDICTOR}, f8[:,::1], f8, f8[::1])")
@@ -172,7 +172,7 @@ def stretch(predictor: Predictor, root: Array, weight: float, z: Array) -> Array
     C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, F = len(others), len(terms)
     N = (len(z) - r) // inputs - 1
-    found, v, y = np.empty(N), np.empty(r + 2 * inputs), np.empty(len(C))
+    factors, v, y = np.empty(N), np.empty(r + 2 * inputs), np.empty(len(C))
     p, total, along = np.empty(1 + len(v) + len(saturations)), np.zeros(F), np.empty(F)
     across = root.T.copy()  # so that the inner loop runs along memory, and is vectorized
     v[:r] = z[:r]
@@ -187,10 +187,10 @@ def stretch(predictor: Predictor, root: Array, weight: float, z: Array) -> Array
                 sums[i] += column[i] * total[j]
         for i in range(F):
             square += along[i] * along[i]
-        found[k] = math.sqrt(1.0 + weight * (square / (k + 1)))
+        factors[k] = math.sqrt(1.0 + weight * (square / (k + 1)))
         for i in range(r):
             v[i] = y[others[i]]
-    return found
+    return factors
 
 
 @compiled(f"Tuple((f8[:,::1], f8[:,:,::1]))({PREDICTOR}, f8[::1], f8[:,::1])")
@@ -225,19 +225,19 @@ def linearized(predictor: Predictor, z: Array, T: Array) -> tuple[Array, Array]:
 
 
 @compiled(f"Tuple((f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]))({PREDICTOR}, f8[::1], f8[:,::1], i8[::1])")
-def affine(predictor: Predictor, z: Array, T: Array, kept: Index) -> tuple[Array, Array, Array, Array]:
-    """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `kept` (k,).
+def affine(predictor: Predictor, z: Array, T: Array, further: Index) -> tuple[Array, Array, Array, Array]:
+    """Return the rollout as affine maps of z that are exact at z, for the positions and the coordinates `further` (k,).
 
     Returns:
-        Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the kept coordinates.
+        Gradient (N, d, nz) and offset (N, d) of the positions, and the same of the further coordinates.
     """
     outputs, gradient = linearized(predictor, z, T)
-    N, nz, k, d = len(outputs), len(z), len(kept), predictor[7]
+    N, nz, k, d = len(outputs), len(z), len(further), predictor[7]
     position, offset = np.empty((N, d, nz)), np.empty((N, d))
     more, more_offset = np.empty((N, k, nz)), np.empty((N, k))
     for i in range(N):
         for axis in range(d + k):
-            at = axis if axis < d else kept[axis - d]
+            at = axis if axis < d else further[axis - d]
             rest = outputs[i, at]
             for j in range(nz):
                 rest -= gradient[i, at, j] * z[j]
@@ -258,17 +258,18 @@ def sets_around(
     root: Array,
     weight: float,
     T: Array,
-    kept: Index,
+    further: Index,
     directions: Array,
     more_directions: Array,
     z: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return the rollout from z, and the generators of the sets around it.
 
-    directions (N, d, L), more_directions (N, k, L): without the factors, for the positions and the coordinates `kept`.
+    directions (N, d, L), more_directions (N, k, L): without the factors, for the positions and the coordinates
+    `further`.
 
     Returns:
-        Positions (N, d) and their generators (N, d, L), the same of the kept coordinates, all coordinates after one
+        Positions (N, d) and their generators (N, d, L), the same of the further coordinates, all coordinates after one
         period (n,), and the factors (N,) that the generators hold.
     """
     window = np.zeros(len(T))
@@ -276,7 +277,7 @@ def sets_around(
         for j in range(len(z)):
             window[i] += T[i, j] * z[j]
     outputs, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
-    (N, d, _), k = directions.shape, len(kept)
+    (N, d, _), k = directions.shape, len(further)
     centers, wide, more, more_wide = (
         np.empty((N, d)),
         np.empty_like(directions),
@@ -287,6 +288,6 @@ def sets_around(
         for axis in range(d):
             centers[i, axis], wide[i, axis] = outputs[i, axis], wider[i] * directions[i, axis]
         for axis in range(k):
-            more[i, axis] = outputs[i, kept[axis]]
+            more[i, axis] = outputs[i, further[axis]]
         more_wide[i] *= wider[i]
     return centers, wide, more, more_wide, outputs[0, : len(predictor[0])].copy(), wider

@@ -166,8 +166,8 @@ def planes_beside(
     normals, offsets = np.empty((n, N, d)), np.empty((n, N))
     for i in range(n):
         for k in range(N):
-            q, kept = choice[i, k], keep_off + margin[i]
-            normals[i, k], offsets[i, k] = unit[i, q], level[i, q] - (0.0 if kept < 0.0 else kept)
+            q, distance = choice[i, k], keep_off + margin[i]
+            normals[i, k], offsets[i, k] = unit[i, q], level[i, q] - (0.0 if distance < 0.0 else distance)
             for axis in range(d):
                 offsets[i, k] -= abs(unit[i, q, axis]) * measured[axis]
     return normals, offsets

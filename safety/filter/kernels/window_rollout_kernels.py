@@ -60,8 +60,8 @@ def rollouts(predictor: Predictor, z: Array) -> Array:
     C, scale, saturations, terms, others, heading, arms, d, inputs = predictor
     n, r, P = len(C), len(others), len(others) + 2 * inputs + len(saturations)
     N = (z.shape[1] - r) // inputs - 1
-    found, one = np.zeros((len(z), N, n + len(arms) * d)), np.empty(n)
-    flat = np.empty((found.shape[2], 0))  # no gradient
+    outputs, one = np.zeros((len(z), N, n + len(arms) * d)), np.empty(n)
+    flat = np.empty((outputs.shape[2], 0))  # no gradient
     for begin in range(0, len(z), BLOCK):
         window = z[begin : begin + BLOCK]
         B = len(window)
@@ -75,10 +75,10 @@ def rollouts(predictor: Predictor, z: Array) -> Array:
             for t in range(B):
                 one[:] = y[:, t]
                 _move(one, flat[:n], pose[t], flat[: 1 + d], heading)
-                _write(one, flat[:n], pose[t], flat[: 1 + d], others, heading, arms, found[begin + t, k], flat)
+                _write(one, flat[:n], pose[t], flat[: 1 + d], others, heading, arms, outputs[begin + t, k], flat)
             for i in range(r):
                 v[i] = y[others[i]]
-    return found
+    return outputs
 
 
 @compiled(f"f8[:,::1]({PREDICTOR}, f8[:,::1], f8, f8[:,::1])")
@@ -87,7 +87,7 @@ def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Arr
     C, scale, saturations, terms, others, _, _, _, inputs = predictor
     r, P = len(others), len(others) + 2 * inputs + len(saturations)
     N = (z.shape[1] - r) // inputs - 1
-    found = np.empty((len(z), N))
+    factors = np.empty((len(z), N))
     for begin in range(0, len(z), BLOCK):
         window = z[begin : begin + BLOCK]
         B = len(window)
@@ -103,7 +103,7 @@ def stretches(predictor: Predictor, root: Array, weight: float, z: Array) -> Arr
                 square = 0.0
                 for i in range(len(along)):
                     square += along[i, t] * along[i, t]
-                found[begin + t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
+                factors[begin + t, k] = math.sqrt(1.0 + weight * (square / (k + 1)))
             for i in range(r):
                 v[i] = y[others[i]]
-    return found
+    return factors

@@ -113,8 +113,8 @@ def _drop_beyond(capsules: Single, normal: Normal, level: np.float32, margin: np
 
 
 @compiled("i8(f4[:,::1], f4[:,::1], f4[::1], i8[::1])")
-def _compact(capsules: Single, kept: Single, gaps: Single, index: NDArray[np.int64]) -> int:
-    """Move the capsules with a finite gap to the front of `kept` and their gaps to the front of gaps, if they are few.
+def _compact(capsules: Single, remaining: Single, gaps: Single, index: NDArray[np.int64]) -> int:
+    """Move the capsules with a finite gap to the front of `remaining` and their gaps to the front of `gaps`, if few.
 
     Returns how many are left. If all stay where they are, it is the number of gaps. index: (n,) work space.
     """
@@ -128,7 +128,7 @@ def _compact(capsules: Single, kept: Single, gaps: Single, index: NDArray[np.int
         index[left] = s
         left += gaps[s] != np.inf
     for row in range(SUPPORT_ROWS):
-        values, out = capsules[row], kept[row]
+        values, out = capsules[row], remaining[row]
         for k in range(left):
             out[k] = values[index[k]]
     for k in range(left):
@@ -157,7 +157,7 @@ def _separate(
     """
     keep_off, give, rounded = search
     normals, levels = planes
-    kept, index = work
+    remaining, index = work
     margin, most, rest = np.float32(rounded), len(levels), capsules
     for k in range(most):
         nearest = first_minimum(gaps.view(np.int32))
@@ -169,9 +169,9 @@ def _separate(
         single = np.float32(normal[0]), np.float32(normal[1]), np.float32(normal[2])
         _drop_beyond(rest, single, np.float32(level), margin, gaps)
         gaps[nearest] = np.inf
-        left = _compact(rest, kept, gaps, index)
+        left = _compact(rest, remaining, gaps, index)
         if left < len(gaps):
-            gaps, rest = gaps[:left], kept
+            gaps, rest = gaps[:left], remaining
         if left == 0:
             return k + 1
     levels[most - 1] = -np.inf
