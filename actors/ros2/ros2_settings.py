@@ -55,12 +55,13 @@ class SensorSettings:
     range_error: float = 0.02  # m, the largest of the lidar
     zero_is_free: bool = False  # the lidar reports 0 where nothing is within its range
     least_width: float = 0.02  # m, of all obstacles: where beams have no information, see `unknown_space.py`
+    free_at_start: float = 0.0  # m, radius of a disc about the robot that is free at the start; 0: nothing is known
     mount: PlanarPose | None = None  # the lidar's pose on the robot; None: the transforms contain it
     odometry_frame: str = "odom"  # the frame of the state
     base_frame: str = ""  # the robot's frame in the transforms, which then replace the odometry; empty: they do not
 
     def __post_init__(self) -> None:
-        check_numbers(self, "range_error", least=0.0)
+        check_numbers(self, "range_error", "free_at_start", least=0.0)
         check_numbers(self, "least_width", above=0.0)
         if self.mount is not None:
             check_numbers(self.mount, "x", "y", "yaw", "tilt")

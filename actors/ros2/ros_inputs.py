@@ -40,7 +40,7 @@ class RosInputs:
         self.robot, self.settings, self.limits = robot, settings, limits
         self.frame = settings.odometry_frame  # of the state
         self._errors = HitErrors.of(robot, settings.range_error)
-        self._unknown = UnknownSpace(robot, self._errors, settings.least_width)
+        self._unknown = UnknownSpace(robot, self._errors, settings.least_width, settings.free_at_start)
         self._lock = threading.Lock()
         self._odometry, self._transforms = self._no_odometry(), TransformTree()
         self._bad_odometry = ""

@@ -72,6 +72,10 @@ class Ros2Command:
     least_width: float = SensorSettings.least_width
     """Assume that no obstacle is narrower than this where beams have no information [m]. With a larger value, the
     robot drives on with more of such beams."""
+    free_at_start: float = 0.0
+    """State that the space within this distance of the origin of the robot's frame is free when the node starts, and
+    that nothing comes into the space that the lidar does not see [m]. A robot whose lidar does not see all round needs
+    this to drive. 0 states nothing."""
     tf: bool = False
     """Take the pose of the robot from /tf instead of odometry messages."""
     odometry_frame: str = SensorSettings.odometry_frame

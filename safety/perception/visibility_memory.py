@@ -207,8 +207,12 @@ class FanMemory(VisibilityMemory[Scan]):
             moved = math.dist(last[:2], scan.pose[:2]) + 0.25 * abs(math.remainder(scan.pose[2] - last[2], math.tau))
             if moved < SPACING:
                 return
-        self._stored.append(_StoredScan(scan, *scan.sensor(), _range_minima(minimum_by_sector(*gaps(scan), SECTORS))))
+        self._stored.append(self._as_stored(scan))
         self._ages = [*self._ages, scan.age][-CAPACITY:]
+
+    @staticmethod
+    def _as_stored(scan: Scan) -> _StoredScan:
+        return _StoredScan(scan, *scan.sensor(), _range_minima(minimum_by_sector(*gaps(scan), SECTORS)))
 
     def _free_along(self, scan: Scan, beams: NDArray[np.bool_]) -> Array:
         at, heading = scan.sensor()
@@ -220,11 +224,14 @@ class FanMemory(VisibilityMemory[Scan]):
             free |= self._shown_free(stored, age, points, scan)
         return STEP * np.where(free.all(axis=0), len(away), free.argmin(axis=0))
 
-    def _shown_free(self, stored: _StoredScan, age: float, points: Array, scan: Scan) -> NDArray[np.bool_]:
-        """Return which points a stored scan shows to be free, with everything within the errors around them."""
+    @staticmethod
+    def _shown_free(
+        stored: _StoredScan, age: float, points: Array, scan: Scan, spacing: float = STEP
+    ) -> NDArray[np.bool_]:
+        """Return which points a stored scan shows to be free, with all within the errors and `spacing` around."""
         away = points - stored.at
         far = np.sqrt(np.einsum("sbd,sbd->sb", away, away))
-        drift = stored.scan.sensor_error + scan.position_error + scan.speed * age + STEP
+        drift = stored.scan.sensor_error + scan.position_error + scan.speed * age + spacing
         reach = np.linalg.norm(points - _position(scan), axis=-1)
         drift = drift + stored.scan.heading_error * far + scan.heading_error * reach
         aside = np.arcsin(np.minimum(drift / np.maximum(far, 1e-9), 1.0))

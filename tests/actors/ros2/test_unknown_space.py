@@ -10,7 +10,7 @@ from brakeline.actors.ros2.laser_beams import read
 from brakeline.actors.ros2.laser_obstacles import HitErrors, obstacles
 from brakeline.actors.ros2.sensor_frames import PlanarPose
 from brakeline.actors.ros2.unknown_space import UnknownSpace
-from brakeline.errors import BadScan
+from brakeline.errors import BadScan, Mismatch
 from brakeline.messaging.obstacle import CYLINDER, Obstacle, Shapes
 from brakeline.messaging.ros2 import cdr_messages as cdr
 from tests.actors.ros2.test_ros_inputs import BEAMS, scan_of
@@ -105,6 +105,84 @@ def test_scans_with_few_or_many_beams(beams):
     assert 1 <= len(boxes_of(space(width=0.05), free_but(*range(-(-beams // 360)), n=beams))) <= 3
 
 
+FORWARD = math.radians(270.0)
+
+
+def forward_scan(at, ranges=math.inf):
+    """Return a scan of 270° in front, with one range for all beams [m]."""
+    step = math.pi / 180.0
+    return scan_of(np.full(270, ranges), header=cdr.header(at, "s"), angle_min=-0.5 * FORWARD, angle_increment=step)
+
+
+def fed(unknown, at, pose, ranges=math.inf):
+    return boxes_of(unknown, forward_scan(at, ranges), np.tile(pose, (270, 1)))
+
+
+def stating(radius=0.5):
+    return UnknownSpace(GROUND, ERRORS, WIDTH, radius)
+
+
+def test_a_robot_that_sees_270_degrees_moves_where_somebody_stated_that_space_is_free_or_where_it_saw_that():
+    """Standing, driving and turning were refused alike, for ever."""
+    with pytest.raises(BadScan, match=r"no information in 90 of 360 directions.*state it \(--free-at-start\)"):
+        fed(space(), 10.0, (0.0, 0.0, 0.0))
+    unknown, pose = stating(), np.zeros(3)
+    for k in range(100):  # 10 s without a motion: two seconds of memory would not do
+        boxes = fed(unknown, 10.0 + 0.2 * k, pose)
+    assert len(boxes) < 40
+    nearest = Shapes.of(boxes, 2).distance(np.zeros((1, 2))).min()
+    assert 0.35 < nearest < 0.5, "behind the robot, space is free up to what was stated, less the errors"
+    for k in range(200):
+        pose = pose + ((0.04, 0.0, 0.0) if k % 60 < 20 else (0.0, 0.0, 0.1 if k % 60 < 40 else -0.1))
+        boxes = fed(unknown, 40.0 + 0.2 * k, pose)
+    assert Shapes.of(boxes, 2).distance(pose[None, :2]).min() > 0.2
+
+
+def test_space_behind_a_robot_that_was_never_seen_or_stated_stays_occupied():
+    unknown = stating(0.3)
+    for k in range(20):
+        boxes = fed(unknown, 10.0 + 0.2 * k, (0.0, 0.0, 0.0))
+    for k in range(1, 4):  # backwards
+        last, boxes = boxes, ()
+        try:
+            boxes = fed(unknown, 14.0 + 0.2 * k, (-0.04 * k, 0.0, 0.0))
+        except BadScan as error:
+            assert "nobody has seen the space there within the last 4.2 m" in str(error)
+            break
+    behind = np.array([[-0.31, 0.0], [-0.4, 0.1], [-0.8, 0.0]])
+    for now in (last, boxes):
+        assert not now or (Shapes.of(now, 2).distance(behind).min(axis=0) == 0.0).all()
+    with pytest.raises(BadScan):
+        fed(unknown, 20.0, (-0.2, 0.0, 0.0))
+
+
+def test_what_was_stated_does_not_count_after_a_jump_of_the_poses():
+    unknown = stating()
+    fed(unknown, 10.0, (0.0, 0.0, 0.0))
+    unknown.reset()
+    with pytest.raises(
+        BadScan, match=r"the poses jumped, so what was free before no longer counts.*start the node again"
+    ):
+        fed(unknown, 10.2, (0.0, 0.0, 0.0))
+
+
+def test_a_disc_that_is_hardly_larger_than_the_body_is_refused():
+    with pytest.raises(Mismatch, match=r"a free disc of 0\.1 m .* the body reaches 0\.105 m: give 0\.18 m or more"):
+        stating(0.1)
+    fed(stating(0.2), 10.0, (0.0, 0.0, 0.0))
+
+
+def test_directions_behind_a_mast_are_blind_but_those_in_which_something_was_seen_are_not():
+    """Something dark may have been put in sight of a robot that stands, but not behind its mast."""
+    mast = range(170, 200)
+    unknown = stating()
+    for k in range(30):
+        assert boxes_of(unknown, replace(free_but(*mast), header=cdr.header(10.0 + 0.2 * k, "s")))
+    with pytest.raises(BadScan, match="no information in 50 of 360 directions"):
+        for k in range(30, 60):
+            boxes_of(unknown, replace(free_but(*range(20), *mast), header=cdr.header(10.0 + 0.2 * k, "s")))
+
+
 def turned_by(rate):
     """Return the poses of the beams of a robot that turns on the spot [rad/s]."""
     poses = np.zeros((BEAMS, 3))
@@ -132,19 +210,21 @@ def test_a_turn_against_the_turn_of_the_lidar_leaves_a_gap_between_its_last_beam
     assert Shapes.of(boxes, 2).distance(np.array([post.position])).min() == 0.0
 
 
-def test_all_that_beams_without_information_may_have_missed_is_in_an_obstacle():
+@pytest.mark.parametrize("degrees", [360.0, 270.0, 180.0])
+def test_all_that_beams_without_information_may_have_missed_is_in_an_obstacle(degrees):
     """Drive among thin posts, half of them black: a beam that hits one of those, and some others, return nothing.
 
-    All errors are the largest. The judge casts ten times as many beams, all of which return.
+    All errors are the largest. The judge casts ten times as many beams, all of which return. A robot whose lidar sees
+    less than a turn knows at the start that the disc up to the nearest post is free, and drives backwards too.
     """
     rng, scans, covered = np.random.default_rng(3), 0, 0
-    for _ in range(8):
-        accepted, points = drive_among_posts(rng)
+    for _ in range(8 if degrees == 360.0 else 4):
+        accepted, points = drive_among_posts(rng, degrees, 6 if degrees == 360.0 else 8)
         scans, covered = scans + accepted, covered + points
-    assert scans > 20 and covered > 100
+    assert scans > (20 if degrees == 360.0 else 10) and covered > 100, (scans, covered)
 
 
-def drive_among_posts(rng, periods=6):
+def drive_among_posts(rng, degrees, periods):
     """Return how many scans were accepted, and how many true hits in unknown directions their obstacles contain."""
     angles = 2.0 * math.pi * np.arange(BEAMS) / BEAMS
     radius = rng.uniform(0.0145, 0.06, 14)
@@ -153,10 +233,14 @@ def drive_among_posts(rng, periods=6):
         Obstacle(CYLINDER, (d * math.cos(b), d * math.sin(b)), (r,))
         for d, b, r in zip(away, bearing, radius, strict=True)
     ]
-    black, unknown = posts[:7], space()
+    outside = np.abs(np.angle(np.exp(1j * angles))) > math.radians(0.5 * degrees)
+    stated = 0.0 if degrees == 360.0 else float(Shapes.of(posts, 2).distance(np.zeros((1, 2))).min())
+    black, unknown = posts[:7], UnknownSpace(GROUND, ERRORS, WIDTH, stated)
     share, speed, rate = rng.choice([0.0, 0.02, 0.08]), rng.choice([0.0, 0.2]), rng.choice([-0.5, 0.0, 0.5])
     pose, accepted, covered = np.array([0.0, 0.0, rng.uniform(-math.pi, math.pi)]), 0, 0
     for period in range(periods):
+        if stated:
+            speed, rate = rng.choice([-0.2, 0.0, 0.2]), rng.choice([-0.5, 0.0, 0.5])
         time = TURN * np.arange(BEAMS) / BEAMS
         way = speed * time
         places = pose[0] + way * math.cos(pose[2]), pose[1] + way * math.sin(pose[2]), pose[2] + rate * time
@@ -166,11 +250,13 @@ def drive_among_posts(rng, periods=6):
             break
         sensors = poses[:, :2] + MOUNT.x * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
         ways = np.stack([np.cos(poses[:, 2] + angles), np.sin(poses[:, 2] + angles)], axis=1)
-        ranges = np.array([cast(posts, at, way[None], FAR)[0] for at, way in zip(sensors, ways, strict=True)])
-        dark = np.array([cast(black, at, way[None], FAR)[0] for at, way in zip(sensors, ways, strict=True)])
+        ranges, dark = np.full((2, BEAMS), FAR)
+        for i in np.flatnonzero(~outside):
+            ranges[i], dark[i] = (cast(hit, sensors[i], ways[i : i + 1], FAR)[0] for hit in (posts, black))
         ranges = np.where(ranges < FAR, np.maximum(ranges + rng.choice([-1.0, 1.0]) * ERRORS.range, 1e-3), np.inf)
         silent = ((dark < FAR) & (dark <= ranges + 0.021)) | (rng.random(BEAMS) < share)
         silent &= period >= 2  # what the first scans show is in the memory
+        silent |= outside
         ranges[silent] = math.nan
         wrong = poses + rng.choice([-1.0, 1.0], 3) * GROUND.measurement_bound[:3] * [0.7, 0.7, 1.0]
         beams = read(scan_of(ranges, range_min=0.0, header=cdr.header(10.0 + TURN * period, "base_scan")))
@@ -179,6 +265,8 @@ def drive_among_posts(rng, periods=6):
         except BadScan:
             continue
         accepted += 1
+        if stated and period % 4 != 3:
+            continue
         known = beams.known
         hits = obstacles(beams.take(known), wrong[known], MOUNT, GROUND, ERRORS, wrong[-1, :2])
         points = judged(posts, sensors[-1], poses, angles, silent)
@@ -192,8 +280,9 @@ def drive_among_posts(rng, periods=6):
 def judged(posts, sensor, poses, angles, silent):
     """Return the true hits (n, 2) near the sensor, in directions between two silent beams or beside one."""
     fine = 2.0 * math.pi * np.arange(10 * BEAMS) / (10 * BEAMS)
+    beam = np.argmin(np.abs(np.angle(np.exp(1j * (fine[:, None] - (poses[:, 2] + angles)[None])))), axis=1)
+    fine = fine[silent[beam]]
     ways = np.stack([np.cos(fine), np.sin(fine)], axis=1)
     ranges = cast(posts, sensor, ways, FAR)
-    beam = np.argmin(np.abs(np.angle(np.exp(1j * (fine[:, None] - (poses[:, 2] + angles)[None])))), axis=1)
-    chosen = (ranges < NEAR) & silent[beam]
+    chosen = ranges < NEAR
     return sensor + ranges[chosen, None] * ways[chosen]
