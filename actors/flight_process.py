@@ -103,9 +103,14 @@ class RealTimeVehicle:
     The true state is unknown here. The estimate takes its place, also for the rays of a virtual scan.
     """
 
-    def __init__(self, vehicle: VehicleClient, skip: Callable[[], object]) -> None:
-        """skip: called for each period that passed without an observation."""
-        self.vehicle, self._skip = vehicle, skip
+    def __init__(self, vehicle: VehicleClient, skip: Callable[[], object], executes: Callable[[Array], object]) -> None:
+        """Follow a vehicle in flight.
+
+        Args:
+            skip: called for each period that passed without an observation.
+            executes: called with the input in force (3,) [m/s] of each period that was observed.
+        """
+        self.vehicle, self._skip, self._executes = vehicle, skip, executes
         self.current_period: ControlPeriod = vehicle.current_period  # the latest that the environment observed
         self.skipped = 0  # periods that passed without an observation
 
@@ -132,6 +137,7 @@ class RealTimeVehicle:
         for _ in range(self.current_period.number - expected):
             self.skipped += 1
             self._skip()
+        self._executes(self.current_period.input)
         return self.initial_period()
 
     def initial_period(self) -> Period:
@@ -174,7 +180,7 @@ class FlightRunner(ActorRunner):
 
     def take(self, vehicle: VehicleClient) -> None:
         """Fly this vehicle, which hovers, from now on. This does everything once that is slow the first time."""
-        self._vehicle = RealTimeVehicle(vehicle, self.runner.skip)
+        self._vehicle = RealTimeVehicle(vehicle, self.runner.skip, self.runner.backup_plan.executes)
         observation, info = self.runner.env.reset(options={"episode_seed": 0})
         self.proposer.begin(np.random.default_rng(0))
         self.proposer.propose(observation, info)
@@ -182,10 +188,14 @@ class FlightRunner(ActorRunner):
         self._vehicle.catch_up()
 
     def commit(self, outcome: DecisionOutcome) -> DecisionOutcome:
-        """Commit the answer's plan. Return an outcome without an answer if the plan is late, or its state is lost."""
+        """Commit the answer's plan. Return an outcome without an answer if the plan is late, or its state is lost.
+
+        A lost vehicle may not follow its plan, so the plan no longer counts as verified.
+        """
         period, answer = self.vehicle.current_period, outcome.answer
         self._began_lost = bool(period.lost)
         if period.lost:
+            self.runner.backup_plan.distrust()
             result, outcome = "lost", replace(outcome, answer=None, failure=f"Lost: {period.lost}")
         elif outcome.failure == STOP_PRACTICE:
             result = "not needed"

@@ -2,7 +2,8 @@
 
 Each command is a module `deploy/commands/NAME_command.py` with a dataclass `NameCommand`: its fields are the options,
 and its method `run` returns the exit status. `extras` names the optional parts that it needs. The module is imported
-when the command runs, so that `--help` answers at once. It imports what an extra brings in `run`, so that `--help` and
+when the command runs, so that `--help` answers at once. `least` and `above` state by the names of options which numbers
+make sense (`check_numbers`). A command imports what an extra brings in `run`, so that `--help` and
 `completion` need no extra.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 import difflib
 import errno
 import importlib
+import math
 import os
 import signal
 import sys
@@ -232,6 +234,22 @@ def parse(name: str, arguments: list[str]) -> Any:
     )
 
 
+def check_numbers(command: Any) -> None:
+    """Check a command's numbers: seeds from 0 on, and those for which it states `least` or `above`, without NaN.
+
+    Raises:
+        ValueError: a number makes no sense.
+    """
+    for name, least in {"seed": 0, **getattr(command, "least", {})}.items():
+        value = getattr(command, name, None)
+        if value is not None and not least <= value < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')} is a number from {least:g} on, not {value:g}")
+    for name, above in getattr(command, "above", {}).items():
+        value = getattr(command, name)
+        if value is not None and not above < value < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')} is a number above {above:g}, not {value:g}")
+
+
 def reason(error: Exception) -> str:
     """Return the message of an error; for a place that cannot be written to or does not exist, also what to do."""
     places = "BRAKELINE_DATA for data sets and model sets, --out for a run or a file"
@@ -272,6 +290,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         with interrupt_on_signals():
             command = parse(name, words[1:])
+            check_numbers(command)
             with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
                 return int(command.run())
     except KeyboardInterrupt as interrupted:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
+from brakeline.messaging.number_checks import check_numbers
+
 Precision = Literal["float32", "bfloat16"]
 GROWTH_SHARES = 1 / 6, 1 / 2  # shares of the training between which penalties grow: first the goals are learned
 Stored = Literal["executed", "both"]  # actions of a corrected step to learn from (`learner/n_step.py`)
@@ -64,6 +66,9 @@ class TD3Config:
     """Compute the products of wide layers in this precision."""
 
     def __post_init__(self) -> None:
+        check_numbers(self, "actor_rate", "critic_rate", "target_noise", "target_noise_clip", least=0.0)
+        check_numbers(self, "exploration_noise", "multiplier_rate", "updates_per_step", least=0.0)
+        check_numbers(self, "reward_scale", above=0.0)
         widths = min(self.hidden, default=0)
         if min(self.batch, self.n_step, self.policy_delay, self.updates_per_step, widths) <= 0:
             raise ValueError(f"batch, n_step, policy_delay, updates_per_step and hidden must be positive: {self}")

@@ -17,7 +17,7 @@ class FlightTiming:
 
     periods: int = 0
     late: int = 0  # periods that began more than `mavlink_vehicle.LATE` after their time
-    slips: int = 0  # periods that began so late that the schedule was moved: the one before lasted two or more
+    slips: int = 0  # periods that began late by a period or more: the one before lasted two or more
     worst_gap: float = 0.0  # s between two setpoints
     round_trip: float = math.inf  # s to the autopilot and back, the fastest
     lost: int = 0  # periods whose telemetry or mode did not count

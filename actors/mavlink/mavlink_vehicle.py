@@ -31,7 +31,7 @@ log = logging.getLogger("brakeline.flight")
 RESEND = 0.05  # s between two transmissions of the same setpoint
 SYNC_INTERVAL = 0.2  # s between two requests for the autopilot's clock
 LOW_BATTERY = 20.0  # %, below which the log says so
-LATE = 0.02  # s after its time at which a period's start counts as late
+LATE = 0.02  # s: a period that begins later than this after its time is late
 
 
 class MavlinkVehicle(PeriodicVehicle):
@@ -239,27 +239,28 @@ class MavlinkVehicle(PeriodicVehicle):
             )
 
     def _begin_next(self, now: float) -> None:
-        """Begin a period: send its input first, then report on the period before."""
+        """Begin a period: send its input first, then report on the period before. Missed periods leave out numbers."""
+        missed = int((now - self._due) / self._robot.period)
         # Without setpoints the autopilot has braked: the inputs of missed periods would set it in motion again.
-        del self._plan[: int((now - self._due) / self._robot.period)]
+        del self._plan[:missed]
         following = self._plan.pop(0) if self._plan else np.zeros(self._robot.action_dim)
         self._velocity = self._robot.clip_input(following, self.current_period.input)
         self._send_setpoint(now)
         self._keep_time(now - self._due)
         start, state = self.current_period.report.measured[:3], self._state(now)
         report, lost = self._report(state, self._path(now, state) - start), self._watch.lost(now)
-        self._begin(ControlPeriod(self.current_period.number + 1, self._velocity, report, lost))
+        self._begin(ControlPeriod(self.current_period.number + 1 + missed, self._velocity, report, lost))
         self._log_loss(lost)
         self._client.path = self._client.path[-1:]
 
     def _keep_time(self, lateness: float) -> None:
-        timing = self.timing
+        """Count a period, and set the time of the next one: also a late period lasts a whole period."""
+        timing, late = self.timing, lateness > LATE
         timing.periods += 1
-        timing.late += lateness > LATE
+        timing.late += late
         timing.lateness.append(lateness)
-        slipped = lateness > self._robot.period
-        timing.slips += slipped
-        self._due += self._robot.period + (lateness if slipped else 0.0)
+        timing.slips += lateness > self._robot.period
+        self._due += self._robot.period + (lateness if late else 0.0)
 
     def _log_loss(self, why: str) -> None:
         """Log a loss when it begins, when its reason changes, and when it ends."""

@@ -15,7 +15,7 @@ from brakeline.sim.vehicle import Period
 class ControlPeriod:
     """One control period, at the moment when it begins."""
 
-    number: int  # the first is 0
+    number: int  # the first is 0; a missed period leaves out its number
     input: Array  # (3,) m/s, in force from this moment on
     report: Period  # the outcome of the period before
     lost: str = ""  # why telemetry does not count, or the autopilot does not follow our setpoints; empty: all is well

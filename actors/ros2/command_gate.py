@@ -110,12 +110,15 @@ class CommandGate:
         self.outcome, self._command = outcome, command
 
     def slip(self, periods: int) -> None:
-        """Pass over the committed plan's inputs for periods in which the process stood still.
+        """Take in that a period begins late: pass over the committed plan's inputs for the periods that were missed.
 
-        Meanwhile the base went on with the last input, or its own timeout stopped it. The inputs of the missed periods
-        could set a robot in motion again that already stands.
+        Meanwhile the base went on with the last input, or its own timeout stopped it. So the plan of a robot that does
+        not stand no longer counts as verified. The inputs of missed periods could set a robot in motion again that
+        already stands.
         """
-        self.stats.slips += 1
+        self.stats.slips += periods > 0
+        if self.backup_plan.plan.any():
+            self.backup_plan.distrust()
         for _ in range(min(periods, len(self.backup_plan.plan))):
             self.backup_plan.fallback()
 

@@ -5,7 +5,8 @@ A beam that hits at range r becomes a disc of radius
     increment r + range error + heading error (r + m) + position error
 
 with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
-may be anywhere in it; the others cover the error of the hit's position. Neighbouring hits that the body cannot pass
+may be anywhere in it; the others cover the error of the hit's position. Between the last beam and the first, the gap is
+wider by the sensor's way during the turn. Neighbouring hits that the body cannot pass
 between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
 sensor's range. Something too near to be measured touches the body where the beam leaves it. Beams without information
 are left out here: `unknown_space.py` says what may be there.
@@ -21,6 +22,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brakeline.actors.ros2.laser_beams import LaserBeams
 from brakeline.actors.ros2.sensor_frames import PlanarPose
@@ -71,11 +73,32 @@ def obstacles(
     near = ~(far | beams.too_near)
     chosen = np.flatnonzero(near)
     order = chosen[np.argsort(beams.angles[chosen], kind="stable")]
-    hits = _joined(points[order], radii[order], 2.0 * robot.footprint)
+    hits = _joined(*_with_seam(points, radii, directions, sensor, order), 2.0 * robot.footprint)
     size = max(0.5 * beams.gap, 1e-3) * robot.footprint + errors.position
     leaves = _leaving(sensor[beams.too_near] - around, directions[beams.too_near], robot.footprint)
     touching = around + (robot.footprint + size) * leaves
     return (*hits, *_joined(touching, np.full(len(touching), size), 2.0 * robot.footprint))
+
+
+def _with_seam(
+    points: Array, radii: Array, directions: Array, sensor: Array, order: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """Return the hits in an order by angle, with one more beside the first beam and one beside the last.
+
+    The sensor moves during a turn, so the last beam does not begin where the first one does. An obstacle that one of
+    them hits may end anywhere in the strip between them, which is as wide as the sensor's way across them.
+    """
+    if not len(order):
+        return points[order], radii[order]
+    across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)  # counterclockwise
+    outer = order[[0, -1]]
+    moved = np.abs(across[outer] @ (sensor[-1] - sensor[0]))
+    moved[~np.isin(outer, (0, len(points) - 1))] = 0.0  # the beam beside the seam hit nothing
+    beside = points[outer] + np.array([[-1.0], [1.0]]) * moved[:, None] * across[outer]
+    order = np.concatenate([outer[:1], order, outer[1:]])
+    shown = points[order]
+    shown[0], shown[-1] = beside
+    return shown, radii[order]
 
 
 def _leaving(sensor: Array, directions: Array, body: float) -> Array:

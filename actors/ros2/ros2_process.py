@@ -46,7 +46,7 @@ log = logging.getLogger("brakeline.ros2")
 
 RESEND = 0.05  # s after which an input is sent again
 SILENCE = 0.5  # s for which a simulation's clock may stand still
-LATE = 0.02  # s after a period's beginning, from which on an answer is too late
+LATE = 0.02  # s: a period that begins later than this after its time is late
 DIAGNOSTICS_INTERVAL = 1.0  # s between two diagnostics, unless the decision changes
 
 
@@ -141,7 +141,6 @@ class FilterNode:
     def _period(self, due: float, stop: threading.Event) -> float:
         """Wait until `due` [s], begin a period, and decide about the next one. Return when that begins [s]."""
         clock, gate, period = self.clock, self.gate, self.robot.period
-        in_time = clock.now() <= due + LATE
         if not clock.wait(due, stop, SILENCE):
             if not stop.is_set():
                 self._begin(why=f"the clock stands still at {clock.now():.2f} s")
@@ -151,16 +150,18 @@ class FilterNode:
             self.inputs.forget()
             gate.backup_plan.distrust()  # a simulation that began anew placed the robot elsewhere
             self._missing = "the clock was set"
-        if jump or clock.now() > due + period:  # the decision was for another time
+        late = bool(jump) or clock.now() > due + LATE  # the decision was for another time
+        if late:
             if not jump:
                 gate.slip(int((clock.now() - due) / period))
-            in_time = False
             due = math.floor(clock.now() / period) * period
         number = gate.stats.periods
-        self._begin(in_time, self._missing)
+        self._begin(not late, self._missing)
         decide_at = due + period - self.settings.lead
         self._missing = "" if self._resend_until(decide_at, stop) else "the clock stands still"
-        if not self._missing:
+        if late:  # the base executed two inputs in this period, so its end cannot be predicted
+            self._missing = self._missing or "the period before began late"
+        elif not self._missing:
             self._decide(due, number)
         return due + period
 

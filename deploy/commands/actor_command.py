@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from functools import partial
+from typing import ClassVar
 
 from brakeline.deploy.commands import common_options as options
 from brakeline.deploy.policy_loading import policy_named
@@ -48,6 +49,9 @@ class ActorCommand:
     """Fly the vehicle behind this link in real time: udpin:HOST:PORT, udpout:HOST:PORT or tcp:HOST:PORT. The map is the
     arena drawn with the seed. The safety service must serve quadrotor-late."""
     flight: options.Unprefixed[options.FlightOptions] = field(default_factory=options.FlightOptions)
+
+    least: ClassVar[dict[str, float]] = {"number": 0, "fleet": 0, "steps": 0, "robots": 1}
+    above: ClassVar[dict[str, float]] = {"deadline": 0}
 
     @property
     def extras(self) -> tuple[str, ...]:

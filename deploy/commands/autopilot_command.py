@@ -61,6 +61,8 @@ class AutopilotCommand:
     json: Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "mavlink")
+    least: ClassVar[dict[str, float]] = {"vehicles": 1, "seconds": 0, "speed": 0}
+    above: ClassVar[dict[str, float]] = {"setpoint_timeout": 0}
 
     def run(self) -> int:
         """Fly until the duration ends, SIGINT or SIGTERM. Returns the exit status."""

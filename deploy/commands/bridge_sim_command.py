@@ -43,6 +43,8 @@ class BridgeSimCommand:
     json: options.Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "ros2")
+    least: ClassVar[dict[str, float]] = {"seconds": 0, "factor": 0}
+    above: ClassVar[dict[str, float]] = {"timeout": 0}
 
     def run(self) -> int:
         """Simulate until the duration ends, SIGINT or SIGTERM. Returns the exit status."""

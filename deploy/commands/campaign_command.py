@@ -51,7 +51,7 @@ class CampaignCommand:
     again: bool = False
     """Drive again what has results already."""
     results: Path = Path("results/campaign")
-    """Store the tables in this folder."""
+    """Store the tables in this folder. A table keeps the cells of earlier campaigns."""
     runs: Path = Path("runs/campaign")
     """Store the rows of all episodes, and the logs of those that came too near, in this folder."""
     quiet: options.Quiet = False
@@ -80,7 +80,7 @@ class CampaignCommand:
             raise ValueError(f"--near is a distance from 0 m on, not {self.near}")
 
     def _campaign(self, name: str) -> dict[str, Any]:
-        """Drive the episodes of a robot, write its table, and return its figures."""
+        """Drive the episodes of a robot, add them to its table, and return their figures."""
         from brakeline.deploy.experiments import campaign
         from brakeline.deploy.experiments.campaign import CampaignPart, cells_of, log_path, parts_of_cell, search_of
         from brakeline.deploy.experiments.experiment_jobs import complete
@@ -97,6 +97,10 @@ class CampaignCommand:
         ]
         # A mistyped name ends the campaign before it begins; models are made once.
         cells = [self._prepared(robot, cell) for cell in cells]
+        own = robot.task.name  # additional tasks of a robot have tables of their own
+        path = self.results / f"{own}.json"
+        earlier = campaign.table_of(path)
+        campaign.check_addable(earlier, cells, path)
         parts = [part for cell in cells for part in parts_of_cell(cell, self.episodes)]
         results = complete(parts, self.runs, self.runs, self.engine, self.again, say)
         searched = {(cell.arena, cell.model_set, cell.perturbation): cell for cell in cells if self.search}
@@ -106,16 +110,16 @@ class CampaignCommand:
             one | {"log": log_path(self.runs, job, one["log"])} for job, one in zip(searches, worst, strict=True)
         ]
         driven = cells_of(parts, results, self.runs)
-        own = robot.task.name  # additional tasks of a robot have tables of their own
-        table = {"robot": own, "cells": driven, "searches": worst_cases}
-        write_atomically(self.results / f"{own}.md", campaign.markdown(own, driven, worst_cases).encode())
-        write_atomically(self.results / f"{own}.json", f"{json.dumps(table, indent=1)}\n".encode())
+        new = {"cells": driven, "searches": worst_cases}
+        table = {name: campaign.added(earlier[name], entries) for name, entries in new.items()}
+        write_atomically(self.results / f"{own}.md", campaign.markdown(own, **table).encode())
+        write_atomically(path, f"{json.dumps({'robot': own} | table, indent=1)}\n".encode())
         if not self.json:
             console.print(plain_table(*campaign.cell_table(driven)))
             if worst_cases:
                 console.print(plain_table(campaign.SEARCH_HEADS, campaign.search_rows(worst_cases)))
             console.print(f"[dim]{self.results}: {own}.md, {own}.json[/]")
-        return table
+        return {"robot": own} | new
 
     def _perturbations(self, dimensions: int) -> list[str]:
         """Return the perturbations that this kind of robot has. Raises ValueError for an unknown one."""

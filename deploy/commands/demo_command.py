@@ -28,6 +28,7 @@ class DemoCommand:
     json: Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "train", "logs")
+    least: ClassVar[dict[str, float]] = {"steps": 1}
 
     def run(self) -> int:
         """Drive the stored policy without and with the filter, then run the training. Returns the exit status."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from brakeline.deploy.commands.command_output import print_result
 from brakeline.deploy.commands.common_options import Json, Quiet, Robot, Seed
@@ -30,6 +31,8 @@ class ExciteCommand:
     quiet: Quiet = False
     json: Json = False
     """With --drive, print the result as one JSON object on stdout."""
+
+    above: ClassVar[dict[str, float]] = {"minutes": 0}
 
     def run(self) -> int:
         """Print or drive the inputs. Returns the exit status."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -63,6 +63,9 @@ class FlyCommand:
     verbose: options.Verbose = False
     quiet: options.Quiet = False
     json: options.Json = False
+
+    least: ClassVar[dict[str, float]] = {"vehicles": 1, "practice": 0}
+    above: ClassVar[dict[str, float]] = {"minutes": 0, "deadline": 0, "setpoint_timeout": 0}
 
     @property
     def extras(self) -> tuple[str, ...]:

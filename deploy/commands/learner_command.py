@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from brakeline.deploy.commands.common_options import BusOptions, Robot, Unprefixed, task_learner
 from brakeline.deploy.run.run_config import RunConfig
@@ -31,6 +31,8 @@ class LearnerCommand:
     steps: int = 100_000
     """Train for this many steps."""
     learner: LearnerConfig = field(default_factory=lambda: RunConfig().learner)
+
+    least: ClassVar[dict[str, float]] = {"steps": 1}
 
     @classmethod
     def defaults(cls, arguments: list[str]) -> Self:

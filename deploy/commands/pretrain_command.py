@@ -26,6 +26,7 @@ class PretrainCommand:
     json: Json = False
 
     extras: ClassVar[tuple[str, ...]] = ("sim", "train")
+    least: ClassVar[dict[str, float]] = {"samples": 1}
 
     def run(self) -> int:
         """Pretrain the method. Returns the exit status."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from rich.markup import escape
@@ -58,6 +59,8 @@ class QueryCommand:
     timeout: float = 1.0
     """Wait this long for the answer [s]."""
     json: Json = False
+
+    above: ClassVar[dict[str, float]] = {"timeout": 0}
 
     def run(self) -> int:
         """Ask, and print the decision. Returns the exit status."""

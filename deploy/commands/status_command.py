@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from rich.markup import escape
 
@@ -23,6 +23,8 @@ class StatusCommand:
     wait: float = 1.5
     """Listen for this long [s]. Each living process publishes its health once a second."""
     json: Json = False
+
+    least: ClassVar[dict[str, float]] = {"wait": 0}
 
     def run(self) -> int:
         """Listen, and print the processes. Returns the exit status."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.patient_save import save_patiently
 from brakeline.deploy.data.recording_origin import ORIGIN, origin, outdated
 from brakeline.deploy.progress import console, under_way
 from brakeline.errors import BadData
@@ -83,20 +84,29 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
                 advance()
                 driven.append(trajectory)
                 if time.monotonic() - saved > SAVE_EVERY:
-                    collect.dataset(robot, driven, seed, conditions, restless).save(part)
+                    _keep(collect.dataset(robot, driven, seed, conditions, restless), part)
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        if driven:
-            collect.dataset(robot, driven, seed, conditions, restless).save(part)
+        if driven and _keep(collect.dataset(robot, driven, seed, conditions, restless), part):
             console.print(
                 f"[yellow]kept {len(driven)} of {total} trajectories[/]: run the same command again to continue"
             )
         raise
     data = collect.dataset(robot, driven, seed, conditions, restless)
     _check_replaceable(path, robot)  # an import may have written the file in the meantime
-    data.save(path)
+    save_patiently(data, path)
     part.unlink(missing_ok=True)
     return data
+
+
+def _keep(data: Dataset, part: Path) -> bool:
+    """Save what is recorded so far. If that fails, say so and return False: the recording goes on without it."""
+    try:
+        data.save(part)
+    except OSError as error:
+        console.print(f"{part} is not saved: {error.strerror}. Make room, or the recording is lost", markup=False)
+        return False
+    return True
 
 
 def _check_replaceable(path: Path, robot: Robot) -> None:

@@ -2,7 +2,7 @@
 
 runs/campaign/<robot>/<part>.json            a part of a cell: one row per episode; a campaign goes on after them
 runs/campaign/<robot>/<part>/<episode>.mcap  the log of an episode that came too near to something
-results/campaign/<robot>.md, <robot>.json    the table
+results/campaign/<robot>.md, <robot>.json    the table of all campaigns with this folder
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from brakeline.deploy.commands.common_options import PhysicsOptions
 from brakeline.deploy.experiments.comparison_table import markdown_table
 from brakeline.deploy.experiments.task_engine import folder_of
 from brakeline.deploy.progress import errors_only
-from brakeline.errors import ResultError
+from brakeline.errors import BadText, ResultError
 from brakeline.logs.proportion_intervals import ClusteredProportion, clopper_pearson
+from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.model_config import KINDS, ModelConfig
 
 if TYPE_CHECKING:
@@ -234,6 +235,42 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
     }
 
 
+def table_of(path: Path) -> dict[str, Any]:
+    """Return the table of earlier campaigns in a file, without cells if there is none. Raises ResultError: damaged."""
+    if not path.exists():
+        return {"cells": [], "searches": []}
+    try:
+        table = parse_json(path.read_bytes())
+        cells, searches = table["cells"], table["searches"]
+        for one in (*cells, *searches):
+            _place(one)
+    except (BadText, KeyError, TypeError) as error:
+        raise ResultError(f"{path} holds no table of a campaign: move it away, or give another --results") from error
+    return {"cells": cells, "searches": searches}
+
+
+def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Path) -> None:
+    """Raise ResultError if cells of earlier campaigns would stand beside cells of another version of a model set."""
+    places = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
+    versions = {cell.model_set: cell.model or "none" for cell in cells}
+    for one in table["cells"]:
+        if _place(one) not in places and one["model"] != versions.get(one["model_set"], one["model"]):
+            raise ResultError(
+                f"{path} holds cells of the model set {one['model']}, which is now {versions[one['model_set']]}: drive "
+                "these cells again in the same campaign, move the file away, or give another --results"
+            )
+
+
+def added(earlier: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the cells, or the searches, of earlier campaigns and new ones. A new one replaces the same earlier one."""
+    return list({_place(one): one for one in (*earlier, *new)}.values())
+
+
+def _place(cell: dict[str, Any]) -> tuple[str, ...]:
+    """Return what names a cell in a table, or a search, which has no policy."""
+    return cell["arena"], cell.get("policy", ""), cell["model_set"], cell["perturbation"]
+
+
 SEARCH_HEADS = ("arena", "model set", "perturbation", "episodes", "collisions", "closest [mm]", "log")
 
 
@@ -250,7 +287,7 @@ def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[st
             f"{cell['collisions']}: {_percent(cell['collisions'], cell['episodes'], cell['collisions_interval'])}"
             for cell in cells
         ],
-        "run into, standing": [str(cell["contacts_standing"]) for cell in cells],
+        "run into, standing": [str(cell.get("contacts_standing", 0)) for cell in cells],
         "interventions": [
             _percent(cell["interventions"], cell["steps"], cell["interventions_interval"]) for cell in cells
         ],
@@ -260,7 +297,7 @@ def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[st
         "closest [mm]": [f"{1e3 * cell['closest']:.1f}" for cell in cells],
         "near misses": [str(len(cell["near"])) for cell in cells],
     }
-    if not any(cell["contacts_standing"] for cell in cells):
+    if not any(cell.get("contacts_standing") for cell in cells):
         del columns["run into, standing"]
     return list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brakeline.deploy.experiments.compared_methods import BATCHES, EVERY, METHODS, NONE, TD3_LEARNER
-from brakeline.deploy.experiments.experiment_jobs import UNSTATED, task_hash
+from brakeline.deploy.experiments.experiment_jobs import task_hash
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.learner.learner_config import TD3Config
 from brakeline.safety.model.model_config import DDPC, SAILR, SECAS, ModelConfig
@@ -71,7 +71,7 @@ class CellConfig:
     untrained: int = 100  # episodes of the untrained policy; few, because they last until the time limit
     task: str = ""  # see `experiment_jobs.task_hash`
     # Version of the model set that filters a robot of your own. Empty: no trial needs one, or the robot is ours.
-    model_set: str = field(default="", metadata=UNSTATED)
+    model_set: str = ""
 
     def __post_init__(self) -> None:
         from brakeline.messaging.task import check_penalty

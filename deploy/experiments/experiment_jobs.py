@@ -20,8 +20,6 @@ from brakeline.messaging.robot_files import REAL_TIME_SUFFIX, task_values
 from brakeline.messaging.structured_text import parse_json
 
 LOCK = ".study.lock"
-# Metadata of a field that older results do not state: they stay usable, whatever its value is today.
-UNSTATED = {"unstated": True}
 
 
 class Job(StudyTask, Protocol):
@@ -91,8 +89,6 @@ def _completed(stored: dict[str, Any], job: Any) -> dict[str, Any]:
         value = getattr(job, field.name)
         if is_dataclass(value) and isinstance(values.get(field.name), dict):
             values[field.name] = _completed(values[field.name], value)
-        elif field.name not in values and field.metadata.get("unstated"):
-            values[field.name] = value
         elif field.name not in values and (default := _default(field)) is not MISSING:
             values[field.name] = default
     return values

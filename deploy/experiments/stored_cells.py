@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from brakeline.deploy.experiments.compared_methods import METHODS
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE
 from brakeline.deploy.experiments.comparison_cells import CellConfig
 from brakeline.deploy.experiments.experiment_jobs import configuration, stored_result
 from brakeline.deploy.experiments.task_engine import robot_folder
 from brakeline.errors import ResultError
 from brakeline.learner.learner_config import TD3Config
+from brakeline.safety.model.model_config import DDPC
 
 SAME = ("robot", "steps", "episodes", "arenas", "physics", "backend", "robots")  # in all cells of a robot
 SAME_IF_STATED = ("task", "model_set")
@@ -57,6 +58,13 @@ def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
             raise ResultError(
                 f"{folder}: the cells have more than one {name} ({', '.join(sorted(values))}): move the older "
                 "ones away, or give another --results"
+            )
+    for study in studies:
+        own_set = METHODS[study["method"]].filter == DDPC or study["method"] == NONE
+        if study.get("task") and own_set and not study.get("model_set"):
+            raise ResultError(
+                f"{folder}: {study['method']}-s{study['seed']} does not state the model set that filtered the robot: "
+                "run it again with --again, or move it away"
             )
     for method in METHODS:
         if len({_settings(study) for study in studies if study["method"] == method}) > 1:

@@ -65,6 +65,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
     from brakeline.actors.mavlink.vehicle_socket import listening
     from brakeline.deploy.data.build_lock import folder_lock
     from brakeline.deploy.data.first_flight import Box, FirstFlight
+    from brakeline.deploy.data.patient_save import save_patiently
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     flight_settings = FlightSettings(
@@ -87,7 +88,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
 
     def store(data: Dataset) -> None:
         with folder_lock(path.parent):
-            data.save(path)
+            save_patiently(data, path)
         log.info("the flight is stored in %s", path)
 
     return flight.result(metadata, store)

@@ -13,6 +13,7 @@ import tyro
 from brakeline.actors.actor_settings import FlightSettings, PhysicsChange
 from brakeline.learner.learner_config import LearnerConfig, TD3Config
 from brakeline.logs.segment_rotation import Rotation
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.model.model_config import AUTO, DDPC, ModelConfig
 from brakeline.safety.model.model_config import METHODS as FILTERS
@@ -125,6 +126,8 @@ class RunConfig:
                 f"a process has at most {MOST_IN_PROCESS} robots, not {self.robots_per_actor}, with any method: it may "
                 f"publish under the names of so many. Lower --robots-per-actor{more}"
             )
+        check_numbers(self, "deadline", above=0.0)
+        check_numbers(self, "practice", "pictures", least=0.0)
         if self.penalty is not None:
             from brakeline.messaging.task import check_penalty, robot_with_task
 

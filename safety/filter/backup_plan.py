@@ -164,8 +164,14 @@ class BackupPlan:
         outside = self._compare and self.predicted is not None and not self.predicted.contains(self.robot, self.seen)
         return self.model != UNVERIFIED and not outside
 
+    def executes(self, action: Array) -> None:
+        """Take in the input (m,) that a robot in real time executes. If the plan has another, it is not verified."""
+        if not np.abs(action - self.plan[0]).max() <= SAME_SET:  # true for NaN, too
+            self.distrust()
+            self.plan[0] = action
+
     def distrust(self) -> None:
-        """Stop counting the plan as verified, since the pose has jumped: the robot brakes along it all the same."""
+        """Stop counting the plan as verified, since the robot left it: the robot brakes along it all the same."""
         self.model, self.predicted, self.reservation = UNVERIFIED, None, None
         self._plan_tokens, self._compare = (), False
         self.widening.interrupt()

@@ -275,7 +275,8 @@ class Filter:
         """Return the committed backup plan, or a plan that is verified anew, or one that is not verified.
 
         The committed plan still counts as verified if the measured state is in the predicted set, this model set
-        verified the plan or the robot stands, and no obstacle broke its bounds (docs/method.md §4). Otherwise, the
+        verified the plan or the robot stands, no obstacle broke its bounds (docs/method.md §4), and the robot's
+        reservation touches no other (§9). Otherwise, the
         filter verifies the rest of that plan and then the strongest braking from the new measurement, each followed by
         the robot's stop rule. If neither is verified, the one with the larger margin is executed: a plan that evades an
         obstacle may need no more than some millimetres, while braking leads straight into it. Outside the recorded
@@ -284,6 +285,9 @@ class Filter:
         if not record.contained:
             record.reason += "; the measured state was outside the predicted set"
         vouched = (request.model == self.version and not record.broken) or request.still(self.robot)
+        if _touches_another(request):
+            record.reason += "; the robot's reservation touches another robot's"
+            vouched = False
         before = z_0[-self.robot.action_dim :]
         tail = request.plan
         if self.robot.feedback:  # a feedback decides this period's input from the measured state
@@ -374,3 +378,9 @@ class Filter:
         chord_deviations[-1] = max(chord_deviations[-1], stopping_distance)
         centers, half = np.vstack([start, centers]), np.vstack([constraints.measured, half])
         return Reservation.of(centers, half, self.robot.footprint + np.array(chord_deviations))
+
+
+def _touches_another(request: Request) -> bool:
+    """Return whether the robot's reservation touches another robot's."""
+    own, others = request.reservation, request.other_reservations
+    return own is not None and others is not None and others.touch(own)

@@ -8,7 +8,8 @@ a box along the world's axes. The last box is reserved for all time after the pl
 each period, a reservation loses its first box and keeps its last. The filter decides robots one after the other, each
 against the current reservations of all others. So disjoint reservations stay disjoint: a robot without a new plan keeps
 its old reservation, and the others were checked against that one. The filter checks the whole reservation, corners
-included.
+included. A robot without a verified plan gets a reservation that may touch another one. While two reservations touch,
+the committed plans of these robots do not count as verified.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from brakeline.safety.filter.halfspaces import TOUCHING, roomiest, viewpoints
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.qp import ConstraintRows
+
+ROUNDED = 1e-6  # m: by how much rounding may let disjoint reservations overlap
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,12 @@ class OtherReservations(ComparedByValue):
     def nearest(self, point: Array) -> Array:
         """Return the least distance (n,) [m] of each reservation from a point (d,)."""
         return np.asarray((self.shapes.distance(point) - self.shapes.margin).reshape(-1, self.periods).min(axis=1))
+
+    def touch(self, own: Reservation) -> bool:
+        """Return whether a robot's own reservation touches one of them in the same period."""
+        center, half, radius = (np.tile(part.T, len(self)).T for part in (own.center, own.half_width, own.radius))
+        between = np.maximum(np.abs(self.shapes.center - center) - self.shapes.half - half, 0.0)
+        return bool((np.linalg.norm(between, axis=1) - self.shapes.margin - radius < -ROUNDED).any())
 
     def take(self, chosen: NDArray[np.bool_]) -> OtherReservations:
         """Return the chosen (n,) reservations."""

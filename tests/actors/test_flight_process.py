@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from brakeline.actors.decision_guard import DecisionOutcome
-from brakeline.actors.flight_process import FlightRunner
+from brakeline.actors.flight_process import FlightRunner, RealTimeVehicle
 from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period
+from tests.robots import QUADROTOR
 
 HELD = "the autopilot does not follow our setpoints (HOLD)"
 STANDING = Period(np.zeros(9), np.zeros(9), False, np.inf, np.inf, np.zeros((SAMPLES, 3)), 0.0)
@@ -26,9 +28,28 @@ def test_a_step_between_two_states_is_lost_if_one_of_them_is(before: str, after:
     published: list[pb.Step] = []
     runner: Any = FlightRunner.__new__(FlightRunner)
     runner.steps, runner.frames = SimpleNamespace(put=published.append), SimpleNamespace(publish=lambda: None)
+    runner.runner = SimpleNamespace(backup_plan=BackupPlan(QUADROTOR.in_real_time()))
     runner.answers, period = Counter(), ControlPeriod(4, np.zeros(3), STANDING, before)
     runner._vehicle = SimpleNamespace(current_period=period)
     runner.commit(DecisionOutcome(pb.Request(), None, None, "no answer", 0.0))
     runner._vehicle.current_period = replace(period, number=5, lost=after)
     runner.publish(pb.Step(index=1))
     assert [step.lost for step in published] == [bool(before or after)]
+    assert (runner.runner.backup_plan.model == UNVERIFIED) == bool(before)
+
+
+@pytest.mark.parametrize("number", [5, 7])
+def test_a_plan_whose_input_the_vehicle_does_not_execute_is_not_verified(number: int) -> None:
+    """Such as after a standstill of the vehicle server, whose slew limits the input that follows."""
+    plan = BackupPlan(QUADROTOR.in_real_time())
+    rows = np.outer(0.5 * np.maximum(6.0 - np.arange(plan.robot.horizon), 0.0), [1.0, 0.0, 0.0])
+    plan.accept(rows, "m", None, verified=True)
+    flown: Any = SimpleNamespace(current_period=ControlPeriod(4, rows[0], STANDING))
+    vehicle = RealTimeVehicle(flown, plan.fallback, plan.executes)
+    flown.wait = lambda _: ControlPeriod(number, rows[number - 4], STANDING)
+    vehicle.step(rows[1])
+    assert plan.model == "m" and plan.next_input == pytest.approx(rows[number - 4])
+    plan.fallback()
+    flown.wait = lambda _: ControlPeriod(number + 1, rows[number - 4], STANDING)
+    vehicle.step(rows[number - 3])
+    assert plan.model == UNVERIFIED and plan.next_input == pytest.approx(rows[number - 4])

@@ -1,5 +1,6 @@
 """Robots that share a world: their reservations stay disjoint, and no robot touches another."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,11 +10,14 @@ from brakeline.actors.decision_guard import request_decisions
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, decide
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.safety.filter.filter import Filter
+from brakeline.safety.model.model_set import ModelSet
+from brakeline.safety.service.wire import reservation_of
 from brakeline.sim.scripted_policies import scripted
 from brakeline.sim.shared_world import FleetEnv
 from tests.actors.conftest import no_answer
 from tests.robots import GROUND
 from tests.safety.asked import apart
+from tests.safety.served import Service
 
 SIZE = 4
 ROUNDING = 1e-6  # m
@@ -76,6 +80,31 @@ def test_no_robots_touch_and_reservations_stay_disjoint_though_answers_fail(ask,
     assert fleet.world.touches == 0
     assert least >= -ROUNDING
     assert {pb.ALLOWED, pb.ADJUSTED, pb.FAILSAFE} <= set(kinds)
+
+
+def test_robots_whose_reservations_touch_do_not_count_as_verified():
+    """The service changes to wider sets and back, and the robots ask for wider sets."""
+    narrow = ModelSet.load("ground")
+    wide = replace(narrow, steps=tuple(replace(step, w=10.0 * step.w) for step in narrow.steps), in_place=None)
+    service, rng, reasons, fleet = Service(wide, narrow), np.random.default_rng(0), [], fleet_of()
+
+    def ask(requests):
+        if rng.random() < 0.2:
+            service.models.install((narrow, wide)[rng.integers(2)])
+        for request in requests:
+            request.widening = rng.choice([1.0, 5.0])
+        replies = service.replies(*requests)
+        for one, other in combinations([reply.decision for reply in replies], 2):
+            reserved = [reservation_of(decision.reservation, GROUND) for decision in (one, other)]
+            if apart(*reserved) < -2.0 * ROUNDING:
+                reasons.append(one.reason + other.reason)
+                assert not (one.verified and other.verified)
+        return replies
+
+    begin_close_together(fleet)
+    drive(fleet, ask, "random", 100)
+    assert fleet.world.touches == 0
+    assert any("touches another robot's" in reason for reason in reasons)
 
 
 def test_without_reservations_the_same_robots_touch(ask):

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from brakeline import Filter, InProcess
 from brakeline.deploy import progress
-from brakeline.deploy.cli import reason
+from brakeline.deploy.cli import COMMANDS, command_class, main, reason
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
@@ -355,3 +355,31 @@ def test_show_prints_a_description(command, figures, robot):
     assert shown["name"] == robot and shown["footprint_m"] in (0.105, 0.3)
     out = command("robot", "show", robot)[1]
     assert "[m/s]" in out and "layout" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("excite --seed -1", "--seed is a number from 0 on, not -1"),
+        ("demo --seed -1", "--seed is a number from 0 on, not -1"),
+        ("pretrain secas --seed -1", "--seed is a number from 0 on, not -1"),
+        ("excite --minutes 0", "--minutes is a number above 0, not 0"),
+        ("fly --minutes nan", "--minutes is a number above 0, not nan"),
+        ("autopilot --vehicles -1", "--vehicles is a number from 1 on, not -1"),
+        ("autopilot --setpoint-timeout nan", "--setpoint-timeout is a number above 0, not nan"),
+        ("bridge-sim --timeout inf", "--timeout is a number above 0, not inf"),
+        ("train --deadline nan --out runs/none", "deadline = nan is not finite"),
+        ("train --practice -1 --out runs/none", "practice = -1.0 is not 0 or more"),
+        ("status --wait -1", "--wait is a number from 0 on, not -1"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_refused_in_a_sentence(words, why, capsys):
+    assert main(words.split()) == 1
+    assert why in " ".join(capsys.readouterr().err.split())
+
+
+def test_every_number_that_is_checked_is_an_option():
+    for name in COMMANDS:
+        command = command_class(name)
+        checked = {**getattr(command, "least", {}), **getattr(command, "above", {})}
+        assert set(checked) <= set(get_type_hints(command)), name

@@ -8,6 +8,7 @@ from brakeline.errors import CheckpointError, DamagedPart, Diverged
 from brakeline.learner.checkpoint import PartState
 from brakeline.learner.lagrange import LagrangeMultiplier
 from brakeline.learner.learner import Learner
+from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import policy_weights
 from tests.learner.toy import CONFIG, TOY, ToyActor, run, settle
@@ -306,3 +307,9 @@ def test_a_resumed_run_keeps_the_multiplier(tmp_path):
     for wrong in ("3.6", float("nan"), -1.0):
         with pytest.raises(ValueError, match="no multiplier"):
             LagrangeMultiplier(0.1, 1.0).restore(PartState({}, {"value": wrong}))
+
+
+@pytest.mark.parametrize("name", ["updates_per_step", "actor_rate", "exploration_noise", "reward_scale"])
+def test_a_setting_that_is_no_number_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} = nan is not finite"):
+        TD3Config(**{name: float("nan")})

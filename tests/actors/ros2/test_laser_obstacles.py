@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,3 +155,19 @@ def test_each_beam_starts_where_the_robot_was_at_its_time():
     poses[:, 0] = 0.25 * (beams.times - 10.0)  # driving at 0.25 m/s
     hits = obstacles(beams, poses, PlanarPose(), GROUND, ERRORS, poses[-1, :2])
     assert sorted(o.position[0] for o in hits) == pytest.approx([-0.475, 0.5])
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_an_obstacle_that_ends_between_the_last_beam_and_the_first_is_contained_to_its_end(turn):
+    """The lidar turns ten times a second on a robot at 0.25 m/s: its last beam begins 25 mm ahead of the first."""
+    beams, poses = read(scan_of(np.full(BEAMS, np.inf))), np.zeros((BEAMS, 3))
+    poses[:, 0] = turn * np.linspace(-0.0125, 0.0125, BEAMS)
+    angles = 0.5 * math.pi + turn * beams.gap * np.arange(BEAMS)
+    wall = Obstacle("box", (turn * 0.069, 0.6), (0.162, 0.2))  # its end is in the strip that no beam crosses
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ranges = [cast([wall], pose[:2], direction, 3.5) for pose, direction in zip(poses, directions, strict=True)]
+    assert ranges[0] == 3.5 and ranges[-1] < 0.6
+    beams = replace(beams, angles=angles, ranges=np.array(ranges))
+    found = obstacles(beams, poses, PlanarPose(), GROUND, HitErrors(0.0, 0.0, 0.0), np.zeros(2))
+    front = np.stack([turn * np.linspace(-0.012, 0.15, 50), np.full(50, 0.5)], axis=1)
+    assert float(Shapes.of(found, 2).distance(front).min(axis=0).max()) < 1e-3

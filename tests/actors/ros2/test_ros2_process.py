@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -275,6 +276,39 @@ def test_an_answer_for_a_past_period_does_not_count():
         due = node_under_test._period(due, stop)
         assert gate.kind == LATE and gate.stats.slips == 1 and due > clock.now()
         assert gate.input[0] < 0.25, "it brakes"
+    finally:
+        node_under_test.close()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.1, 2.5])
+def test_no_decision_rests_on_an_input_that_the_base_executed_for_part_of_a_period(share):
+    """A period begins late by a share of its length: the base went on with the input before."""
+    stop, requests, period, sent = threading.Event(), [], ROBOT.period, []
+
+    def ask(asked):
+        requests.extend(asked)
+        return allow(asked)
+
+    node_under_test = FilterNode(Ros2Settings(ros=RosSettings(listen=(free_endpoint(),))), ask, stop)
+    try:
+        gate, clock = node_under_test.gate, Stalling()
+        command = lambda number: RawCommand(np.array([0.05 + 0.1 * (number % 2), 0.0]), clock.time, number)  # noqa: E731
+        node_under_test.clock = clock
+        node_under_test._decide = lambda began, number: gate.decide(np.zeros(5), (), command(number), began, number)
+        node_under_test._send = lambda action: sent.append((clock.now(), action[0]))
+        due, before = 100.0, 0
+        for number in range(12):
+            if number == 5:
+                clock.stall, before = share * period, len(requests)
+            due = node_under_test._period(due, stop)
+            assert number != 5 or gate.kind == LATE
+        sent.append((due, 0.0))
+        assert requests[before].model != "m" and requests[-1].model == "m"
+        for request in requests:
+            end = request.time + period
+            for (since, value), (until_, _) in pairwise(sent):
+                if value != request.plan[0]:
+                    assert min(until_, end) - max(since, request.time) < 0.02 + 1e-9, request.time
     finally:
         node_under_test.close()
 

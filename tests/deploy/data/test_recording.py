@@ -3,13 +3,16 @@
 import itertools
 import subprocess
 import sys
+import time
+from contextlib import ExitStack
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
-from brakeline.deploy.data import collect, data_paths, model_store, simulated_recording
+from brakeline.deploy.data import collect, data_paths, model_store, patient_save, simulated_recording
 from brakeline.deploy.data.build_lock import LOCK
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.excitation import excitation, restless_excitation
@@ -24,6 +27,7 @@ from brakeline.safety.model.windows import windows
 from brakeline.sim.batch import batch_support
 from brakeline.sim.sim_conditions import Conditions, NoiseLevels
 from tests.accepting import BOUND
+from tests.full_disk import full_disk
 from tests.logs.sample_log import written
 from tests.robots import GROUND, QUADROTOR
 from tests.safety.toys import car
@@ -334,3 +338,31 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch,
     again = data_paths.record_path(GROUND).with_name("fresh.safetensors")
     fresh = simulated_recording.load_or_record(GROUND, again, trajectories=4)
     assert whole.digest() == fresh.digest(), "the same data as in one go"
+
+
+def test_a_recording_on_a_full_disk_goes_on_and_waits_for_room(monkeypatch, tmp_path, capsys):
+    """A partial save that fails does not end the recording. The last save waits until there is room."""
+    monkeypatch.setattr(simulated_recording, "SAVE_EVERY", 0.0)
+    path, disk = tmp_path / "record.safetensors", ExitStack()
+
+    def make_room(seconds):
+        assert not path.exists()
+        disk.close()
+
+    monkeypatch.setattr(patient_save, "time", SimpleNamespace(sleep=make_room, monotonic=time.monotonic))
+    with disk:
+        disk.enter_context(full_disk(100_000))
+        data = simulated_recording.load_or_record(GROUND, path, 3, seed=1)
+    assert Dataset.load(path).digest() == data.digest() and len(data.trajectories) == 5
+    assert not path.with_name("record.part.safetensors").exists()
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "is not saved: File too large" in printed and "is not saved yet: File too large. Make room" in printed
+
+
+def test_a_disk_that_stays_full_ends_the_wait(monkeypatch, tmp_path):
+    monkeypatch.setattr(patient_save, "RETRY", 0.01)
+    monkeypatch.setattr(patient_save, "PATIENCE", 0.05)
+    data = collect.dataset(GROUND, list(collect.record(GROUND, 1, 1, Conditions())), 1, Conditions())
+    with full_disk(1000), pytest.raises(OSError, match="File too large"):
+        patient_save.save_patiently(data, tmp_path / "record.safetensors")
+    assert not list(tmp_path.iterdir())

@@ -160,6 +160,29 @@ def test_each_task_and_each_robot_of_ones_own_has_a_table_of_its_own(driven, mon
     assert experiment_jobs.result_path(tmp_path / "runs", own) == tmp_path / "runs" / "my" / f"{own.name}.json"
 
 
+def test_a_table_keeps_the_cells_of_earlier_campaigns_unless_their_model_set_has_changed(driven, monkeypatch, tmp_path):
+    _, (first, _), _ = driven
+    monkeypatch.setattr(experiment_jobs, "complete", lambda jobs, *_: [first] if jobs else [])
+    settings = {"engine": IN_THIS_PROCESS, "results": tmp_path, "runs": tmp_path / "runs", "quiet": True}
+    command = CampaignCommand(
+        arenas=("default",), policies=("random",), model_sets=("residual",), episodes=4, **settings
+    )
+    for arena in ("default", "dense", "default"):
+        replace(command, arenas=(arena,)).run()
+    path = tmp_path / "ground.json"
+    table = json.loads(path.read_text())
+    assert [cell["arena"] for cell in table["cells"]] == ["default", "dense"]
+    assert "| default | random |" in (text := (tmp_path / "ground.md").read_text()) and "| dense | random |" in text
+    table["cells"][1]["model"] = "another"
+    path.write_text(json.dumps(table))
+    with pytest.raises(ResultError, match="holds cells of the model set another"):
+        command.run()
+    replace(command, arenas=("dense",)).run()
+    path.write_text("{}")
+    with pytest.raises(ResultError, match="no table of a campaign"):
+        command.run()
+
+
 def test_an_episode_that_touches_a_wall_and_a_walker_is_one_collision():
     both = {name: [value] for name, value in (ROW | {"collision": 1, "contact_moving": 1}).items()}
     (cell,) = cells_of([CELL], [{"episodes": both, "near": []}], Path("runs"))

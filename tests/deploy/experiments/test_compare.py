@@ -37,8 +37,9 @@ from brakeline.deploy.experiments.comparison_table import (
     table,
     written,
 )
-from brakeline.deploy.experiments.experiment_jobs import configuration, task_hash, write
+from brakeline.deploy.experiments.experiment_jobs import configuration, result_path, task_hash, write
 from brakeline.deploy.experiments.experiment_jobs import read as read_result
+from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
@@ -397,7 +398,13 @@ def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_p
     for cell in before:  # of a version that did not note the model set
         study = {name: value for name, value in configuration(cell).items() if name != "model_set"}
         write(tmp_path, cell, {"study": study, "model": None})
-    assert all(read_result(tmp_path, cell) for cell in noted(car))
+    for cell in before[:2]:
+        with pytest.raises(ResultError, match="another model_set"):
+            read_result(tmp_path, cell)
+        with pytest.raises(ResultError, match=f"{cell.name} does not state the model set that filtered the robot"):
+            stored_cells(tmp_path, car)
+        result_path(tmp_path, cell).unlink()
+    assert len(stored_cells(tmp_path, car)) == 1 and read_result(tmp_path, before[2]) is not None
 
 
 @pytest.mark.parametrize(
