@@ -33,7 +33,7 @@ class EvaluateCommand:
     fleet: int = 0
     """Let this many robots share one world and avoid each other. 0 evaluates one robot alone."""
     backend: Literal["single", "batch"] = "single"
-    """Simulate one robot after the other, or many ground robots at once (batch: several times faster, for networks)."""
+    """Simulate one robot after the other, or many robots at once (batch: several times faster, for networks)."""
     seed: options.Seed = 0
     render: Path | None = None
     """Also draw an episode from above, with tube and plan, into this file (.png, .gif or .mp4)."""
