@@ -1,6 +1,7 @@
 """Resample columns over time to trajectories with one state and one input per period.
 
-States are interpolated linearly. The input of a period is the one that was held for most of it, or else the mean.
+States are interpolated linearly, but extrapolated from before a change of an input (`_at_edges`). The input of a period
+is the one that was held for most of it, or else the mean.
 Periods begin where inputs change, if most inputs change at a common phase. A recording is split at gaps, at jumps of
 the pose, and where an input is outside the robot's bounds. Angles are unwrapped first.
 """
