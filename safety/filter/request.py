@@ -319,7 +319,9 @@ def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
 
 def _sized(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
     if value.shape != shape:
-        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}")
+        labels = {"state": robot.state, "action": robot.action, "input_in_force": robot.action}.get(name, ())
+        meaning = f": {', '.join(labels)}" if labels else ""
+        raise BadRequest(name, f"{name} has shape {value.shape}, a {robot.name} robot's has {shape}{meaning}")
 
 
 def _finite(robot: Robot, named: Named) -> None:

@@ -57,7 +57,8 @@ class PlanAuthenticator:
         """
         if folder is not None and (folder / KEY_FILE).exists():
             return cls((folder / KEY_FILE).read_bytes())
-        log.info("no %s: plans that another replica verified count as unverified here", KEY_FILE)
+        if folder is not None:
+            log.info("no %s among the keys: plans that another replica verified count as unverified here", KEY_FILE)
         return cls(secrets.token_bytes(KEY_SIZE))
 
     def plan_tokens(self, request: pb.Request, decision: pb.Decision, robot: Robot, asker: str = "") -> list[bytes]:

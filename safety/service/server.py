@@ -105,7 +105,10 @@ class ModelRegistry:
             if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
                 raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
-            raise NoModel("robot", f"no model of {request.robot} is loaded (loaded: {have})")
+            start = f"start another service (`brakeline safety {request.robot}`)"
+            raise NoModel(
+                "robot", f"no model of {request.robot} is loaded (loaded: {have}): {start}, or ask about these"
+            )
         if request.layout and not method.robot.accepts_layout(request.layout):
             raise BadRequest(
                 "layout",
