@@ -3,7 +3,7 @@
 Each command is a module `deploy/commands/NAME_command.py` with a dataclass `NameCommand`: its fields are the options,
 and its method `run` returns the exit status. `extras` names the optional parts that it needs. The module is imported
 when the command runs, so that `--help` answers at once. `least` and `above` state by the names of options which numbers
-make sense (`check_numbers`). A command imports what an extra brings in `run`, so that `--help` and
+make sense (`check_option_numbers`). A command imports what an extra brings in `run`, so that `--help` and
 `completion` need no extra.
 """
 
@@ -234,7 +234,7 @@ def parse(name: str, arguments: list[str]) -> Any:
     )
 
 
-def check_numbers(command: Any) -> None:
+def check_option_numbers(command: Any) -> None:
     """Check a command's numbers: seeds from 0 on, and those for which it states `least` or `above`, without NaN.
 
     Raises:
@@ -290,7 +290,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         with interrupt_on_signals():
             command = parse(name, words[1:])
-            check_numbers(command)
+            check_option_numbers(command)
             with progress.silenced() if getattr(command, "quiet", False) else nullcontext():
                 return int(command.run())
     except KeyboardInterrupt as interrupted:

@@ -243,7 +243,7 @@ def table_of(path: Path) -> dict[str, Any]:
         table = parse_json(path.read_bytes())
         cells, searches = table["cells"], table["searches"]
         for one in (*cells, *searches):
-            _place(one)
+            _cell_key(one)
     except (BadText, KeyError, TypeError) as error:
         raise ResultError(f"{path} holds no table of a campaign: move it away, or give another --results") from error
     return {"cells": cells, "searches": searches}
@@ -251,10 +251,10 @@ def table_of(path: Path) -> dict[str, Any]:
 
 def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Path) -> None:
     """Raise ResultError if cells of earlier campaigns would stand beside cells of another version of a model set."""
-    places = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
+    driven_again = {(cell.arena, Path(cell.policy).stem, cell.model_set, cell.perturbation) for cell in cells}
     versions = {cell.model_set: cell.model or "none" for cell in cells}
     for one in table["cells"]:
-        if _place(one) not in places and one["model"] != versions.get(one["model_set"], one["model"]):
+        if _cell_key(one) not in driven_again and one["model"] != versions.get(one["model_set"], one["model"]):
             raise ResultError(
                 f"{path} holds cells of the model set {one['model']}, which is now {versions[one['model_set']]}: drive "
                 "these cells again in the same campaign, move the file away, or give another --results"
@@ -263,10 +263,10 @@ def check_addable(table: dict[str, Any], cells: Sequence[CampaignPart], path: Pa
 
 def added(earlier: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the cells, or the searches, of earlier campaigns and new ones. A new one replaces the same earlier one."""
-    return list({_place(one): one for one in (*earlier, *new)}.values())
+    return list({_cell_key(one): one for one in (*earlier, *new)}.values())
 
 
-def _place(cell: dict[str, Any]) -> tuple[str, ...]:
+def _cell_key(cell: dict[str, Any]) -> tuple[str, ...]:
     """Return what names a cell in a table, or a search, which has no policy."""
     return cell["arena"], cell.get("policy", ""), cell["model_set"], cell["perturbation"]
 

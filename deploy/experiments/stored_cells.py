@@ -60,8 +60,8 @@ def _check_comparable(studies: Sequence[dict[str, Any]], folder: Path) -> None:
                 "ones away, or give another --results"
             )
     for study in studies:
-        own_set = METHODS[study["method"]].filter == DDPC or study["method"] == NONE
-        if study.get("task") and own_set and not study.get("model_set"):
+        states_set = METHODS[study["method"]].filter == DDPC or study["method"] == NONE
+        if study.get("task") and states_set and not study.get("model_set"):
             raise ResultError(
                 f"{folder}: {study['method']}-s{study['seed']} does not state the model set that filtered the robot: "
                 "run it again with --again, or move it away"

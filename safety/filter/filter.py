@@ -284,17 +284,17 @@ class Filter:
         """
         if not record.contained:
             record.reason += "; the measured state was outside the predicted set"
-        vouched = (request.model == self.version and not record.broken) or request.still(self.robot)
+        was_verified = (request.model == self.version and not record.broken) or request.still(self.robot)
         if _touches_another(request):
             record.reason += "; the robot's reservation touches another robot's"
-            vouched = False
+            was_verified = False
         before = z_0[-self.robot.action_dim :]
         tail = request.plan
         if self.robot.feedback:  # a feedback decides this period's input from the measured state
             tail = np.vstack([self.robot.stop_by_feedback(tail[:1], request.state, before), tail[1:]])
         chosen = tail[self.robot.committed_steps : self.robot.free_steps].ravel()
         as_committed = np.concatenate([z_0, chosen])
-        if record.contained and vouched:
+        if record.contained and was_verified:
             constraints = self.constraints_for(as_committed, local_map.widening)
             margin = constraints.margin_in(local_map, as_committed)
             return PlanCandidate(FAILSAFE, tail, as_committed, margin, True, constraints, continues=True)
