@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from brakeline.actors.ros2.ros2_settings import AgeLimits, SensorSettings, Topics
 from brakeline.deploy.commands import common_options as options
@@ -49,6 +49,9 @@ class GraphOptions:
 @dataclass(frozen=True)
 class Ros2Command:
     """The options of `brakeline ros2`."""
+
+    least: ClassVar[dict[str, float]] = {"range_error": 0, "free_at_start": 0}
+    above: ClassVar[dict[str, float]] = {"least_width": 0}
 
     robot: options.Robot = "ground"
     router: tuple[str, ...] = ("tcp/localhost:7447",)

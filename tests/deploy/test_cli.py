@@ -370,6 +370,7 @@ def test_show_prints_a_description(command, figures, robot):
         ("bridge-sim --timeout inf", "--timeout is a number above 0, not inf"),
         ("train --deadline nan --out runs/none", "deadline = nan is not finite"),
         ("train --practice -1 --out runs/none", "practice = -1.0 is not 0 or more"),
+        ("ros2 ground --free-at-start -1", "--free-at-start is a number from 0 on, not -1"),
         ("status --wait -1", "--wait is a number from 0 on, not -1"),
     ],
 )
