@@ -1,8 +1,8 @@
 """Memory of the free space near a robot, as cells of a grid: for directions in which its sensor never sees.
 
-`FanMemory` keeps the last dozen scans. A robot that turns to and fro soon forgets what is behind it, and cannot
-move any more. In this memory, a cell of the grid stays free while it is near the robot. So use it only where
-nothing moves. A cell counts as free if a single scan shows that all of it is free, even with the errors of that scan. At the
+`FanMemory` keeps the last dozen scans. A robot that turns to and fro soon forgets what is behind it, and cannot move
+any more. In this memory, a cell of the grid stays free while it is near the robot. So use it only where nothing
+moves. A cell counts as free if a single scan shows that all of it is free, even with the errors of that scan. At the
 start, an operator may state that a disc about the robot is free. Nothing else makes a cell free.
 
 The memory forgets a cell after the robot has driven `KEPT`. Meanwhile, the poses must stay within their stated errors.
