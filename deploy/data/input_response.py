@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from brakeline.deploy.data.aligned_log import AlignedLog
 from brakeline.deploy.data.motion_check import FEWEST_SPANS, MAX_LAG, SPAN, agreement, same_gain
 from brakeline.deploy.data.sources.quantity_names import COMMAND
-from brakeline.deploy.data.sources.source_table import Series
+from brakeline.deploy.data.sources.source_table import Array, Series
 from brakeline.messaging.robot import Robot
 
 FOLLOWS_CORRELATION = 0.6  # of an input with the coordinate that follows it
@@ -80,27 +81,49 @@ def followed_inputs(robot: Robot) -> Iterator[tuple[int, int]]:
 def estimate_delay(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> float | None:
     """Return the dead time in s from an input to its follower, or None if nothing moved.
 
-    The delay is the shift at which the changes of both over one time step correlate most. A first-order lag responds
-    most strongly at once. Therefore it does not count, and the result is the dead time, to one time step.
+    The delay is the shift at which the changes of both over one time step correlate most, whatever the sign. A
+    first-order lag responds most strongly at once. Therefore it does not count, and the result is the dead time, to one
+    time step.
 
     Args:
         recordings: for each recording the series (time, values) of input and follower, and its begin and end in s.
         period: the robot's period in s.
     """
+    step, responses = response_by_lag(recordings, period)
+    after = np.abs(responses[len(responses) // 2 :][: math.ceil(MAX_DELAY * period / step) + 1])
+    return step * float(after.argmax()) if after.max() > 0.0 else None
+
+
+def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> tuple[float, Array]:
+    """Return a time step in s, and the correlation of the changes of input and follower over it, by lag.
+
+    The lags are -n, ..., n time steps, of which n are `MAX_DELAY` periods or `MAX_LAG`. At a negative lag, the follower changes
+    before its input. If the input or the follower never changes, all correlations are 0.
+    """
     sampled = float(np.median(np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])))
     step = max(sampled, period / STEPS_PER_PERIOD)
-    most = int(np.ceil(MAX_DELAY * period / step))
-    total = np.zeros(most + 1)
-    energy = 0.0
-    for (input_time, inputs), (follower_time, follower), begin, end in recordings:
+    most = math.ceil(max(MAX_DELAY * period, MAX_LAG) / step)
+    total, energy, motion = np.zeros(2 * most + 1), 0.0, 0.0
+    for inputs, (follower_time, follower), begin, end in recordings:
         times = np.arange(begin, end, step)
         if len(times) <= most + 2:
             continue
-        held = inputs[np.clip(np.searchsorted(input_time, times + 1e-6 * step, "right") - 1, 0, None)]
-        changed, moved = np.diff(held), np.diff(np.interp(times, follower_time, follower))
+        changed = np.diff(hold_at(inputs, times + 1e-6 * step))
+        moved = np.diff(np.interp(times, follower_time, follower))
         # A change at t[i] shows in the step after t[i].
-        total += [float(changed[: len(changed) - j - 1] @ moved[j + 1 :]) for j in range(most + 1)]
-        energy += float(changed @ changed)
-    if energy == 0.0 or total.max() <= 0.0:
-        return None
-    return step * float(total.argmax())
+        changed, moved = changed[:-1], moved[1:]
+        n = len(changed)
+        total += [float(changed[max(-k, 0) : n - max(k, 0)] @ moved[max(k, 0) : n + min(k, 0)]) for k in _lags(most)]
+        energy, motion = energy + float(changed @ changed), motion + float(moved @ moved)
+    size = float(np.sqrt(energy * motion))
+    return step, total / size if size > 0.0 else total
+
+
+def hold_at(series: Series, times: Array) -> Array:
+    """Return the last value of a series at or before each time."""
+    time, values = series
+    return values[np.clip(np.searchsorted(time, times, "right") - 1, 0, None)]
+
+
+def _lags(most: int) -> range:
+    return range(-most, most + 1)

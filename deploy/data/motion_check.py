@@ -13,12 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brakeline.deploy.data.aligned_log import AlignedLog, align
-from brakeline.deploy.data.sources.quantity_names import Places
+from brakeline.deploy.data.aligned_log import AlignedLog, Indices
 from brakeline.deploy.data.sources.source_table import Array
 from brakeline.deploy.data.stamps import FACTORS, TIME
 from brakeline.deploy.data.unit_table import COMPASS, UNITS, factor, from_si, in_si
-from brakeline.errors import NoSource
 
 SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
 SAME_CORRELATION = 0.9  # of two columns of the same quantity
@@ -27,6 +25,7 @@ FOLLOWS_CORRELATION = 0.8  # of an input with the motion up to `MAX_LAG` later, 
 MAX_LAG = 1.0  # s
 FEWEST_SPANS = 20  # fewer spans give no result
 LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h and ft/s differ by 10 %
+ALIKE = 1.25  # largest ratio of two gains with one cause: the noise of the positions changes them a little
 HEADING_UNITS = ("rad", "deg", COMPASS)
 UNCONVERTED = "unconverted"  # the reading of a heading without the conversion by --unit
 WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
@@ -38,23 +37,6 @@ class SpeedFit(NamedTuple):
     correlation: float
     gain: float
     unit: str  # SI unit of the speed
-
-
-def refuse_contradictions(
-    places: Places,
-    positions: list[str],
-    inputs: list[str],
-    heading: str,
-    units: Mapping[str, str],
-    given: Mapping[str, str],
-) -> None:
-    """Raise NoSource with what to do if the motion contradicts the unit of a column."""
-    try:
-        log = align(places, positions, inputs, {})
-    except NoSource:
-        return  # too few rows to compare; `resample` says so
-    if problems := contradictions(log, heading, units, given):
-        raise NoSource("\n".join(problems))
 
 
 def contradictions(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
@@ -119,13 +101,10 @@ def heading_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, flo
     On a straight path, a constant agrees as well as the heading does: 0 if the angle does not change. If the column was
     converted from the unit `given`, `UNCONVERTED` is the score without the conversion.
     """
-    i, j = log.spans(SPAN)
-    x, y = (log.change(p, i, j) for p in log.positions[:2])
-    length = np.hypot(x, y)
-    far = np.flatnonzero(length > 0.3 * np.quantile(length, 0.99)) if len(length) else i
-    if len(far) < FEWEST_SPANS:
+    direction, middle = directions_of_motion(log)
+    if not len(middle):
         return dict.fromkeys(HEADING_UNITS, 0.0)
-    direction, middle, scores = np.arctan2(y[far], x[far]), ((i + j) // 2)[far], {}
+    scores = {}
     readings = {unit: in_si(log.columns[name], unit, "rad") for unit in HEADING_UNITS}
     if given:
         readings[UNCONVERTED] = from_si(log.columns[name], given, "rad")
@@ -134,6 +113,19 @@ def heading_scores(log: AlignedLog, name: str, given: str = "") -> dict[str, flo
         turned = np.ptp(angles) > 0.5
         scores[unit] = float(np.abs(np.cos(direction - angles[middle])).mean()) if turned else 0.0
     return scores
+
+
+def directions_of_motion(log: AlignedLog) -> tuple[Array, Indices]:
+    """Return the directions in rad of the spans in which the robot moves, and the row in the middle of each span.
+
+    Both are empty if there are too few of them.
+    """
+    i, j = log.spans(SPAN)
+    x, y = (log.change(p, i, j) for p in log.positions[:2])
+    length = np.hypot(x, y)
+    far = np.flatnonzero(length > 0.3 * np.quantile(length, 0.99)) if len(length) else i
+    far = far if len(far) >= FEWEST_SPANS else far[:0]
+    return np.arctan2(y[far], x[far]), ((i + j) // 2)[far]
 
 
 def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
@@ -153,7 +145,13 @@ def speeds_of_motion(log: AlignedLog, heading: str) -> list[tuple[str, Array]]:
 
 
 def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool) -> SpeedFit | None:
-    """Return the speed of the motion that a column agrees with best, or None. The motion follows an input later."""
+    """Return the speed of the motion that a column agrees with best; None if it agrees with none of them."""
+    best = best_fit(log, name, speeds, is_input)
+    return best if best.correlation > (FOLLOWS_CORRELATION if is_input else SAME_CORRELATION) else None
+
+
+def best_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool) -> SpeedFit:
+    """Return the speed of the motion that correlates most with a column. The motion follows an input later."""
     i, j = log.spans(SPAN)
     sums = np.concatenate([[0.0], np.cumsum(log.columns[name])])
     means = (sums[j + 1] - sums[i]) / (j - i + 1)
@@ -164,8 +162,7 @@ def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_in
         for lag in lags
         if (end := len(means) - lag) >= FEWEST_SPANS
     ]
-    best = max(fits, default=SpeedFit(0.0, 0.0, ""))
-    return best if best.correlation > (FOLLOWS_CORRELATION if is_input else SAME_CORRELATION) else None
+    return max(fits, default=SpeedFit(0.0, 0.0, ""))
 
 
 def agreement(one: Array, other: Array) -> tuple[float, float]:
@@ -211,13 +208,17 @@ def _explained(log: AlignedLog, gains: dict[str, SpeedFit]) -> list[str]:
     """Explain gains by the stamps, if speeds and turn rates have the same, by the positions, or by each column."""
     wrong = {name: fit for name, fit in gains.items() if not same_gain(fit.gain)}
     values = [fit.gain for fit in wrong.values()]
-    alike = len(values) > 0 and max(values) < 1.1 * min(values)
+    alike = len(values) > 0 and max(values) < ALIKE * min(values)
     if alike and {fit.unit for fit in wrong.values()} == {"m/s", "rad/s"} and len(wrong) == len(gains):
         units = [unit for unit, scale in FACTORS.items() if abs(values[0] * scale - 1.0) < LIKE_UNIT]
-        hint = f"They look like {units[0]}: give" if units else "Give"
+        hint = (
+            f"They look like {units[0]}: give the unit of the stamps with --unit {TIME}={units[0]}"
+            if units
+            else "No unit of time explains this: write the time in s into the column (numbers of rows are no time)"
+        )
         return [
             f"the time stamps do not fit: {', '.join(wrong)} are {values[0]:.3g} times as fast as the positions move. "
-            f"{hint} the unit of the stamps with --unit {TIME}={units[0] if units else 'ms'}"
+            f"{hint}"
         ]
     linear = {name: fit for name, fit in gains.items() if fit.unit == "m/s"}
     if alike and wrong.keys() == linear.keys() and values[0] < 1.0:

@@ -18,7 +18,8 @@ from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
 from brakeline.deploy.data.log_options import LogOptions
-from brakeline.deploy.data.motion_check import refuse_contradictions
+from brakeline.deploy.data.motion_sense import refuse_contradictions
+from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.errors import NoSource
@@ -82,6 +83,7 @@ def resample(
     notes = [*notes_of(tables), *chosen, *glitches, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
+    responses = checked_responses(recordings, robot, delay)
     step = float(np.median(np.concatenate([np.diff(r.states[0][0]) for r in recordings])))
     samples = int(np.clip(round(robot.period / step), 1, MAX_SAMPLES))
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]
@@ -97,7 +99,7 @@ def resample(
     data.check()
     uneven = float(np.concatenate([changed for _, changed, _ in resampled]).mean())
     delays = _delays(recordings, robot)
-    notes += _notes(robot, samples, chord_deviation, uneven, delays)
+    notes += [*_notes(robot, samples, chord_deviation, uneven, delays), *responses]
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, uneven, tuple(notes))
     )
@@ -237,9 +239,9 @@ def _notes(robot: Robot, samples: int, chord_deviation: float, uneven: float, de
     notes = [f"{name}: the robot responds {1e3 * d:.0f} ms later (cross-correlation)" for name, d in delays.items()]
     notes += [
         f"{name}: the delay is above one period ({robot.period:g} s), but predictions use one earlier input only. If "
-        "the time stamps are wrong, shift them with --delay; otherwise choose a longer period."
+        f"the time stamps are wrong, shift them with --delay {d:.3g}; otherwise choose a longer period."
         for name, d in delays.items()
-        if d > robot.period
+        if d > 1.01 * robot.period
     ]
     most = f"paths leave their chords by at most {1e3 * chord_deviation:.{1 if samples == 1 else 2}f} mm"
     if not robot.position_dim:

@@ -1,0 +1,115 @@
+"""Compare the senses of a log's columns with its motion: a mirrored heading, an opposite sign, swapped columns.
+
+`motion_check` compares units. A column can have the right unit, and still describe another frame or another quantity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from brakeline.deploy.data.aligned_log import AlignedLog, align
+from brakeline.deploy.data.motion_check import (
+    best_fit,
+    contradictions,
+    directions_of_motion,
+    speed_fit,
+    speeds_of_motion,
+)
+from brakeline.deploy.data.sources.quantity_names import Places
+from brakeline.deploy.data.sources.source_table import Array
+from brakeline.deploy.data.unit_table import AS_IT_IS
+from brakeline.errors import NoSource
+
+COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
+UNRELATED = 0.5  # largest correlation with a column's own quantity, if the column holds another one
+FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
+QUANTITIES = {"m/s": "speed", "rad/s": "turn rate"}
+
+
+def refuse_contradictions(
+    places: Places,
+    positions: list[str],
+    inputs: list[str],
+    heading: str,
+    units: Mapping[str, str],
+    given: Mapping[str, str],
+) -> None:
+    """Raise NoSource with what to do if the motion contradicts a column."""
+    try:
+        log = align(places, positions, inputs, {})
+    except NoSource:
+        return  # too few rows to compare; `resample` says so
+    problems = contradictions(log, heading, units, given) or wrong_senses(log, heading, units, given)
+    if problems:
+        raise NoSource("\n".join(problems))
+
+
+def wrong_senses(log: AlignedLog, heading: str, units: Mapping[str, str], given: Mapping[str, str]) -> list[str]:
+    """Return in sentences which columns the motion contradicts other than by a known unit.
+
+    Args:
+        log: its heading is not unwrapped, and not set.
+        heading: name of the heading; empty for none.
+        units: SI unit that each column should have.
+        given: units that `--unit` names; a column that the user takes as it is counts as right.
+    """
+    if heading and (mirrored := mirrored_heading(log, heading)):
+        return [mirrored]
+    speeds = speeds_of_motion(log, heading)
+    problems = []
+    for name, unit in units.items():
+        if unit in QUANTITIES and name in log.columns and given.get(name) != AS_IT_IS:
+            problems.append(_wrong_sense(log, name, unit, speeds))
+    return [problem for problem in problems if problem]
+
+
+def mirrored_heading(log: AlignedLog, name: str) -> str:
+    """Return what to do if a heading turns against the direction of motion; empty if it does not."""
+    direction, middle = directions_of_motion(log)
+    angles = log.columns[name][middle]
+    if not len(angles) or np.ptp(np.unwrap(log.columns[name])) < 0.5:
+        return ""
+    # A robot that drives backwards moves at pi to its heading, so that only twice the angles can be compared.
+    same, mirrored = (complex(np.exp(2j * (direction - sign * angles)).mean()) for sign in (1.0, -1.0))
+    if abs(mirrored) < COHERENT or abs(same) > INCOHERENT:
+        return ""
+    offset = 0.5 * math.atan2(mirrored.imag, mirrored.real)
+    from_y = abs(abs(offset) - math.pi / 2.0) < 0.4
+    formula = f"pi/2 - {name}" if from_y else f"-{name}"
+    repair = "swap the columns x and y" if from_y else "change the sign of y"
+    return (
+        f"{name} grows clockwise, but x and y show that it must grow counterclockwise from the x axis. Write {formula} "
+        f"into the column, or {repair}, whichever of the two is wrong"
+    )
+
+
+def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, Array]]) -> str:
+    """Return what to do about a column that is not the speed or turn rate that it should be; empty if it is."""
+    is_input = name in log.inputs
+    own, others = ([s for s in speeds if (s[0] == unit) == wanted] for wanted in (True, False))
+    fit = speed_fit(log, name, own, is_input)
+    quantity, as_it_is = QUANTITIES[unit], f"or take the column as it is with --unit {name}={AS_IT_IS}"
+    if fit is not None:
+        if 1.0 / FAR_GAIN[is_input] < fit.gain < FAR_GAIN[is_input]:
+            return ""
+        return (
+            f"{name} is {fit.gain:.3g} times the {quantity} of the positions, and no unit explains this. "
+            f"Write {name} in {unit} and the positions in m, {as_it_is}"
+        )
+    if speed_fit(log, name, [(unit, -values) for _, values in own], is_input) is not None:
+        if is_input:
+            return ""  # its sign is the controller's
+        return (
+            f"{name} has the opposite sign of the {quantity} of the positions. Change the sign of the column, "
+            f"{as_it_is}"
+        )
+    elsewhere = speed_fit(log, name, others, is_input)
+    if elsewhere is None or best_fit(log, name, own, is_input).correlation > UNRELATED:
+        return ""
+    return (
+        f"{name} follows the {QUANTITIES[elsewhere.unit]} of the positions, not their {quantity}: are two columns "
+        f"swapped? Name the right one with --map {name}=COLUMN, {as_it_is}"
+    )

@@ -1,0 +1,104 @@
+"""Check that the robot responds to the inputs of its log: late enough, and at all.
+
+If a command has a stamp that is too late, the model set learns the effect of another command. Its sets are wide, and
+its bound holds only for driving in which commands change as in the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from brakeline.deploy.data.gap_free_recordings import GapFreeRecording
+from brakeline.deploy.data.input_response import MAX_DELAY, followed_inputs, hold_at, response_by_lag
+from brakeline.deploy.data.sources.quantity_names import column_names
+from brakeline.deploy.data.sources.source_table import Array, Series
+from brakeline.errors import NoSource
+from brakeline.messaging.robot import Robot
+
+Recordings = Sequence[tuple[Series, Series, float, float]]  # of input and follower, with begin and end in s
+
+LEAST_LEAD = 0.5  # of a period: a smaller lead of the robot over its input is the jitter of stamps
+CLEARER = 1.5  # times the largest response after the input: the response before it is no chance
+LEAST_RESPONSE = 0.15  # correlation of the changes of an input and its follower
+UNRELATED = 0.2  # correlation with its input that no follower has, if the columns belong together
+LONGEST_LAG = 1.0  # s over which they are compared, or `MAX_DELAY` periods
+MOVED = 0.25  # of an input's range: how far a coordinate moves that does not stand
+FEWEST = 200  # half periods: a shorter log shows no relation
+
+
+def checked_responses(recordings: Sequence[GapFreeRecording], robot: Robot, delay: float) -> list[str]:
+    """Return notes on inputs to which the robot responds in the opposite direction.
+
+    Args:
+        recordings: their inputs are shifted by `delay` already.
+        robot: names the coordinate that follows each input.
+        delay: time in s by which the stamps of the inputs were shifted.
+
+    Raises:
+        NoSource: the robot moves before its inputs change, or whatever they are.
+    """
+    states, inputs = column_names(robot)
+    problems, notes = list[str](), list[str]()
+    for i, follower in followed_inputs(robot):
+        series = [(r.inputs[i], r.states[follower], r.begin, r.end) for r in recordings]
+        step, responses = response_by_lag(series, robot.period)
+        after = responses[len(responses) // 2 :]
+        moved = MOVED * float(robot.high()[i] - robot.low()[i])
+        if (lead := _lead(step, responses)) >= LEAST_LEAD * robot.period:
+            problems.append(
+                f"{inputs[i]}: the robot moves {lead:.3g} s before this input changes, so the stamps of the input are "
+                f"too late, or it is the input of another drive. Shift the stamps with --delay {delay - lead:.3g}"
+            )
+        elif problem := _unrelated(inputs[i], states[follower], series, robot.period, moved):
+            problems.append(problem)
+        elif after.max() < -after.min():
+            notes.append(
+                f"{inputs[i]}: {states[follower]} changes in the opposite direction. If your controller does not use "
+                "this sign, change it in the column"
+            )
+    if problems:
+        raise NoSource("\n".join(problems))
+    return notes
+
+
+def _lead(step: float, responses: Array) -> float:
+    """Return how long the strongest response is before its input [s]; 0 if it is after it, or not clear."""
+    strength, now = np.abs(responses), len(responses) // 2
+    best = int(strength.argmax())
+    clear = strength[best] > max(LEAST_RESPONSE, CLEARER * float(strength[now:].max()))
+    return step * (now - best) if clear and best < now else 0.0
+
+
+def _unrelated(name: str, follower: str, series: Recordings, period: float, moved: float) -> str:
+    """Return what to do if a coordinate does not follow its input; empty if it does, or if the log shows neither."""
+    step = 0.5 * period
+    lags = np.arange(0.0, max(LONGEST_LAG, MAX_DELAY * period), step)
+    times = [np.arange(begin, end - lags[-1], step) for _, _, begin, end in series]
+    if sum(map(len, times)) < FEWEST:
+        return ""
+    held = np.concatenate([hold_at(one[0], clock) for one, clock in zip(series, times, strict=True)])
+    followers = [
+        np.concatenate([np.interp(clock + lag, *one[1]) for one, clock in zip(series, times, strict=True)])
+        for lag in lags
+    ]
+    if np.ptp(followers[0]) < moved:
+        return ""
+    if np.ptp(held) == 0.0:
+        return (
+            f"{name} is always {held[0]:.6g}, but {follower}, which follows it, moves: the column does not hold what "
+            f"the robot was sent. Name the right one with --map {name!r}=COLUMN"
+        )
+    if max(abs(_correlation(held, values)) for values in followers) > UNRELATED:
+        return ""
+    return (
+        f"{follower} does not follow {name} (correlation below {UNRELATED:g}): the columns are swapped, or the input "
+        f"is of another drive. Name the right one with --map {name!r}=COLUMN, or correct `follows` in the description"
+    )
+
+
+def _correlation(one: Array, other: Array) -> float:
+    one, other = one - one.mean(), other - other.mean()
+    size = float(np.sqrt((one @ one) * (other @ other)))
+    return float(one @ other) / size if size > 0.0 else 0.0
