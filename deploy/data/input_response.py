@@ -97,8 +97,8 @@ def estimate_delay(recordings: Sequence[tuple[Series, Series, float, float]], pe
 def response_by_lag(recordings: Sequence[tuple[Series, Series, float, float]], period: float) -> tuple[float, Array]:
     """Return a time step in s, and the correlation of the changes of input and follower over it, by lag.
 
-    The lags are -n, ..., n time steps, of which n are `MAX_DELAY` periods or `MAX_LAG`. At a negative lag, the follower changes
-    before its input. If the input or the follower never changes, all correlations are 0.
+    The lags are -n, ..., n time steps, of which n are `MAX_DELAY` periods or `MAX_LAG`. At a negative lag, the follower
+    changes before its input. If the input or the follower never changes, all correlations are 0.
     """
     sampled = float(np.median(np.concatenate([np.diff(follower[0]) for _, follower, _, _ in recordings])))
     step = max(sampled, period / STEPS_PER_PERIOD)

@@ -8,6 +8,7 @@ asked for was in SI units already.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 from brakeline.deploy.data.aligned_log import AlignedLog, Indices
 from brakeline.deploy.data.sources.source_table import Array
 from brakeline.deploy.data.stamps import FACTORS, TIME
-from brakeline.deploy.data.unit_table import COMPASS, UNITS, factor, from_si, in_si
+from brakeline.deploy.data.unit_table import COMPASS, UNITS, factor, from_si, in_si, unit_option
 
 SPAN = 0.3  # s over which motion is compared with a column: over less, noise dominates
 SAME_CORRELATION = 0.9  # of two columns of the same quantity
@@ -25,7 +26,7 @@ FOLLOWS_CORRELATION = 0.8  # of an input with the motion up to `MAX_LAG` later, 
 MAX_LAG = 1.0  # s
 FEWEST_SPANS = 20  # fewer spans give no result
 LIKE_UNIT = 0.06  # largest relative difference of a gain from a unit's: km/h and ft/s differ by 10 %
-ALIKE = 1.25  # largest ratio of two gains with one cause: the noise of the positions changes them a little
+ALIKE = 1.5  # largest ratio of two gains with one cause: noise and curved paths change them a little
 HEADING_UNITS = ("rad", "deg", COMPASS)
 UNCONVERTED = "unconverted"  # the reading of a heading without the conversion by --unit
 WORDS = {"deg": "degrees", COMPASS: "a compass heading (degrees, clockwise from y)"}
@@ -76,14 +77,15 @@ def needlessly_converted(fit: SpeedFit, given: str) -> bool:
 
 def needless_conversion(name: str, given: str, si: str) -> str:
     """Return the sentence for a column that agrees with the motion only without its conversion."""
-    return f"{name} is in {si} already: only without --unit {name}={given} does the motion agree with it. Leave it out"
+    option = unit_option(name, given)
+    return f"{name} is in {si} already: only without {option} does the motion agree with it. Leave it out"
 
 
 def heading_contradiction(name: str, unit: str, score: float) -> str:
     """Return the sentence for a heading that the motion follows in another unit only."""
     return (
         f"{name} looks like {WORDS[unit]}: in that unit, the motion agrees with it ({score:.0%}), in rad it does not. "
-        f"Convert it with --unit {name}={unit}"
+        f"Convert it with {unit_option(name, unit)}"
     )
 
 
@@ -198,7 +200,7 @@ def speed_contradiction(name: str, fit: SpeedFit) -> str:
     what = "speed" if fit.unit == "m/s" else "turn rate"
     return (
         f"{name} looks like {unit}: it is {fit.gain:.3g} times the {what} of the positions in {fit.unit}. "
-        f"Convert it with --unit {name}={unit}"
+        f"Convert it with {unit_option(name, unit)}"
         if unit
         else ""
     )
@@ -224,7 +226,7 @@ def _explained(log: AlignedLog, gains: dict[str, SpeedFit]) -> list[str]:
     if alike and wrong.keys() == linear.keys() and values[0] < 1.0:
         unit = next((u for u, scale in UNITS["m"].items() if abs(values[0] / scale - 1.0) < LIKE_UNIT), "")
         if unit:
-            words = " ".join(f"{name}={unit}" for name in log.positions)
+            words = " ".join(shlex.quote(f"{name}={unit}") for name in log.positions)
             return [
                 f"{', '.join(log.positions)} look like {unit}: they move {1 / values[0]:.3g} times as fast as "
                 f"{', '.join(wrong)}. Convert them with --unit {words}"

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,7 +21,7 @@ from brakeline.deploy.data.motion_check import (
 )
 from brakeline.deploy.data.sources.quantity_names import Places
 from brakeline.deploy.data.sources.source_table import Array
-from brakeline.deploy.data.unit_table import AS_IT_IS
+from brakeline.deploy.data.unit_table import AS_IT_IS, unit_option
 from brakeline.errors import NoSource
 
 COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
@@ -91,7 +92,7 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
     is_input = name in log.inputs
     own, others = ([s for s in speeds if (s[0] == unit) == wanted] for wanted in (True, False))
     fit = speed_fit(log, name, own, is_input)
-    quantity, as_it_is = QUANTITIES[unit], f"or take the column as it is with --unit {name}={AS_IT_IS}"
+    quantity, as_it_is = QUANTITIES[unit], f"or take the column as it is with {unit_option(name, AS_IT_IS)}"
     if fit is not None:
         if 1.0 / FAR_GAIN[is_input] < fit.gain < FAR_GAIN[is_input]:
             return ""
@@ -111,5 +112,5 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
         return ""
     return (
         f"{name} follows the {QUANTITIES[elsewhere.unit]} of the positions, not their {quantity}: are two columns "
-        f"swapped? Name the right one with --map {name}=COLUMN, {as_it_is}"
+        f"swapped? Name the right one with --map {shlex.quote(name)}=COLUMN, {as_it_is}"
     )

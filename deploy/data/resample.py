@@ -16,13 +16,14 @@ import numpy as np
 
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
 from brakeline.deploy.data.glitches import without_glitches
+from brakeline.deploy.data.held_values import without_held_poses
 from brakeline.deploy.data.input_response import estimate_delay, followed_inputs
 from brakeline.deploy.data.log_options import LogOptions
 from brakeline.deploy.data.motion_sense import refuse_contradictions
 from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
-from brakeline.errors import NoSource
+from brakeline.errors import BadData, NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
 from brakeline.safety.model.dataset import Dataset, Trajectory, bends
@@ -76,11 +77,13 @@ def resample(
     positions, heading = states[: robot.position_dim], "" if robot.heading is None else states[robot.heading]
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
+    pose = [*positions, *([heading] if heading else [])]
+    places, held = without_held_poses(places, pose, states)
     places, glitches = without_glitches(places, positions, heading, inputs)
     if robot.position_dim:
         refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)
-    notes = [*notes_of(tables), *chosen, *glitches, *cuts]
+    notes = [*notes_of(tables), *chosen, *held, *glitches, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     responses = checked_responses(recordings, robot, delay)
@@ -96,7 +99,13 @@ def resample(
     parts = tuple(part for t in pieces for part in _split(t, longest))
     chord_deviation = _chord_deviation(robot, parts, samples)
     data = Dataset(robot, parts, {"origin": "import"}, chord_deviation)
-    data.check()
+    try:
+        data.check()
+    except BadData as error:
+        raise NoSource(
+            f"{error} If not: there is a position every {step:.3g} s, which does not show where the robot is when an "
+            "input changes. Log the state more often, or at the moments when the inputs change"
+        ) from error
     uneven = float(np.concatenate([changed for _, changed, _ in resampled]).mean())
     delays = _delays(recordings, robot)
     notes += [*_notes(robot, samples, chord_deviation, uneven, delays), *responses]

@@ -6,12 +6,14 @@ its bound holds only for driving in which commands change as in the log.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 import numpy as np
 
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording
 from brakeline.deploy.data.input_response import MAX_DELAY, followed_inputs, hold_at, response_by_lag
+from brakeline.deploy.data.motion_check import MAX_LAG
 from brakeline.deploy.data.sources.quantity_names import column_names
 from brakeline.deploy.data.sources.source_table import Array, Series
 from brakeline.errors import NoSource
@@ -23,7 +25,6 @@ LEAST_LEAD = 0.5  # of a period: a smaller lead of the robot over its input is t
 CLEARER = 1.5  # times the largest response after the input: the response before it is no chance
 LEAST_RESPONSE = 0.15  # correlation of the changes of an input and its follower
 UNRELATED = 0.2  # correlation with its input that no follower has, if the columns belong together
-LONGEST_LAG = 1.0  # s over which they are compared, or `MAX_DELAY` periods
 MOVED = 0.25  # of an input's range: how far a coordinate moves that does not stand
 FEWEST = 200  # half periods: a shorter log shows no relation
 
@@ -42,16 +43,19 @@ def checked_responses(recordings: Sequence[GapFreeRecording], robot: Robot, dela
     states, inputs = column_names(robot)
     problems, notes = list[str](), list[str]()
     for i, follower in followed_inputs(robot):
-        series = [(r.inputs[i], r.states[follower], r.begin, r.end) for r in recordings]
+        low, high = float(robot.low()[i]), float(robot.high()[i])
+        series = [
+            ((r.inputs[i][0], np.clip(r.inputs[i][1], low, high)), r.states[follower], r.begin, r.end)
+            for r in recordings
+        ]  # a glitch of an input is beyond its bounds
         step, responses = response_by_lag(series, robot.period)
         after = responses[len(responses) // 2 :]
-        moved = MOVED * float(robot.high()[i] - robot.low()[i])
         if (lead := _lead(step, responses)) >= LEAST_LEAD * robot.period:
             problems.append(
                 f"{inputs[i]}: the robot moves {lead:.3g} s before this input changes, so the stamps of the input are "
                 f"too late, or it is the input of another drive. Shift the stamps with --delay {delay - lead:.3g}"
             )
-        elif problem := _unrelated(inputs[i], states[follower], series, robot.period, moved):
+        elif problem := _unrelated(inputs[i], states[follower], series, robot.period, MOVED * (high - low)):
             problems.append(problem)
         elif after.max() < -after.min():
             notes.append(
@@ -74,7 +78,7 @@ def _lead(step: float, responses: Array) -> float:
 def _unrelated(name: str, follower: str, series: Recordings, period: float, moved: float) -> str:
     """Return what to do if a coordinate does not follow its input; empty if it does, or if the log shows neither."""
     step = 0.5 * period
-    lags = np.arange(0.0, max(LONGEST_LAG, MAX_DELAY * period), step)
+    lags = np.arange(0.0, max(MAX_LAG, MAX_DELAY * period), step)
     times = [np.arange(begin, end - lags[-1], step) for _, _, begin, end in series]
     if sum(map(len, times)) < FEWEST:
         return ""
@@ -88,13 +92,14 @@ def _unrelated(name: str, follower: str, series: Recordings, period: float, move
     if np.ptp(held) == 0.0:
         return (
             f"{name} is always {held[0]:.6g}, but {follower}, which follows it, moves: the column does not hold what "
-            f"the robot was sent. Name the right one with --map {name!r}=COLUMN"
+            f"the robot was sent. Name the right one with --map {shlex.quote(name)}=COLUMN"
         )
     if max(abs(_correlation(held, values)) for values in followers) > UNRELATED:
         return ""
     return (
         f"{follower} does not follow {name} (correlation below {UNRELATED:g}): the columns are swapped, or the input "
-        f"is of another drive. Name the right one with --map {name!r}=COLUMN, or correct `follows` in the description"
+        f"is of another drive. Name the right one with --map {shlex.quote(name)}=COLUMN, or correct `follows` in the "
+        "description"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Iterable
 
 import numpy as np
@@ -88,6 +89,15 @@ def unknown_unit(name: str) -> str:
     """Return what a header `NAME [UNIT]` or `NAME (UNIT)` has in place of a known unit; empty if there is nothing."""
     match = WITH_UNIT.fullmatch(name.strip())
     return match[2] if match and factor(match[2]) is None else ""
+
+
+def unit_option(name: str, unit: str) -> str:
+    """Return the option that converts a column from a unit, as a shell takes it.
+
+    >>> unit_option("turn rate", "rpm")
+    "--unit 'turn rate=rpm'"
+    """
+    return f"--unit {shlex.quote(f'{name}={unit}')}"
 
 
 def chosen_units(words: Iterable[str]) -> dict[str, str]:

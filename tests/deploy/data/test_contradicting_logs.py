@@ -1,0 +1,158 @@
+"""Columns that have the right unit and still describe something else: `import` refuses them, and says what to do."""
+
+import math
+
+import numpy as np
+import pytest
+
+from brakeline.deploy.cli import main
+from tests.deploy.data.porter import COLUMNS, FILE, drive, write_csv
+
+pytestmark = pytest.mark.usefixtures("reading_here")
+X, Y, HEADING, V, W, SPEED, TURN = range(len(COLUMNS))
+PERIOD = 10  # rows
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(seconds=120.0)
+
+
+def late(values, columns, rows):
+    values[rows:, columns] = values[:-rows, columns]
+    values[:rows, columns] = 0.0
+
+
+def wrapped(angles):
+    return (angles + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def mirror_y(values):
+    values[:, Y] *= -1.0
+
+
+def clockwise_from_y(values):
+    values[:, HEADING] = wrapped(math.pi / 2.0 - values[:, HEADING])
+
+
+def swap(one, other):
+    def swapped(values):
+        values[:, [one, other]] = values[:, [other, one]]
+
+    return swapped
+
+
+def opposite(column):
+    def negated(values):
+        values[:, column] *= -1.0
+
+    return negated
+
+
+def of_another_drive(values):
+    values[:, [SPEED, TURN]] = drive(seconds=120.0, seed=7)[1][:, [SPEED, TURN]]
+
+
+def percent(values):
+    values[:, SPEED] *= 100.0 / 0.6
+
+
+def nothing_sent(values):
+    values[:, [SPEED, TURN]] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("mistake", "said"),
+    [
+        (mirror_y, "Write -heading into the column, or change the sign of y"),
+        (clockwise_from_y, "Write pi/2 - heading into the column, or swap the columns x and y"),
+        (swap(X, Y), "or swap the columns x and y"),
+        (opposite(W), "w has the opposite sign of the turn rate of the positions"),
+        (swap(V, W), "v follows the turn rate of the positions, not their speed: are two columns swapped?"),
+        (swap(SPEED, TURN), "speed follows the turn rate of the positions"),
+        (percent, "times the speed of the positions, and no unit explains this. Write speed in m/s"),
+        (lambda values: late(values, [SPEED, TURN], PERIOD), "Shift the stamps with --delay -0.2"),
+        (lambda values: late(values, [SPEED, TURN], 4 * PERIOD), "Shift the stamps with --delay -0.8"),
+        (of_another_drive, "v does not follow speed"),
+        (nothing_sent, "speed is always 0, but v, which follows it, moves"),
+    ],
+)
+def test_a_column_that_contradicts_the_motion_is_refused(driven, tmp_path, capsys, mistake, said):
+    time, values = driven[0], driven[1].copy()
+    mistake(values)
+    status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys)
+    assert status == 1 and said in text and "Traceback" not in text
+
+
+def test_late_inputs_are_imported_with_the_delay_that_the_error_names(driven, tmp_path, capsys):
+    time, values = driven[0], driven[1].copy()
+    late(values, [SPEED, TURN], PERIOD)
+    status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys, "--delay", "-0.2")
+    assert status == 0, text
+
+
+def test_a_state_with_the_opposite_sign_can_be_taken_as_it_is(driven, tmp_path, capsys):
+    time, values = driven[0], driven[1].copy()
+    values[:, W] *= -1.0
+    status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys, "--unit", "w=1")
+    assert status == 0, text
+
+
+def test_an_input_with_the_opposite_sign_is_noted(driven, tmp_path, capsys):
+    time, values = driven[0], driven[1].copy()
+    values[:, TURN] *= -1.0
+    status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys)
+    assert status == 0 and "turn rate: w changes in the opposite direction" in text and "speed: v" not in text
+
+
+def test_stamps_in_no_unit_of_time_are_refused(driven, tmp_path, capsys):
+    """A log whose rows are numbered as if there were 500 a second, not 50."""
+    time, values = driven
+    path = write_csv(tmp_path / "drive.csv", time, values)
+    cells = [line.split(",", 1) for line in path.read_text().splitlines()[1:]]
+    path.write_text("\n".join([f"time,{','.join(COLUMNS)}", *(f"{0.1 * float(t):.3f},{rest}" for t, rest in cells)]))
+    status, text = imported(path, capsys)
+    assert status == 1 and "No unit of time explains this: write the time in s" in text
+
+
+# --- poses that are no measurements ---------------------------------------------------------------------------------
+
+
+def test_rows_that_repeat_a_pose_are_no_measurements(driven, tmp_path, capsys, figures):
+    """As many positions per period, and as large a chord deviation, as the log without these rows."""
+    time, values = driven
+    held = values.copy()
+    held[:, : W + 1] = values[np.arange(len(values)) // 5 * 5, : W + 1]
+    path, out = write_csv(tmp_path / "held.csv", time, held), tmp_path / "a.safetensors"
+    report = figures("import", path, "--robot", FILE, "--out", out)["report"]
+    assert any("x, y, heading change only in every 5th row" in note for note in report["notes"])
+    sparse = write_csv(tmp_path / "sparse.csv", time[::5], values[::5])
+    honest = figures("import", sparse, "--robot", FILE, "--out", out)["report"]
+    assert report["samples"] == honest["samples"] == 2
+    assert report["chord_deviation"] == pytest.approx(honest["chord_deviation"], rel=0.05)
+
+
+def test_a_pose_that_is_lost_for_seconds_is_left_out(driven, tmp_path, capsys, figures):
+    time, values = driven[0], driven[1].copy()
+    values[2000:2500, : W + 1] = values[2000, : W + 1]
+    path, out = write_csv(tmp_path / "lost.csv", time, values), tmp_path / "a.safetensors"
+    report = figures("import", path, "--robot", FILE, "--out", out)["report"]
+    assert any("line 2002: the pose stays the same for 9.98 s, then jumps" in note for note in report["notes"])
+    assert report["periods"] <= 600 - 10.0 / 0.2
+
+
+def test_a_robot_that_stands_may_repeat_its_pose(driven, tmp_path, capsys, figures):
+    time, values = driven[0], driven[1].copy()
+    for k in (
+        np.flatnonzero((np.abs(values[1:, V]) < 0.03) & (values[1:, SPEED] == 0.0) & (values[1:, TURN] == 0.0)) + 1
+    ):
+        values[k, : W + 1] = values[k - 1, : W + 1]
+    path, out = write_csv(tmp_path / "quiet.csv", time, values), tmp_path / "a.safetensors"
+    report = figures("import", path, "--robot", FILE, "--out", out)["report"]
+    assert report["samples"] == 10 and not any("repeat" in note or "jump" in note for note in report["notes"])
+
+
+def imported(path, capsys, *words):
+    status = main(["import", str(path), "--robot", str(FILE), "--out", str(path.with_suffix(".safetensors")), *words])
+    printed = capsys.readouterr()
+    return status, " ".join((printed.out + printed.err).split())
