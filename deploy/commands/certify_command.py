@@ -251,7 +251,7 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
         table.add_column(column)
     for column in (
         *("samples", "rank", "condition", "plans", "violations", "≤ per step", "≤ per plan", "≤ per episode"),
-        *("outside an hour", "stop from rest", "from full speed", "clearance margin"),
+        *("steps outside in an hour", "stop from rest", "from full speed", "clearance margin"),
     ):
         table.add_column(column, justify="right")
     for s, windows in rows:
@@ -260,11 +260,12 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
-            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f} steps"),
+            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f}"),
             *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
             width(s.clearance_margin),
         )
-    table.caption = "* the default; half-widths of a full stop, largest axis"
+    starred = any(s.certificate == RESIDUAL and s.mode == "direct" for s, _ in rows)
+    table.caption = f"{'* the default; ' if starred else ''}half-widths of a full stop, largest axis"
     if any(s.unit != "m" for s, _ in rows):
         table.caption += "; in joint space, shares of half the distance between a limit and the opposite one"
     return table

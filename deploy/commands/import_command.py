@@ -63,11 +63,15 @@ class ImportCommand:
                 imported.data.save(path)
         figures: dict[str, Any] = {"path": None if covered.refused else str(path), "digest": imported.data.digest()}
         figures |= {"report": asdict(imported.report), "coverage": asdict(covered), "refused": covered.refused}
+        lengths = (
+            f"{covered.windows} windows of a plan's length ({robot.horizon} periods; they overlap), {covered.plans} of "
+            "them brake as the filter's plans do"
+        )
         counts = f"{imported.data.periods} periods in {imported.report.trajectories} trajectories"
         missing = [Text.from_markup(f"[yellow]missing:[/] {escape(text)}") for text in covered.missing]
         next_command = f"brakeline certify {self.robot} --data {path} --use"
         following = [] if covered.refused else [f"{path}: {counts}", f"next: {next_command}"]
-        print_result(self.json, figures, *imported.report.notes, coverage_table(covered), *missing, *following)
+        print_result(self.json, figures, *imported.report.notes, coverage_table(covered), lengths, *missing, *following)
         if covered.refused and not self.json:
             errors.print(f"[red]refused:[/] no model set can be made of this: {escape(covered.refused)}")
         return int(bool(covered.refused))
@@ -82,5 +86,4 @@ def coverage_table(covered: Coverage) -> StackingTable:
         bounds = f"{one.low:g} to {one.high:g} {one.unit}"
         table.add_row(one.name, f"{one.least:.3g}", f"{one.most:.3g}", bounds, f"{one.share:.0%}")
     table.add_row("stops", str(covered.stops))
-    table.add_row("windows", f"{covered.plans} of plans", f"{covered.windows} free")
     return table

@@ -83,6 +83,9 @@ class QueryCommand:
             self.json,
             figures,
             Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}"),
+            "proposed "
+            + ", ".join(map(quantity, robot.action, action))
+            + ("" if self.action else " (the highest inputs; choose others with --action)"),
             "execute " + ", ".join(map(quantity, robot.action, answer.action)),
             describe_verification(answer.verified, answer.bound),
             plan_table(answer, robot.action),

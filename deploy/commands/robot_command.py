@@ -24,6 +24,11 @@ from brakeline.messaging.task import RobotWithTask, Task, robot_maybe_with_task
 if TYPE_CHECKING:
     from brakeline.deploy.data.log_options import LogOptions
 
+NOT_SHOWN = (
+    "the log does not show the body, `sight` and the measurement errors (`error`): the template's values remain. "
+    "Measure the robot, and replace them"
+)
+
 
 @dataclass(frozen=True)
 class RobotCommand:
@@ -163,7 +168,7 @@ def _from_logs(sources: tuple[Path, ...], template: str, name: str, options: Log
         except (BadDescription, tomllib.TOMLDecodeError) as error:
             problems = str(error)
         else:
-            return text, one.notes
+            return text, (*one.notes, NOT_SHOWN)
     reasons = "\n  ".join((*schema.notes, problems))
     raise NoSource(
         f"{names}: no description without mistakes follows from it. Drive so that every input takes several values and "

@@ -28,6 +28,7 @@ from brakeline.safety.model.windows import FREE, PLAN, resting_periods_at_end, s
 NEAR = 0.05  # share of an input's range: values this close to a bound count as at the bound
 FEWEST_CRUISES = plans_needed(0.1)  # plans of a kind that, without a violation, bound its share outside by 10 %
 MOST_SHOWN = 3  # groups of violations in a message
+VAGUE = 0.25  # of a plan's way: a wider tube shows that the model predicts little
 MOST_PLANS = 10**6  # largest number of plans that advice asks for
 
 
@@ -155,7 +156,23 @@ def recording_advice(report: ValidationReport, data: Dataset) -> list[str]:
     With these data, the bound is within the robot's limit, turns on the spot have bounds of their own, and much is
     known of a policy that keeps an input at its bound. The list is empty if all this is so already.
     """
-    return _turns_missing(report, data.robot) + _cruises_missing(report, data.robot) + _too_loose(report, data)
+    robot = data.robot
+    missing = _relation_missing(report, data) + _turns_missing(report, robot) + _cruises_missing(report, robot)
+    return missing + _too_loose(report, data)
+
+
+def _relation_missing(report: ValidationReport, data: Dataset) -> list[str]:
+    """Return advice if a learned period predicts little of a plan: columns, stamps or the description are wrong."""
+    horizon, d = data.robot.horizon, data.robot.position_dim
+    ways = [np.linalg.norm(t.states[horizon:, :d] - t.states[:-horizon, :d], axis=1) for t in data.trajectories]
+    way = float(np.quantile(np.concatenate(ways), 0.99)) if d and any(map(len, ways)) else 0.0
+    if report.mode != ONE_STEP or report.unit != "m" or report.half_width_full <= VAGUE * way:
+        return []
+    return [
+        f"a clear relation between inputs and motion: where the robot stops from full speed is known only to "
+        f"±{report.half_width_full:.2g} m, and a plan is {way:.2g} m long. Look for a wrong column, sign or time stamp "
+        "in the log, for a state that the description lacks, and for a delay of more than one period"
+    ]
 
 
 def _turns_missing(report: ValidationReport, robot: Robot) -> list[str]:

@@ -75,7 +75,7 @@ def gap_free_recordings(
             part = [_within(series, begin, end) for series in states]
             if all(len(time) >= 2 for time, _ in part):
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
-    counts = {"gaps": gaps, "jumps of the pose": jumps}
+    counts = {"gaps in the stamps: the recording is cut there": gaps, "jumps of the pose": jumps}
     counts["rows with the stamp of the row before and another pose: left out"] = shared
     return recordings, [f"{count} {what}" for what, count in counts.items() if count]
 

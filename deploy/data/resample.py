@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from brakeline.deploy.data.beat import find_beat
 from brakeline.deploy.data.gap_free_recordings import GapFreeRecording, gap_free_recordings
 from brakeline.deploy.data.glitches import without_glitches
 from brakeline.deploy.data.held_values import without_held_poses
@@ -34,6 +35,8 @@ FEWEST_PERIODS = 5  # shorter trajectories are dropped
 LONGEST, FEWEST_PARTS = 300, 60  # periods per trajectory; number of trajectories, so that 30 % can be held out
 MAX_SAMPLES = 20  # positions per period
 SAME = 1e-6  # s: closer times are the same, but for rounding
+LIKE_A_BEAT = 0.9  # share of the times between changes that are multiples of a beat
+NEAR_MULTIPLE = 0.05  # of a beat: how far from a multiple of it the period counts as one
 PHASES = 40  # bins of the phase at which inputs change
 
 
@@ -92,7 +95,7 @@ def resample(
     resampled = [_trajectories(recording, robot, samples) for recording in recordings]
     pieces = [t for trajectories, _, _ in resampled for t in trajectories]
     if out := sum(beyond for _, _, beyond in resampled):
-        notes.append(f"{out} periods left out: an input was outside the robot's bounds")
+        notes.append(f"{out} periods left out: an input was outside the robot's bounds ({_beyond(recordings, robot)})")
     if not pieces:
         raise NoSource("; ".join((*notes, f"fewer than {FEWEST_PERIODS} consecutive periods are left")))
     longest = int(np.clip(sum(len(t.inputs) for t in pieces) // FEWEST_PARTS, 4 * robot.horizon, LONGEST))
@@ -108,6 +111,7 @@ def resample(
         ) from error
     uneven = float(np.concatenate([changed for _, changed, _ in resampled]).mean())
     delays = _delays(recordings, robot)
+    notes += _beat_notes(recordings, robot, uneven)
     notes += [*_notes(robot, samples, chord_deviation, uneven, delays), *responses]
     return ImportedData(
         data, ImportReport(data.periods, len(parts), samples, chord_deviation, delays, uneven, tuple(notes))
@@ -232,6 +236,35 @@ def _chord_deviation(robot: Robot, parts: Sequence[Trajectory], samples: int) ->
         around = np.concatenate([[0.0], D]) + np.concatenate([D, [0.0]])
         worst = max(worst, float(around.max(initial=0.0)))
     return worst / 4.0 / samples**2
+
+
+def _beyond(recordings: list[GapFreeRecording], robot: Robot) -> str:
+    """Return the ranges of the inputs that leave their bounds, with the bounds."""
+    ranges = []
+    for i, name in enumerate(column_names(robot)[1]):
+        values = np.concatenate([r.inputs[i][1] for r in recordings])
+        low, high = float(robot.low()[i]), float(robot.high()[i])
+        if values.min() < low or values.max() > high:
+            ranges.append(f"{name} {values.min():.3g} to {values.max():.3g}, bounds {low:g} to {high:g}")
+    return "; ".join(ranges)
+
+
+def _beat_notes(recordings: Sequence[GapFreeRecording], robot: Robot, uneven: float) -> list[str]:
+    """Return a note if the inputs change at multiples of another time than the period, or within many periods."""
+    between = [
+        np.diff(np.unique(np.concatenate([time[1:][np.diff(v) != 0.0] for time, v in r.inputs]))) for r in recordings
+    ]
+    step = float(np.median(np.concatenate([np.diff(time) for r in recordings for time, _ in r.inputs])))
+    beat = find_beat(np.concatenate(between), step)
+    if beat is None or beat.share < LIKE_A_BEAT:
+        return []
+    ratio = robot.period / beat.seconds
+    if abs(ratio - round(ratio)) < NEAR_MULTIPLE and ratio > 0.5 and uneven < 1.0 - MOSTLY:
+        return []
+    return [
+        f"the inputs change at multiples of {beat.seconds:.3g} s, but the description's period is {robot.period:g} s: "
+        f"if your controller sends inputs every {beat.seconds:.3g} s, write `period = {beat.seconds:.3g}`"
+    ]
 
 
 def _delays(recordings: list[GapFreeRecording], robot: Robot) -> dict[str, float]:

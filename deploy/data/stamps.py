@@ -63,6 +63,8 @@ def stamped(table: Table, column: str = "", unit: str = "") -> Table:
         raise NoSource(f"a row has no number in `{RUN}`")
     runs = np.unique(run, return_inverse=True)[1].astype(np.intp)  # only the identity of a run matters
     steps = np.diff(stamps[valid])[np.diff(runs[valid]) == 0]
+    if len(steps) and (steps < 0.0).all():
+        raise NoSource(f"column {name}: the time runs backwards from row to row. Write the rows in the opposite order")
     steps = steps[steps > 0.0]
     if not len(steps) and np.count_nonzero(valid) > 1:
         raise NoSource(f"column {name}: the time stamps never increase; name another column with --map {TIME}=COLUMN")

@@ -76,6 +76,7 @@ def read(path: Path) -> list[Table]:
         raise NoSource(
             f"{path}, line {dialect.numbers[first] if dialect.lines else 1}: {cells} cells, but the header has "
             f"{len(dialect.names)} names ({len(skipped)} of {len(dialect.lines)} lines do not fit it)"
+            + _decimal_commas(dialect, cells)
         )
     if skipped:
         where = _listed([dialect.numbers[i] for i in skipped])
@@ -88,6 +89,13 @@ def read(path: Path) -> list[Table]:
         if note:
             dialect.notes.append(f"{path.name}, column {name}, {note}")
     return [Table("", np.zeros(0), columns, notes=tuple(dialect.notes), lines=numbers)]
+
+
+def _decimal_commas(dialect: _Dialect, cells: int) -> str:
+    """Return what to do if commas separate cells and decimals both, so that lines have about twice the cells."""
+    if dialect.separator != "," or not 1.5 * len(dialect.names) < cells <= 2 * len(dialect.names):
+        return ""
+    return ". If the numbers have decimal commas, write the file with semicolons between its cells, or decimal points"
 
 
 def _dialect(path: Path) -> _Dialect:

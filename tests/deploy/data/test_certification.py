@@ -91,6 +91,14 @@ def test_with_few_violations_more_of_the_same_helps_and_within_the_limit_nothing
     assert not recording_advice(held, replace(data, robot=replace(GROUND, accept_bound=limit)))
 
 
+def test_a_tube_as_wide_as_a_plan_is_long_asks_for_the_columns(held, data):
+    loose = replace(data, robot=replace(GROUND, accept_bound=0.9))
+    vague = replace(held, mode="one-step", half_width_full=0.2)
+    (line,) = recording_advice(vague, loose)
+    assert "known only to ±0.2 m" in line and "Look for a wrong column, sign or time stamp" in line
+    assert not recording_advice(replace(vague, half_width_full=0.01), loose)
+
+
 def test_few_cruises_are_missing_from_the_data_of_a_policy_that_will_cruise(held, data):
     groups = tuple(
         GroupStatement(name, 9 * n, n, 0, 0.0, 1.0, 1.0, 0, 1.0)

@@ -115,6 +115,39 @@ def test_stamps_in_no_unit_of_time_are_refused(driven, tmp_path, capsys):
     assert status == 1 and "No unit of time explains this: write the time in s" in text
 
 
+def test_rows_in_the_opposite_order_are_named(driven, tmp_path, capsys):
+    time, values = driven
+    status, text = imported(write_csv(tmp_path / "drive.csv", time[::-1], values[::-1]), capsys)
+    assert status == 1 and "the time runs backwards from row to row. Write the rows in the opposite order" in text
+
+
+def test_decimal_commas_between_commas_are_named(driven, tmp_path, capsys):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    path.write_text(path.read_text().replace(".", ","))
+    status, text = imported(path, capsys)
+    assert status == 1 and "If the numbers have decimal commas, write the file with semicolons" in text
+
+
+@pytest.mark.parametrize(("period", "noted"), [(0.1, False), (0.2, False), (0.25, True), (0.05, True), (1.0, True)])
+def test_a_period_that_is_not_the_controllers_is_noted(driven, tmp_path, capsys, period, noted):
+    """The joystick of the log speaks every 0.1 s."""
+    robot = tmp_path / "porter.toml"
+    robot.write_text(FILE.read_text().replace("period = 0.2", f"period = {period}"))
+    held = driven[1].copy()
+    if period == 0.2:  # whose inputs change every 0.2 s
+        held[:, [SPEED, TURN]] = held[np.arange(len(held)) // PERIOD * PERIOD][:, [SPEED, TURN]]
+    status, text = imported(write_csv(tmp_path / "drive.csv", driven[0], held), capsys, robot=robot)
+    assert ("inputs change at multiples of 0.1 s" in text and "write `period = 0.1`" in text) == noted, (status, text)
+
+
+def test_inputs_beyond_their_bounds_are_named_with_their_range(driven, tmp_path, capsys):
+    robot = tmp_path / "porter.toml"
+    robot.write_text(FILE.read_text().replace("high = 0.6", "high = 0.4"))
+    status, text = imported(write_csv(tmp_path / "drive.csv", *driven), capsys, robot=robot)
+    assert status == 0 and "(speed 0 to 0.6, bounds 0 to 0.4)" in text
+    assert "windows of a plan's length (5 periods; they overlap)" in text
+
+
 # --- poses that are no measurements ---------------------------------------------------------------------------------
 
 
@@ -152,7 +185,7 @@ def test_a_robot_that_stands_may_repeat_its_pose(driven, tmp_path, capsys, figur
     assert report["samples"] == 10 and not any("repeat" in note or "jump" in note for note in report["notes"])
 
 
-def imported(path, capsys, *words):
-    status = main(["import", str(path), "--robot", str(FILE), "--out", str(path.with_suffix(".safetensors")), *words])
+def imported(path, capsys, *words, robot=FILE):
+    status = main(["import", str(path), "--robot", str(robot), "--out", str(path.with_suffix(".safetensors")), *words])
     printed = capsys.readouterr()
     return status, " ".join((printed.out + printed.err).split())
