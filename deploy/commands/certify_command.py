@@ -251,7 +251,7 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
         table.add_column(column)
     for column in (
         *("samples", "rank", "condition", "plans", "violations", "≤ per step", "≤ per plan", "≤ per episode"),
-        *("steps outside in an hour", "stop from rest", "from full speed", "clearance margin"),
+        *("outside, in an hour", "stop from rest", "from full speed", "clearance margin"),
     ):
         table.add_column(column, justify="right")
     for s, windows in rows:
@@ -260,7 +260,7 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             s.mode + ("" if s.certificate != RESIDUAL or s.mode != "direct" else " *"),
             windows,
             *(str(s.samples), str(s.rank), f"{s.condition:.0f}", str(s.windows), str(s.violations)),
-            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f}"),
+            *(percent(s.bound_step), percent(s.bound_plan), percent(s.bound_episode), f"≤ {s.outside_hour:.0f} steps"),
             *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
             width(s.clearance_margin),
         )

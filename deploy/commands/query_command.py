@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import ClassVar
@@ -83,15 +84,19 @@ class QueryCommand:
             self.json,
             figures,
             Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}"),
-            "proposed "
-            + ", ".join(map(quantity, robot.action, action))
-            + ("" if self.action else " (the highest inputs; choose others with --action)"),
+            proposal(robot.action, action, given=bool(self.action)),
             "execute " + ", ".join(map(quantity, robot.action, answer.action)),
             describe_verification(answer.verified, answer.bound),
             plan_table(answer, robot.action),
             f"margin {margin}, {answer.time_ms:.2f} ms in decide, model {answer.model}",
         )
         return 0
+
+
+def proposal(inputs: tuple[str, ...], action: Sequence[float], given: bool) -> str:
+    """Return a proposed action as text. given: whether the user gave it; the default is easily overlooked."""
+    default = "" if given else " (the highest inputs; propose others with --action)"
+    return "proposed " + ", ".join(map(quantity, inputs, action)) + default
 
 
 def plan_table(answer: Answer, inputs: tuple[str, ...]) -> StackingTable:

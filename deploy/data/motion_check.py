@@ -154,9 +154,7 @@ def speed_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_in
 
 def best_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_input: bool) -> SpeedFit:
     """Return the speed of the motion that correlates most with a column. The motion follows an input later."""
-    i, j = log.spans(SPAN)
-    sums = np.concatenate([[0.0], np.cumsum(log.columns[name])])
-    means = (sums[j + 1] - sums[i]) / (j - i + 1)
+    means = span_means(log, name)
     lags = range(0, round(MAX_LAG / log.step) + 1, max(round(0.1 / log.step), 1)) if is_input else (0,)
     fits = [
         SpeedFit(*agreement(speed[lag:], means[:end]), unit)
@@ -165,6 +163,13 @@ def best_fit(log: AlignedLog, name: str, speeds: list[tuple[str, Array]], is_inp
         if (end := len(means) - lag) >= FEWEST_SPANS
     ]
     return max(fits, default=SpeedFit(0.0, 0.0, ""))
+
+
+def span_means(log: AlignedLog, name: str) -> Array:
+    """Return the mean of a column over each span."""
+    i, j = log.spans(SPAN)
+    sums = np.concatenate([[0.0], np.cumsum(log.columns[name])])
+    return np.asarray((sums[j + 1] - sums[i]) / (j - i + 1))
 
 
 def agreement(one: Array, other: Array) -> tuple[float, float]:

@@ -13,9 +13,11 @@ import numpy as np
 
 from brakeline.deploy.data.aligned_log import AlignedLog, align
 from brakeline.deploy.data.motion_check import (
+    FEWEST_SPANS,
     best_fit,
     contradictions,
     directions_of_motion,
+    span_means,
     speed_fit,
     speeds_of_motion,
 )
@@ -27,6 +29,7 @@ from brakeline.errors import NoSource
 COHERENT, INCOHERENT = 0.9, 0.6  # of directions and headings: the length of the mean of their differences' unit vectors
 UNRELATED = 0.5  # largest correlation with a column's own quantity, if the column holds another one
 FAR_GAIN = {False: 2.0, True: 5.0}  # of a state, of an input: farther from 1 it is another unit
+BACKWARDS = 0.3  # of the usual top speed: a robot that moves so fast against its heading drives backwards
 QUANTITIES = {"m/s": "speed", "rad/s": "turn rate"}
 
 
@@ -94,6 +97,11 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
     fit = speed_fit(log, name, own, is_input)
     quantity, as_it_is = QUANTITIES[unit], f"or take the column as it is with {unit_option(name, AS_IT_IS)}"
     if fit is not None:
+        if not is_input and unit == "m/s" and _unsigned(span_means(log, name), [values for _, values in own]):
+            return (
+                f"{name} is positive while the robot drives backwards: it has no sign. Give it the sign of the motion "
+                f"along the heading, {as_it_is}"
+            )
         if 1.0 / FAR_GAIN[is_input] < fit.gain < FAR_GAIN[is_input]:
             return ""
         return (
@@ -114,3 +122,20 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
         f"{name} follows the {QUANTITIES[elsewhere.unit]} of the positions, not their {quantity}: are two columns "
         f"swapped? Name the right one with --map {shlex.quote(name)}=COLUMN, {as_it_is}"
     )
+
+
+def _unsigned(means: Array, own: list[Array]) -> bool:
+    """Return whether a speed is positive while the robot moves against its heading, and it moves along it only.
+
+    Args:
+        means: (n,) mean of the speed over each span.
+        own: speeds of the motion of each span: along the heading, across it, and in all. Without a heading, they are
+            along axes, which have no such sign.
+    """
+    if len(own) != 3 or not len(means) or (own[2] < 0.0).any():
+        return False
+    along, across = own[:2]
+    back = along < -BACKWARDS * np.quantile(np.abs(along), 0.99)
+    if np.abs(across).mean() > 0.3 * np.abs(along).mean() or np.count_nonzero(back) < FEWEST_SPANS:
+        return False
+    return bool((means[back] > 0.0).mean() > COHERENT)

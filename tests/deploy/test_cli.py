@@ -19,7 +19,7 @@ from brakeline.deploy.cli import COMMANDS, command_class, main, reason
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
-from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table
+from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table, proposal
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.errors import BadScan
 from brakeline.logs.figure_tables import analyse
@@ -384,3 +384,10 @@ def test_every_number_that_is_checked_is_an_option():
         command = command_class(name)
         checked = {**getattr(command, "least", {}), **getattr(command, "above", {})}
         assert set(checked) <= set(get_type_hints(command)), name
+
+
+def test_a_query_without_an_action_says_what_it_proposes():
+    inputs = ("speed [m/s]", "turn rate [rad/s]")
+    given = proposal(inputs, (0.25, 0.0), given=True)
+    assert given == "proposed speed 0.25 m/s, turn rate 0 rad/s"
+    assert proposal(inputs, (0.25, 0.0), given=False) == f"{given} (the highest inputs; propose others with --action)"

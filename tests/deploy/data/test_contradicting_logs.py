@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.cli import main
-from tests.deploy.data.porter import COLUMNS, FILE, drive, write_csv
+from tests.deploy.data.porter import COLUMNS, FILE, Porter, drive, driven_by, joystick, write_csv
 
 pytestmark = pytest.mark.usefixtures("reading_here")
 X, Y, HEADING, V, W, SPEED, TURN = range(len(COLUMNS))
@@ -103,6 +103,28 @@ def test_an_input_with_the_opposite_sign_is_noted(driven, tmp_path, capsys):
     values[:, TURN] *= -1.0
     status, text = imported(write_csv(tmp_path / "drive.csv", time, values), capsys)
     assert status == 0 and "turn rate: w changes in the opposite direction" in text and "speed: v" not in text
+
+
+def test_a_speed_without_its_sign_is_refused(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    inputs = joystick(rng, 120.0)
+    inputs[:, 0] *= np.where(np.arange(len(inputs)) // 500 % 2, -1.0, 1.0)  # backwards in every second 10 s
+    time, values = driven_by(Porter(rng), inputs)
+    robot = tmp_path / "porter.toml"
+    robot.write_text(FILE.read_text().replace("low = 0.0", "low = -0.6"))
+    status, text = imported(write_csv(tmp_path / "signed.csv", time, values), capsys, robot=robot)
+    assert status == 0, text
+    values[:, V] = np.abs(values[:, V])
+    status, text = imported(write_csv(tmp_path / "unsigned.csv", time, values), capsys, robot=robot)
+    assert status == 1 and "v is positive while the robot drives backwards: it has no sign" in text
+
+
+def test_a_new_description_names_what_a_log_cannot_show(driven, tmp_path, capsys):
+    path = write_csv(tmp_path / "drive.csv", *driven)
+    assert main(["robot", "new", str(tmp_path / "my.toml"), "--from", str(path)]) == 0
+    assert "the log does not show the body, `sight` and the measurement errors" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_stamps_in_no_unit_of_time_are_refused(driven, tmp_path, capsys):
