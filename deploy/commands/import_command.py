@@ -33,8 +33,8 @@ class ImportCommand:
     """Read a coordinate, an input or the time from this place of the log, if it is not found by its name. Write
     NAME=TABLE/FIELD, or NAME=COLUMN for a file of columns."""
     delay: float = 0.0
-    """Add this time to the stamps of the inputs, if these are too early [s]. If they are too late, give a negative time.
-    The report says how long after its inputs the robot moves."""
+    """Add this time to the stamps of the inputs, if these are too early [s]. If they are too late, give a negative
+    time. The report says how long after its inputs the robot moves."""
     hold: float = HOLD
     """Let an input count for this time after its last message [s]."""
     reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)

@@ -12,8 +12,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from brakeline.deploy.data.gap_free_recordings import GAP
 from brakeline.deploy.data.glitches import FEWEST_ROWS, SPIKE, place_of
-from brakeline.deploy.data.sources.quantity_names import Places, with_values
+from brakeline.deploy.data.sources.quantity_names import Place, Places, with_values
 from brakeline.deploy.data.sources.source_table import Array
 
 Flags = NDArray[np.bool_]
@@ -42,19 +43,27 @@ def without_held_poses(places: Places, pose: Sequence[str], states: Sequence[str
         return places, []
     values = np.column_stack([places[name][0].columns[places[name][1]][rows] for name in pose])
     moved = np.abs(np.diff(values, axis=0, prepend=values[:1] - 1.0))
-    new = (moved > 0.0).any(1)
+    time = table.time[rows]
+    begins = np.diff(time, prepend=-np.inf) > GAP * np.median(np.diff(time))
     if len(table.run):
-        new |= np.diff(table.run[rows], prepend=-1) != 0
+        begins |= np.diff(table.run[rows], prepend=-1) != 0
+    new: Flags = np.asarray((moved > 0.0).any(1) | begins)
     at = np.flatnonzero(new)
     every = int(np.median(np.diff(at))) if len(at) > FEWEST_ROWS else 1
-    lost, notes = _lost(table.time[rows], moved[:, : len(pose)], at, every)
-    notes = [f"{place_of(table, int(rows[i]))}: {text}" for i, text in notes]
+    lost = np.zeros(len(rows), bool)
+    notes = []
+    for i, j in _lost(moved, begins, at, every):
+        lost[i + 1 : j] = True
+        seconds = time[j - 1] - time[i]
+        notes.append(
+            f"{place_of(table, int(rows[i]))}: the pose stays the same for {seconds:.3g} s, then jumps: left out"
+        )
     since = np.arange(len(rows)) - np.maximum.accumulate(np.where(new, np.arange(len(rows)), 0))
     measured = (since % every == 0) & ~lost
     if measured.all():
         return places, []
     if every > 1:
-        seconds = float(np.median(np.diff(table.time[rows[measured]])))
+        seconds = float(np.median(np.diff(time[measured])))
         notes.append(
             f"{', '.join(pose)} change only in every {_ordinal(every)} row: the rows between repeat them, and do not "
             f"count as measurements (one every {seconds:.3g} s)"
@@ -67,15 +76,20 @@ def without_held_poses(places: Places, pose: Sequence[str], states: Sequence[str
     return {**places, **{name: _without(places, name, repeated) for name in written}}, notes
 
 
-def _lost(time: Array, moved: Array, at: NDArray[np.intp], every: int) -> tuple[Flags, list[tuple[int, str]]]:
-    """Return the rows of stretches of one pose that end in a jump, each with a note at its first row."""
-    lost, notes = np.zeros(len(time), bool), list[tuple[int, str]]()
-    usual = np.quantile(moved[at[1:]], 0.99, axis=0) if len(at) > 1 else np.inf
-    for i, j in pairwise(at):
-        if j - i > LOST * every and (moved[j] > SPIKE * np.maximum(usual, 1e-9)).any():
-            lost[i + 1 : j] = True
-            notes.append((int(i), f"the pose stays the same for {time[j - 1] - time[i]:.3g} s, then jumps: left out"))
-    return lost, notes
+def _lost(moved: Array, begins: Flags, at: NDArray[np.intp], every: int) -> list[tuple[int, int]]:
+    """Return the first row of each stretch of one pose that ends in a jump, and the row of the jump.
+
+    Args:
+        moved: (n, d) how far each coordinate moved since the row before.
+        begins: (n,) whether a row begins a recording, before which the robot may have been anywhere.
+        at: rows with a new pose.
+        every: usual number of rows from one pose to the next.
+    """
+    if begins.all():
+        return []
+    usual = np.quantile(moved[~begins], 0.99, axis=0)
+    jumps = (moved > SPIKE * np.maximum(usual, 1e-9)).any(1) & ~begins
+    return [(int(i), int(j)) for i, j in pairwise(at) if j - i > LOST * every and jumps[j]]
 
 
 def _with_pose(places: Places, name: str, time: Array, rows: NDArray[np.intp], new: Flags) -> bool:
@@ -87,7 +101,7 @@ def _with_pose(places: Places, name: str, time: Array, rows: NDArray[np.intp], n
     return bool(np.count_nonzero(changes & new) >= ALSO_HELD * np.count_nonzero(changes))
 
 
-def _without(places: Places, name: str, rows: NDArray[np.intp]) -> tuple:
+def _without(places: Places, name: str, rows: NDArray[np.intp]) -> Place:
     table, column = places[name]
     values = table.columns[column].copy()
     values[rows] = np.nan

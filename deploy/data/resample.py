@@ -81,12 +81,12 @@ def resample(
     places = resolve(tables, robot, options)
     chosen = choice_notes(tables, places)
     pose = [*positions, *([heading] if heading else [])]
-    places, held = without_held_poses(places, pose, states)
     places, glitches = without_glitches(places, positions, heading, inputs)
+    places, held = without_held_poses(places, pose, states)
     if robot.position_dim:
         refuse_contradictions(places, positions, inputs, heading, column_units(robot), options.units)
     recordings, cuts = gap_free_recordings(places, robot, delay, hold)
-    notes = [*notes_of(tables), *chosen, *held, *glitches, *cuts]
+    notes = [*notes_of(tables), *chosen, *glitches, *held, *cuts]
     if not recordings:
         raise NoSource("; ".join(notes) or "the columns have no time in common")
     responses = checked_responses(recordings, robot, delay)

@@ -68,8 +68,12 @@ def checked_responses(recordings: Sequence[GapFreeRecording], robot: Robot, dela
 
 
 def _lead(step: float, responses: Array) -> float:
-    """Return how long the strongest response is before its input [s]; 0 if it is after it, or not clear."""
-    strength, now = np.abs(responses), len(responses) // 2
+    """Return how long the strongest response is before its input [s]; 0 if it is after it, or not clear.
+
+    A response counts in the direction in which the coordinate follows its input in all. A controller that damps the
+    motion changes its input after the motion too, but in the opposite direction.
+    """
+    strength, now = np.sign(responses.sum()) * responses, len(responses) // 2
     best = int(strength.argmax())
     clear = strength[best] > max(LEAST_RESPONSE, CLEARER * float(strength[now:].max()))
     return step * (now - best) if clear and best < now else 0.0
