@@ -56,7 +56,7 @@ def _named(table: Table, column: str, rows: Rows, cut: str) -> list[str]:
     """Return notes that name the first glitches of a column."""
     values = table.columns[column]
     usual = np.delete(values, rows)
-    low, high = np.nanquantile(usual, (TAIL, 1.0 - TAIL))
+    low, high = np.quantile(usual[np.isfinite(usual)], (TAIL, 1.0 - TAIL))
     what = f"is a glitch (usual: {low:.3g} to {high:.3g}): {cut}"
     notes = [f"{place_of(table, int(row))}, column {column}: {values[row]:.6g} {what}" for row in rows[:NAMED]]
     more = len(rows) - NAMED

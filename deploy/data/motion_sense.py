@@ -46,6 +46,11 @@ def refuse_contradictions(
         log = align(places, positions, inputs, {})
     except NoSource:
         return  # too few rows to compare; `resample` says so
+    if positions and not any(np.ptp(log.columns[name]) for name in positions):
+        raise NoSource(
+            f"{', '.join(positions)} never change: they do not hold the robot's position. Name the right columns with "
+            f"--map {shlex.quote(positions[0])}=COLUMN, or drive the robot"
+        )
     problems = contradictions(log, heading, units, given) or wrong_senses(log, heading, units, given)
     if problems:
         raise NoSource("\n".join(problems))

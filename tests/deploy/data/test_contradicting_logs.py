@@ -57,6 +57,10 @@ def percent(values):
     values[:, SPEED] *= 100.0 / 0.6
 
 
+def no_position(values):
+    values[:, [X, Y, HEADING]] = 0.0
+
+
 def nothing_sent(values):
     values[:, [SPEED, TURN]] = 0.0
 
@@ -74,6 +78,7 @@ def nothing_sent(values):
         (lambda values: late(values, [SPEED, TURN], PERIOD), "Shift the stamps with --delay -0.2"),
         (lambda values: late(values, [SPEED, TURN], 4 * PERIOD), "Shift the stamps with --delay -0.8"),
         (of_another_drive, "v does not follow speed"),
+        (no_position, "x, y never change: they do not hold the robot's position"),
         (nothing_sent, "speed is always 0, but v, which follows it, moves"),
     ],
 )
