@@ -24,6 +24,7 @@ from brakeline.deploy.data.motion_sense import refuse_contradictions
 from brakeline.deploy.data.response_check import checked_responses
 from brakeline.deploy.data.sources.quantity_names import choice_notes, column_names, column_units, resolve
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
+from brakeline.deploy.data.standing_noise import small_errors
 from brakeline.errors import BadData, NoSource
 from brakeline.messaging.obstacle import rotate
 from brakeline.messaging.robot import Robot
@@ -111,6 +112,7 @@ def resample(
         ) from error
     uneven = float(np.concatenate([changed for _, changed, _ in resampled]).mean())
     delays = _delays(recordings, robot)
+    notes += small_errors(robot, parts)
     notes += _beat_notes(recordings, robot, uneven)
     notes += [*_notes(robot, samples, chord_deviation, uneven, delays), *responses]
     return ImportedData(

@@ -167,6 +167,20 @@ def test_a_period_that_is_not_the_controllers_is_noted(driven, tmp_path, capsys,
     assert ("inputs change at multiples of 0.1 s" in text and "write `period = 0.1`" in text) == noted, (status, text)
 
 
+def test_an_error_below_the_noise_at_rest_is_noted(tmp_path, capsys):
+    """The porter's positions are measured within 4 mm."""
+    rng = np.random.default_rng(1)
+    inputs = joystick(rng, 120.0)
+    inputs[2000:3000] = 0.0  # it stands for 20 s
+    path = write_csv(tmp_path / "drive.csv", *driven_by(Porter(rng), inputs))
+    status, text = imported(path, capsys)
+    assert status == 0 and "while the robot stands" not in text
+    robot = tmp_path / "porter.toml"
+    robot.write_text(FILE.read_text().replace("error = 0.01 }", "error = 0.001 }"))
+    status, text = imported(path, capsys, robot=robot)
+    assert status == 0 and "x varies by ±0.00" in text and "the description states `error = 0.001`" in text
+
+
 def test_inputs_beyond_their_bounds_are_named_with_their_range(driven, tmp_path, capsys):
     robot = tmp_path / "porter.toml"
     robot.write_text(FILE.read_text().replace("high = 0.6", "high = 0.4"))
