@@ -39,4 +39,5 @@ def _moved_at_rest(robot: Robot, t: Trajectory, rest: int) -> Array:
     """Return the changes of the states (n, d) in the periods that follow `rest` periods without an input."""
     idle = np.concatenate([[0], np.cumsum(robot.is_stop_input(t.inputs))])
     at = np.arange(rest, len(t.inputs))
-    return np.diff(t.states, axis=0)[at[idle[at + 1] - idle[at - rest] == rest + 1]]
+    changes: Array = np.diff(t.states, axis=0)
+    return np.asarray(changes[at[idle[at + 1] - idle[at - rest] == rest + 1]])
