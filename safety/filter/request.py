@@ -152,9 +152,9 @@ class Decision(ComparedByValue):
     verified: bool = True
     contained: bool = True
     compared: bool = False
-    time_ms: float = 0.0
-    solve_ms: float = 0.0
-    verify_ms: float = 0.0
+    time_ms: float = field(default=0.0, compare=False)
+    solve_ms: float = field(default=0.0, compare=False)
+    verify_ms: float = field(default=0.0, compare=False)
     solver: str = ""
     iterations: int = 0
     broken: int = 0
