@@ -109,9 +109,15 @@ class RobotCommand:
             if name != "inputs":
                 text = "\n".join(value) if isinstance(value, list) else value
                 text = f"{text:g}" if isinstance(text, float) else str(text)
-                rows.append((name.replace("_", " "), escape(text)))
+                rows.append((escape(_label(name)), escape(text)))
         print_result(self.json, values, plain_table((), rows))
         return 0
+
+
+def _label(name: str) -> str:
+    """Return a figure's name for people, with its unit in brackets: `period [s]` for `period_s`."""
+    words, _, last = name.replace("_", " ").rpartition(" ")
+    return f"{words} [{last}]" if last in ("s", "m") else f"{words} {last}".strip()
 
 
 def _code_problems(task: Task) -> tuple[list[tuple[str, str]], list[str]]:
