@@ -1,4 +1,4 @@
-"""What a smaller stated share costs: half-widths, stated bounds and corrections against the share outside and the data.
+"""What a smaller stated share costs: half-widths, bounds and corrections against the share outside and the data.
 
     python -m benchmarks widths
 
