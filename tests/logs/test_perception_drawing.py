@@ -129,7 +129,8 @@ def test_browsers_draw_the_perceived_surroundings(
     write(path, analysis.figures(), analysis.by_label())
     show(tab, path)
     tab.value("document.querySelector('#picker [data-view=above]').click()")
-    shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in ("free", "hit", "mover", "swept", "reservation")}
+    marks = ("free", "hit", "mover", "swept", "reservation")
+    shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in marks}
     assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "reservation": 3}
     legend = tab.value("document.querySelector('#picker').textContent")
     assert "reserved by other robots" in legend and "recovering" in legend
