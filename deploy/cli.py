@@ -185,7 +185,9 @@ def print_overview(console: Console) -> None:
         console.print(f"[bold]{title}[/]")
         console.print(table)
         console.print()
-    console.print("`brakeline COMMAND --help` lists the options of a command. With --json, it prints one JSON object.")
+    console.print(
+        "`brakeline COMMAND --help` lists the options of a command. With --json, a command prints one JSON object."
+    )
 
 
 def command_class(name: str) -> Any:

@@ -48,7 +48,7 @@ Results = list[dict[str, Any]]
 class CompareCommand:
     """The options of `brakeline compare`."""
 
-    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Compare the methods on these robots."""
     seeds: tuple[int, ...] | None = None
     """Train each method once from each of these seeds. Defaults to 0 to 9 where a batch trains, and to 0, 1 and 2 where
