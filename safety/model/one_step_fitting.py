@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from brakeline.errors import ErrorBoundError
+from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples, samples_of
 from brakeline.safety.model.dataset import Dataset
