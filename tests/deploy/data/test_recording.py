@@ -19,6 +19,7 @@ from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.errors import BadData, BadModel, NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.acceleration_age import ENTRY
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kinds
 from brakeline.safety.model.model_config import AUTO
@@ -315,6 +316,10 @@ def test_the_last_steps_of_a_log(tmp_path):
     data, note = from_log(log, GROUND, last=60)
     assert [len(t.inputs) for t in data.trajectories] == [9, 49]
     assert "58 of the last 60 steps" in note and data.about == {"origin": "log"}
+    for step in made:
+        step.acceleration_age = 0.2
+    aged = written(tmp_path / "aged.mcap", (("step/ground/a", step, i) for i, step in enumerate(made)))
+    assert from_log(aged, GROUND, last=60)[0].about == {"origin": "log", ENTRY: "0.2"}
     with pytest.raises(BadData, match="no trajectory of ground"):
         from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
 
