@@ -49,3 +49,6 @@ class FlightSettings:
     """Raise the autopilot's parameters that are below the robot's bounds."""
     lead: bool = False
     """Send positions ahead of the vehicle instead of velocities."""
+    acceleration_age: float = 0.0
+    """Report the horizontal acceleration of this long ago instead of the present one [s]. It must be the age with which
+    the model set was recorded; `brakeline fly` takes it from the model set."""

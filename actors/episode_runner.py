@@ -238,6 +238,7 @@ class EpisodeRunner:
             true_state=info["true_state"].tolist(),
             path=info["subsamples"].ravel().tolist(),
             weights_version=weights_version,
+            acceleration_age=self.backup_plan.acceleration_age,
             **{name: info[name] for name in COPIED},
         )
         step.header.time = info["time"]

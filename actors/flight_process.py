@@ -162,10 +162,17 @@ class FlightRunner(ActorRunner):
         propose: PolicyFactory | None,
         publisher: BackgroundPublisher,
         conditions: Conditions,
+        acceleration_age: float = 0.0,
     ) -> None:
-        """stages: the arenas of the flight's episodes, one after the other; they differ in the goal."""
+        """Prepare the runner.
+
+        Args:
+            stages: the arenas of the flight's episodes, one after the other; they differ in the goal.
+            acceleration_age: see `FlightSettings`.
+        """
         self._stages, self._next_stages = stages, cycle(stages)
         super().__init__(process, settings, 0, self._environment(conditions), propose, continuous=True)
+        self.runner.backup_plan.acceleration_age = acceleration_age
         self._vehicle: RealTimeVehicle | None = None
         self._began_lost = False  # whether the state before the step did not count
         self.answers: Counter[str] = Counter()  # "in time", "late", "none", "lost" or "not needed"
@@ -243,13 +250,16 @@ class FlightRunner(ActorRunner):
         return make
 
 
-def takeoff_verified(question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop) -> bool:
+def takeoff_verified(
+    question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop, acceleration_age: float = 0.0
+) -> bool:
     """Wait until the safety service decides about hovering at the start. Return False after a stop.
 
     Args:
         robot: the robot in real time.
         stage: the first arena.
         filtered: whether our own filter decides; a rival method does not tell whether it can verify hovering.
+        acceleration_age: see `FlightSettings`.
 
     Raises:
         TakeoffNotVerified: the filter cannot verify hovering there.
@@ -260,7 +270,8 @@ def takeoff_verified(question: Ask, robot: Robot, stage: Arena, filtered: bool, 
     near = [obstacle for obstacle, far in zip(stage.obstacles, distances, strict=True) if far <= robot.sight]
     logged = ""
     while not stop():
-        request = request_message(BackupPlan(robot), state, np.zeros(robot.action_dim), near, known_free=True)
+        backup_plan = BackupPlan(robot, acceleration_age=acceleration_age)
+        request = request_message(backup_plan, state, np.zeros(robot.action_dim), near, known_free=True)
         outcome = request_decisions(question, [request], robot)[0]
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in (ALLOWED, ADJUSTED):
@@ -307,11 +318,14 @@ def run(
     stats, publisher = ActorStats(), BackgroundPublisher()
     with Process(settings.bus, settings.name) as process:
         stop, started = process.stop.is_set, time.monotonic()
-        actor = FlightRunner(process, settings, stages, propose, publisher, conditions or Conditions())
+        age = flight.acceleration_age
+        actor = FlightRunner(process, settings, stages, propose, publisher, conditions or Conditions(), age)
         process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started) | actor.figures())
         process.announce()
         question = partial(query_service, process.bus, deadline=settings.deadline)
-        if not (actor.join(stop) and takeoff_verified(question, robot, stages[0], settings.method == "ddpc", stop)):
+        if not (
+            actor.join(stop) and takeoff_verified(question, robot, stages[0], settings.method == "ddpc", stop, age)
+        ):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)
         vehicle = VehicleClient(request, actor.frames.add, process.bus.rejected, stop)

@@ -245,9 +245,9 @@ def interval(station: Station, name: str, seconds: float = 1.5) -> str:
     """Request a message at 20 Hz. Returns the answer, and whether the message then comes."""
     answer = station.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, getattr(m, f"MAVLINK_MSG_ID_{name}"), 50_000)
     if seconds:
-        station.heard[name] = 0
+        station.received[name] = 0
         station.listen(seconds)
-        answer += ", comes" if station.heard[name] > 0.5 * seconds / 0.05 else ", does not come"
+        answer += ", comes" if station.received[name] > 0.5 * seconds / 0.05 else ", does not come"
     return answer
 
 

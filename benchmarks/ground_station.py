@@ -1,4 +1,4 @@
-"""A ground station for comparisons. It sends what its caller wants, and keeps what it receives, without a check."""
+"""A ground station that compares autopilots. It sends any message, and stores what it receives without a check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from brakeline.messaging.byte_links import Link
 from brakeline.sim.autopilot.common_dialect import mavlink
 
-OURSELVES = 254  # system id
+STATION_ID = 254  # MAVLink system id
 STEP = 0.02  # s between two reads of the link
 STREAM = 0.05  # s between two setpoints
 PATIENCE = 3.0  # s, longest wait for an answer
@@ -20,24 +20,24 @@ RESULTS = {value: name.removeprefix("MAV_RESULT_").lower().replace("_", " ") for
 
 
 class Station:
-    """Talks to one vehicle.
+    """Exchange messages with one vehicle.
 
     Attributes:
         last: the newest message of each type.
-        heard: the number of messages of each type.
-        velocity: setpoint that the station streams [m/s, NED]; None: it streams none.
+        received: the number of received messages of each type.
+        velocity: the setpoint that the station streams [m/s, north, east, down]; None: it streams none.
         frame, mask: coordinate frame and type mask of the setpoints.
     """
 
     def __init__(self, link: Link, system: int) -> None:
         self._link, self.system = link, system
-        self._mav = mavlink.MAVLink(self, srcSystem=OURSELVES, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+        self._mav = mavlink.MAVLink(self, srcSystem=STATION_ID, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
         self._mav.robust_parsing = True
         self.last: dict[str, Any] = {}
-        self.heard: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
         self.velocity: tuple[float, float, float] | None = None
         self.frame, self.mask = int(mavlink.MAV_FRAME_LOCAL_NED), VELOCITY_ONLY
-        self._beaten = self._streamed = -1.0
+        self._heartbeat_sent = self._setpoint_sent = -1.0
 
     def write(self, data: bytes) -> None:
         """Send bytes; pymavlink calls this."""
@@ -47,11 +47,11 @@ class Station:
         """Receive and stream setpoints for `seconds`, or until `until` holds. Returns the time that passed [s]."""
         started = time.monotonic()
         while (passed := time.monotonic() - started) < seconds:
-            self._speak(time.monotonic())
+            self._send_due(time.monotonic())
             for message in self._mav.parse_buffer(self._link.receive()) or ():
                 if message.get_srcSystem() == self.system:
                     self.last[message.get_type()] = message
-                    self.heard[message.get_type()] += 1
+                    self.received[message.get_type()] += 1
             if until():
                 break
             time.sleep(STEP)
@@ -80,12 +80,13 @@ class Station:
         """The custom mode of the last heartbeat."""
         return int(self.last["HEARTBEAT"].custom_mode)
 
-    def _speak(self, now: float) -> None:
-        if now - self._beaten > 1.0:
-            self._beaten = now
+    def _send_due(self, now: float) -> None:
+        """Send the heartbeat and the setpoint if they are due. now: monotonic time [s]."""
+        if now - self._heartbeat_sent > 1.0:
+            self._heartbeat_sent = now
             self._mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
-        if self.velocity is not None and now - self._streamed > STREAM:
-            self._streamed = now
+        if self.velocity is not None and now - self._setpoint_sent > STREAM:
+            self._setpoint_sent = now
             self._mav.set_position_target_local_ned_send(
                 0, self.system, 1, self.frame, self.mask, 0, 0, 0, *self.velocity, 0, 0, 0, 0, 0
             )

@@ -1,4 +1,4 @@
-"""What a narrower promise costs: half-widths, stated bounds and corrections against the share outside and the data.
+"""What a smaller stated share costs: half-widths, bounds and corrections against the share outside and the data.
 
     python -m benchmarks widths
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import difflib
 import errno
 import importlib
-import math
 import os
 import signal
 import sys
@@ -37,6 +36,7 @@ from tyro.constructors import (
 )
 
 from brakeline.deploy import progress
+from brakeline.deploy.option_numbers import check_option_numbers
 from brakeline.extras import missing_extra
 from brakeline.messaging.stop_signals import interrupt_on_signals
 
@@ -185,7 +185,9 @@ def print_overview(console: Console) -> None:
         console.print(f"[bold]{title}[/]")
         console.print(table)
         console.print()
-    console.print("`brakeline COMMAND --help` lists the options of a command. With --json, it prints one JSON object.")
+    console.print(
+        "`brakeline COMMAND --help` lists the options of a command. With --json, a command prints one JSON object."
+    )
 
 
 def command_class(name: str) -> Any:
@@ -232,22 +234,6 @@ def parse(name: str, arguments: list[str]) -> Any:
     return tyro.cli(
         command, **defaults, prog=f"brakeline {name}", description=description, args=words, registry=registry
     )
-
-
-def check_option_numbers(command: Any) -> None:
-    """Check a command's numbers: seeds from 0 on, and those for which it states `least` or `above`, without NaN.
-
-    Raises:
-        ValueError: a number makes no sense.
-    """
-    for name, least in {"seed": 0, **getattr(command, "least", {})}.items():
-        value = getattr(command, name, None)
-        if value is not None and not least <= value < math.inf:
-            raise ValueError(f"--{name.replace('_', '-')} is a number from {least:g} on, not {value:g}")
-    for name, above in getattr(command, "above", {}).items():
-        value = getattr(command, name)
-        if value is not None and not above < value < math.inf:
-            raise ValueError(f"--{name.replace('_', '-')} is a number above {above:g}, not {value:g}")
 
 
 def reason(error: Exception) -> str:

@@ -27,10 +27,9 @@ def main(kind: str = "csv") -> None:
         log = small_log.write_bag(folder / "bag") if kind == "bag" else small_log.write_csv(folder / "drive.csv")
 
         brakeline(["import", str(log), "--robot", str(robot)])
-        certify = ["certify", str(robot), "--certificates", "residual", "--mode", "direct", "--use"]
-        brakeline([*certify, "--accept-bound", "0.05"])  # from 12 minutes of data, the bound exceeds the limit of 1 %
+        brakeline(["certify", str(robot), "--use"])
 
-        filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-direct.safetensors"))
+        filter = Filter(ModelSet.load(folder / "data" / "my-robot" / "residual-one-step.safetensors"))
         print(f"a full stop from full speed is known to {100.0 * filter.half_width(filter.robot.high()):.0f} cm")
         decide(filter, 2.0)
         decide(filter, 0.4)

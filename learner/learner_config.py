@@ -46,8 +46,8 @@ class TD3Config:
     updates_per_step: float = 1.0
     """Update this many times for each step."""
     cost_limit: float | None = None
-    """Raise a penalty on collisions until at most this share of the episodes collides (a Lagrange multiplier). With
-    None, the reward alone counts."""
+    """Raise a penalty on collisions until at most this share of the episodes collides (a Lagrange multiplier). By
+    default, the reward alone counts."""
     multiplier_rate: float = 10.0
     """With a cost limit, raise the penalty by this reward for each episode that collides."""
     stored: Stored = "both"

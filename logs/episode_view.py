@@ -21,18 +21,21 @@ from brakeline.safety.perception.displayed_map import reserved_boxes
 if TYPE_CHECKING:
     from brakeline.logs.episode_sampler import EpisodeRecord
 
-MOST_TUBES, FEW_TUBES = 28, 12  # tubes in one picture; in one of an ordinary episode
-CORNERS, HITS = 48, 90  # corners of the free space's outline and scan hits in the picture of one step
-NEAR = 8  # steps before and after the closest approach for which the picture has tubes
+MOST_TUBES, FEW_TUBES = 28, 12  # most tubes in the drawing of one episode; of an ordinary episode
+CORNERS, HITS = 48, 90  # most corners of the free space's outline, and most scan hits, in the drawing of one step
+NEAR = 8  # steps before and after the closest approach for which the drawing has tubes
 SKETCHED = 2  # digits after the decimal point in a sketch: cm
 
 # One letter for each step's decision: n (none), a(l)lowed, a(d)justed, f(a)ilsafe, r(e)covering.
 LETTERS: dict[int, str] = {int(pb.UNKNOWN): "n", **{kind: name[1] for kind, name in KINDS.items()}}
-ALARMING = "nlead"  # letters; of several steps, a sketch shows the last one in this order
+ALARMING = "nlead"  # letters, the least alarming first; of several steps, a sketch shows the most alarming one
 
 
 def picture(episode: EpisodeRecord, robot: Robot | None, tubes: int = MOST_TUBES) -> Figures:
-    """Return what a drawing of each step needs, for JSON: arena, path [m], decisions by letter, at most `tubes`."""
+    """Return what a drawing of each step needs, for JSON: arena, path [m], decisions by letter, some tubes.
+
+    tubes: largest number of tubes.
+    """
     steps, exchanges = episode.steps, episode.exchanges()
     closest = _closest(steps)
     return {
@@ -198,7 +201,7 @@ def _tube(exchange: pb.Exchange, others: Iterable[pb.Exchange], robot: Robot | N
         return None
     if not len(view.centers) or view.centers.shape[1] < 2:
         return None
-    perceived = view.perceived_json(HITS) | {"promises": reservations_json(view.reservations)}
+    perceived = view.perceived_json(HITS) | {"reservations": reservations_json(view.reservations)}
     return {
         "from": rounded(request.state[: view.centers.shape[1]]),
         "boxes": view.boxes_json(),

@@ -104,7 +104,17 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
-    columns = ("step", "x, y [m]", "proposed", "executed", "decision", "ms", "margin [m]", "clear [m]", "why")
+    columns = (
+        "step",
+        "x, y [m]",
+        "proposed",
+        "executed",
+        "decision",
+        "decide [ms]",
+        "margin [m]",
+        "clearance [m]",
+        "why",
+    )
     rows = [
         (
             str(row["step"]),
@@ -164,7 +174,7 @@ def for_clearance(figures: Figures) -> str:
     """Describe how many verified proposals the filter replaced to keep the clearance margin."""
     if figures["for_clearance"] is None:
         return "not recorded by this method or version"
-    return f"{figures['for_clearance']} of {figures['adjusted']} adjusted proposals were verified themselves"
+    return f"{figures['for_clearance']} of {figures['adjusted']} adjusted steps: the filter verified the proposal too"
 
 
 def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
@@ -255,7 +265,7 @@ def _training(robot: str, training: Figures) -> Table:
     if stale is not None and stale["max"] > 0:
         versions = "mean {mean:.2f}, p99 {p99:.0f}, at most {max:.0f} versions".format(**stale)
         rows.append(("weights behind", "", "", versions))
-    return plain_table((f"{robot} over training", "first", "last", ""), rows)
+    return plain_table((f"{robot} over the run", "first", "last", ""), rows)
 
 
 def _coarse(bins: list[Figures], most: int) -> list[Figures]:

@@ -82,27 +82,27 @@ class RunAnalysis:
     def _read(self, log: Log) -> None:
         """Read all messages in one loop."""
         handlers: dict[str, Callable[[LogChannel, Any], None]] = {
-            STEP.name: lambda series, step: self.training[series.robot].step(step),
-            EXCHANGE.name: lambda series, exchange: self.training[series.robot].exchange(exchange),
+            STEP.name: lambda channel, step: self.training[channel.robot].step(step),
+            EXCHANGE.name: lambda channel, exchange: self.training[channel.robot].exchange(exchange),
             LEARNER.name: lambda _, metrics: self._learner(metrics),
         }
         if self.options.pictures or self.options.episode is not None:
             handlers |= {
                 STEP.name: self._step,
                 EXCHANGE.name: self._exchange,
-                EPISODE.name: lambda series, episode: self._buffer(series)[1].about.append(episode),
+                EPISODE.name: lambda channel, episode: self._buffer(channel)[1].about.append(episode),
                 HEALTH.name: lambda _, health: self.timeline.health(health, self._received),
                 LOG.name: lambda _, line: self.timeline.line(line, self._received),
             }
         rejected, add = RejectedMessages(), self.metrics.add
-        for series, message, log_time, _ in log.decoded():
+        for channel, message, log_time, _ in log.decoded():
             try:
                 self._received = log.clock.at(log_time)
-                if add(series.key, message, self._received) and (handle := handlers.get(series.topic)) is not None:
-                    handle(series, message)
+                if add(channel.key, message, self._received) and (handle := handlers.get(channel.topic)) is not None:
+                    handle(channel, message)
             except Exception as error:  # reject one message and go on
                 log.malformed += 1
-                rejected.reject(series.key, error)
+                rejected.reject(channel.key, error)
 
     def _learner(self, metrics: Any) -> None:
         """Add a learner's message, and the steps after a gap of the log that it permits. Episodes drawn lack these."""
@@ -110,30 +110,30 @@ class RunAnalysis:
         for step in self.metrics.late:
             self.training[metrics.robot].step(step)
 
-    def _step(self, series: LogChannel, step: Any) -> None:
-        self.training[series.robot].step(step)
-        sampler, buffer = self._buffer(series)
+    def _step(self, channel: LogChannel, step: Any) -> None:
+        self.training[channel.robot].step(step)
+        sampler, buffer = self._buffer(channel)
         sampler.step(buffer, step)
         self.timeline.step(self._received)
 
-    def _exchange(self, series: LogChannel, exchange: Any) -> None:
-        robot = series.robot
+    def _exchange(self, channel: LogChannel, exchange: Any) -> None:
+        robot = channel.robot
         self.training[robot].exchange(exchange)
         if robot not in self.intervention_maps:
             self.intervention_maps[robot] = InterventionMap(self.log.robots.named(robot))
         self.intervention_maps[robot].exchange(exchange)
-        self._buffer(series)[1].exchanges.append(exchange)
+        self._buffer(channel)[1].exchanges.append(exchange)
 
-    def _buffer(self, series: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:
+    def _buffer(self, channel: LogChannel) -> tuple[EpisodeSampler, ActorBuffer]:
         """Return the sampler of the channel's robot kind, and the buffer of its actor."""
-        if series not in self._buffers:
-            if series.robot not in self.samplers:
-                robot, options = self.log.robots.named(series.robot), self.options
+        if channel not in self._buffers:
+            if channel.robot not in self.samplers:
+                robot, options = self.log.robots.named(channel.robot), self.options
                 wanted = options.episode, options.actor
-                self.samplers[series.robot] = EpisodeSampler(robot, self.prefix, *wanted, options.sketches)
-            sampler = self.samplers[series.robot]
-            self._buffers[series] = sampler, sampler.source(series.actor)
-        return self._buffers[series]
+                self.samplers[channel.robot] = EpisodeSampler(robot, self.prefix, *wanted, options.sketches)
+            sampler = self.samplers[channel.robot]
+            self._buffers[channel] = sampler, sampler.source(channel.actor)
+        return self._buffers[channel]
 
     def about(self) -> Figures:
         """Return one row about the run: configuration, figures, missing messages."""

@@ -143,14 +143,14 @@ def _write_scenes(log: Log, out: Path) -> int:
 
 def _stored(log: Log) -> Iterator[tuple[Entry, Record]]:
     """Yield the messages of a log, as stored and decoded."""
-    for series, log_time, publish_time, payload in log.rows():
+    for channel, log_time, publish_time, payload in log.rows():
         try:
-            message: Any = series.decode(payload)
+            message: Any = channel.decode(payload)
         except DecodeError:
             log.malformed += 1
             continue
-        entry = Entry(series.key, type(message), payload, log_time, publish_time, message.header.sequence)
-        yield entry, Record(series.topic, series.key, message, log_time, publish_time)
+        entry = Entry(channel.key, type(message), payload, log_time, publish_time, message.header.sequence)
+        yield entry, Record(channel.topic, channel.key, message, log_time, publish_time)
 
 
 def episodes(log: Log, robot: RobotWithTask) -> Iterator[list[pb.Step]]:

@@ -105,10 +105,10 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> No
     writer.start(profile=first.profile if isinstance(first, Header) else "", library="brakeline recover")
     for item in chain(() if first is None else (first,), items):
         if type(item) is tuple:
-            series, log_time, publish_time, payload = item
-            if series not in numbers:
-                numbers[series] = _register(writer, series, schemas)
-            writer.add_message(numbers[series], log_time, payload, publish_time, series.sequence)
+            channel, log_time, publish_time, payload = item
+            if channel not in numbers:
+                numbers[channel] = _register(writer, channel, schemas)
+            writer.add_message(numbers[channel], log_time, payload, publish_time, channel.sequence)
             result.messages += 1
             result.last = max(result.last, log_time)
         elif isinstance(item, DamagedBytes):
@@ -121,18 +121,18 @@ def _copy(source: IO[bytes], size: int, sink: IO[bytes], result: Recovery) -> No
     writer.finish()
 
 
-def _register(writer: Any, series: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:
+def _register(writer: Any, channel: LogChannel, schemas: dict[tuple[str, bytes], int]) -> int:
     """Return the number of a channel in the new file; register its schema if needed."""
-    schema, channel = series.schema, series.channel
-    assert channel is not None, "the container has set it"
-    number, encoding, topic = 0, SchemaEncoding.Protobuf, topic_of(channel.topic)  # 0: no schema
+    schema, record = channel.schema, channel.channel
+    assert record is not None, "the container has set it"
+    number, encoding, topic = 0, SchemaEncoding.Protobuf, topic_of(record.topic)  # 0: no schema
     content = None if schema is None else (schema.name, schema.data)
     if schema is not None:
         encoding = schema.encoding
-    elif channel.message_encoding == MessageEncoding.Protobuf and topic is not None:  # its declaration is lost
+    elif record.message_encoding == MessageEncoding.Protobuf and topic is not None:  # its declaration is lost
         content = topic.message.DESCRIPTOR.full_name, schema_of(topic.message)
     if content is not None:
         if content not in schemas:
             schemas[content] = writer.register_schema(content[0], encoding, content[1])
         number = schemas[content]
-    return int(writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata))
+    return int(writer.register_channel(record.topic, record.message_encoding, number, record.metadata))

@@ -99,10 +99,13 @@ class LogChannel:
     """A channel of the file: the messages published at one key.
 
     Attributes:
-        decode: None for an unknown message type.
+        topic: the topic of the channel in the file.
+        key: the key of the bus at which the messages were published.
+        decode: decodes a message; None for an unknown message type.
+        schema, channel: the records of the file that declare the channel.
         robot, actor: the second and third part of the key, e.g. "ground" and "actor-0".
-        names: the names in the key of one of our topics, by field.
-        sequence: of the message that was read last.
+        names: the names that the key of a Brakeline topic contains, by field.
+        sequence: the sequence number of the message that was read last.
     """
 
     topic: str
@@ -120,7 +123,7 @@ class LogChannel:
 
 
 MakeChannel = Callable[[str, str | None], LogChannel]  # from the topic and the name of the schema; None: it is lost
-Row = tuple[Any, int, int, bytes]  # Series, log_time, publish_time [ns], payload
+Row = tuple[Any, int, int, bytes]  # LogChannel, log_time [ns], publish_time [ns], payload
 Item = Row | Header | Metadata | Attachment | DamagedBytes
 
 
@@ -146,20 +149,20 @@ class _Tables:
     """
 
     def __init__(self, make: MakeChannel, summary: Callable[[], bytes]) -> None:
-        self.make, self.schemas, self.series = make, dict[int, Schema](), dict[int, LogChannel]()
+        self.make, self.schemas, self.channels = make, dict[int, Schema](), dict[int, LogChannel]()
         self.summary: Callable[[], bytes] | None = summary
         self.topics = dict[int, str]()  # as the metadata say, by the channel's number
         self.chunked = False  # the file has chunks
 
     def channel(self, number: int) -> LogChannel | None:
         """Return the channel of a message; None if nothing declares it."""
-        if number not in self.series:
+        if number not in self.channels:
             self._read_summary()
-        if number not in self.series and number in self.topics:
-            series = self.make(self.topics[number], None)
-            series.channel = Channel(number, self.topics[number], MessageEncoding.Protobuf, {}, 0)
-            self.series[number] = series
-        return self.series.get(number)
+        if number not in self.channels and number in self.topics:
+            channel = self.make(self.topics[number], None)
+            channel.channel = Channel(number, self.topics[number], MessageEncoding.Protobuf, {}, 0)
+            self.channels[number] = channel
+        return self.channels.get(number)
 
     def note(self, topics: Mapping[str, str]) -> None:
         """Take in the metadata `CHANNELS`."""
@@ -176,15 +179,15 @@ class _Tables:
             new = Schema.read(stream)
             self.schemas[new.id] = new
         else:
-            channel = Channel.read(stream)
-            if channel.id not in self.series:  # the summary repeats it
-                if channel.schema_id and channel.schema_id not in self.schemas:
+            record = Channel.read(stream)
+            if record.id not in self.channels:  # the summary repeats it
+                if record.schema_id and record.schema_id not in self.schemas:
                     self._read_summary()
-                schema = self.schemas.get(channel.schema_id)
-                lost = None if channel.message_encoding == MessageEncoding.Protobuf else ""
-                series = self.make(channel.topic, lost if schema is None else schema.name)
-                series.schema, series.channel = schema, channel
-                self.series[channel.id] = series
+                schema = self.schemas.get(record.schema_id)
+                lost = None if record.message_encoding == MessageEncoding.Protobuf else ""
+                channel = self.make(record.topic, lost if schema is None else schema.name)
+                channel.schema, channel.channel = schema, record
+                self.channels[record.id] = channel
 
 
 def raw_channel(key: str, schema: str | None) -> LogChannel:
@@ -206,24 +209,24 @@ def records(file: IO[bytes], size: int, make: MakeChannel = raw_channel) -> Iter
     magic = file.read(len(MAGIC))
     if not MAGIC.startswith(magic):
         raise NotMcap(f"the file starts with {magic!r}")
-    good = len(magic)  # offset of the end of the last complete record
+    read_to = len(magic)  # offset of the end of the last complete record
     checksum = Checksum(magic)
     while True:
         head = file.read(_HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-        end = good + _HEAD.size + length
+        end = read_to + _HEAD.size + length
         if not opcode or end > size:
-            reason = "a record is incomplete" if good < size else "the recorder was killed or is still running"
+            reason = "a record is incomplete" if read_to < size else "the recorder was killed or is still running"
             if opcode == Opcode.CHUNK:
                 count = 0
-                for row in _begun(file.read(), tables):
+                for row in _messages_of_incomplete_chunk(file.read(), tables):
                     yield row
                     count += 1
                 reason = f"a chunk is incomplete, of which {count} messages were read"
-            yield DamagedBytes(good, size - good, reason, at_end=True)
+            yield DamagedBytes(read_to, size - read_to, reason, at_end=True)
             return
         content = file.read(length)
-        if (changed := checksum.check(opcode, head, content, good)) is not None:
+        if (changed := checksum.check(opcode, head, content, read_to)) is not None:
             yield changed
         try:
             if opcode == Opcode.CHUNK:
@@ -234,12 +237,12 @@ def records(file: IO[bytes], size: int, make: MakeChannel = raw_channel) -> Iter
                     yield DamagedBytes(end, size - end, "the last bytes are missing", at_end=True)
                 return
             else:
-                yield from _plain(opcode, content, tables)
+                yield from _read_outside_chunk(opcode, content, tables)
         except BROKEN as error:
             checksum.damaged = True
-            lost = min(error.size, end - good) if isinstance(error, Undeclared) else end - good
-            yield DamagedBytes(good, lost, str(error) or type(error).__name__, at_end=False)
-        good = end
+            lost = min(error.size, end - read_to) if isinstance(error, Undeclared) else end - read_to
+            yield DamagedBytes(read_to, lost, str(error) or type(error).__name__, at_end=False)
+        read_to = end
 
 
 def has_whole_summary(file: IO[bytes], size: int) -> bool:
@@ -272,7 +275,7 @@ def _summary_again(file: IO[bytes], size: int) -> bytes:
     return data or b""
 
 
-def _plain(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
+def _read_outside_chunk(opcode: int, content: bytes, tables: _Tables) -> Iterator[Item]:
     """Read a record outside a chunk. Index records yield nothing."""
     if opcode in (SCHEMA, CHANNEL):
         tables.add(opcode, content)
@@ -319,7 +322,7 @@ def _uncompressed(content: bytes) -> bytes:
     return data
 
 
-def _begun(content: bytes, tables: _Tables) -> Iterator[Row]:
+def _messages_of_incomplete_chunk(content: bytes, tables: _Tables) -> Iterator[Row]:
     """Yield the messages at the beginning of an incomplete chunk."""
     try:
         _, _, size, _, length = _CHUNK.unpack_from(content)
@@ -336,7 +339,7 @@ def _begun(content: bytes, tables: _Tables) -> Iterator[Row]:
 
 def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
     """Yield the messages among the records in `data`. Raises one of `BROKEN`: `Undeclared` after all other messages."""
-    series, head, message = tables.series, _HEAD.unpack_from, _MESSAGE.unpack_from
+    channels, head, message = tables.channels, _HEAD.unpack_from, _MESSAGE.unpack_from
     at, end = 0, len(data)
     undeclared: list[tuple[int, int]] = []  # channel and size
     while at < end:
@@ -346,7 +349,7 @@ def _unpacked(data: bytes, tables: _Tables) -> Iterator[Row]:
             raise ValueError("a record is longer than its chunk")
         if opcode == MESSAGE:
             number, sequence, log_time, publish_time = message(data, at + 9)
-            channel = series.get(number) or tables.channel(number)
+            channel = channels.get(number) or tables.channel(number)
             if channel is None:
                 undeclared.append((number, after - at))
             else:

@@ -138,23 +138,23 @@ class Log:
         return Damage([str(cut) for cut in self.cuts], self.malformed)
 
     def __iter__(self) -> Iterator[Record]:
-        for series, message, log_time, publish_time in self.decoded():
-            yield Record(series.topic, series.key, message, log_time, publish_time)
+        for channel, message, log_time, publish_time in self.decoded():
+            yield Record(channel.topic, channel.key, message, log_time, publish_time)
 
     def decoded(self) -> Iterator[tuple[LogChannel, Any, int, int]]:
         """Yield (channel, message, log_time, publish_time) for each valid message: faster than iterating.
 
         A message that names another robot or process than its key is not valid, as for the processes that received it.
         """
-        for series, log_time, publish_time, payload in self.rows():
+        for channel, log_time, publish_time, payload in self.rows():
             try:
-                message = series.decode(payload)
+                message = channel.decode(payload)
                 check(message, len(payload))
-                check_names(series.names, message)
+                check_names(channel.names, message)
             except (DecodeError, Implausible):
                 self.malformed += 1
                 continue
-            yield series, message, log_time, publish_time
+            yield channel, message, log_time, publish_time
 
     def rows(self) -> Iterator[Row]:
         """Yield (channel, log_time, publish_time, payload) for each message of a known type, without decoding it."""

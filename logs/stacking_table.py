@@ -51,7 +51,9 @@ class StackingTable(Table):
 
 def plain_table(columns: Sequence[str], rows: Iterable[Sequence[RenderableType]]) -> StackingTable:
     """Return a table without lines; without `columns`, rows of a name and a value."""
-    table = StackingTable(*columns, show_header=bool(columns), **PLAIN)
+    table = StackingTable(show_header=bool(columns), **PLAIN)
+    for column in columns:
+        table.add_column(Text(column))  # as markup, the unit in `decision [ms]` would be a style
     for row in rows:
         table.add_row(*row)
     return table

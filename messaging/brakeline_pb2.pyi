@@ -448,6 +448,7 @@ class Request(_message.Message):
     PAST_FROM_START_FIELD_NUMBER: _builtins.int
     SLOW_FIELD_NUMBER: _builtins.int
     LAYOUT_FIELD_NUMBER: _builtins.int
+    ACCELERATION_AGE_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
     episode: _builtins.int
@@ -475,6 +476,10 @@ class Request(_message.Message):
     layout: _builtins.str
     """Hash of the description by which the client drives (`Robot.layout`). A service with another one refuses the request.
     Empty: not compared.
+    """
+    acceleration_age: _builtins.float
+    """s: the horizontal acceleration in `state` and `past_states` is the one of this long ago. A service whose model set
+    was recorded with another age refuses the request.
     """
     @_builtins.property
     def state(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -561,10 +566,11 @@ class Request(_message.Message):
         past_from_start: _builtins.bool = ...,
         slow: _builtins.float = ...,
         layout: _builtins.str = ...,
+        acceleration_age: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "layout", b"layout", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "layout", b"layout", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -1004,6 +1010,7 @@ class Step(_message.Message):
     BROKEN_FIELD_NUMBER: _builtins.int
     FOR_CLEARANCE_FIELD_NUMBER: _builtins.int
     CLOSEST_FIELD_NUMBER: _builtins.int
+    ACCELERATION_AGE_FIELD_NUMBER: _builtins.int
     LOST_FIELD_NUMBER: _builtins.int
     robot: _builtins.str
     actor: _builtins.str
@@ -1060,6 +1067,8 @@ class Step(_message.Message):
     """as the decision says"""
     closest: _builtins.float
     """m, least clearance at the physics samples of the period; absent: a log from before"""
+    acceleration_age: _builtins.float
+    """s: the horizontal acceleration in `state` is the one of this long ago"""
     lost: _builtins.bool
     """in real time: the vehicle did not follow the action, or its state is not known"""
     @_builtins.property
@@ -1127,11 +1136,12 @@ class Step(_message.Message):
         broken: _builtins.int = ...,
         for_clearance: _builtins.bool | None = ...,
         closest: _builtins.float | None = ...,
+        acceleration_age: _builtins.float = ...,
         lost: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "closest", b"closest", "for_clearance", b"for_clearance", "header", b"header"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "lost", b"lost", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_closest", b"_closest", "_for_clearance", b"_for_clearance", "acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "broken", b"broken", "clearance", b"clearance", "closest", b"closest", "collision", b"collision", "compared", b"compared", "contact_moving", b"contact_moving", "contact_robot", b"contact_robot", "contact_standing", b"contact_standing", "contained", b"contained", "cut", b"cut", "decide_ms", b"decide_ms", "decision", b"decision", "episode", b"episode", "fallback", b"fallback", "fleet", b"fleet", "for_clearance", b"for_clearance", "goal", b"goal", "header", b"header", "index", b"index", "lost", b"lost", "next_observation", b"next_observation", "observation", b"observation", "outside", b"outside", "path", b"path", "penalty", b"penalty", "propose_ms", b"propose_ms", "proposed", b"proposed", "reward", b"reward", "robot", b"robot", "speed", b"speed", "state", b"state", "step", b"step", "terminated", b"terminated", "true_state", b"true_state", "truncated", b"truncated", "turned", b"turned", "weights_version", b"weights_version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__closest: _TypeAlias = _typing.Literal["closest"]  # noqa: Y015
     _WhichOneofArgType__closest: _TypeAlias = _typing.Literal["_closest", b"_closest"]  # noqa: Y015
@@ -1600,6 +1610,7 @@ class FlightRequest(_message.Message):
     ROBOT_FIELD_NUMBER: _builtins.int
     LATE_FIELD_NUMBER: _builtins.int
     OBSTACLES_FIELD_NUMBER: _builtins.int
+    ACCELERATION_AGE_FIELD_NUMBER: _builtins.int
     url: _builtins.str
     """the link to the autopilot"""
     system: _builtins.int
@@ -1616,6 +1627,8 @@ class FlightRequest(_message.Message):
     """the robot's description as JSON (messaging/robot_description.py)"""
     late: _builtins.bool
     """the robot in real time"""
+    acceleration_age: _builtins.float
+    """s: report the horizontal acceleration of this long ago"""
     @_builtins.property
     def origin(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """(3), m: the start of the autopilot's local frame in the world"""
@@ -1637,10 +1650,11 @@ class FlightRequest(_message.Message):
         robot: _builtins.str = ...,
         late: _builtins.bool = ...,
         obstacles: _abc.Iterable[Global___Obstacle] | None = ...,
+        acceleration_age: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["height", b"height", "late", b"late", "lead", b"lead", "obstacles", b"obstacles", "origin", b"origin", "raise_limits", b"raise_limits", "robot", b"robot", "system", b"system", "truth", b"truth", "url", b"url"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["acceleration_age", b"acceleration_age", "height", b"height", "late", b"late", "lead", b"lead", "obstacles", b"obstacles", "origin", b"origin", "raise_limits", b"raise_limits", "robot", b"robot", "system", b"system", "truth", b"truth", "url", b"url"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

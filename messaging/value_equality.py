@@ -9,15 +9,18 @@ import numpy as np
 
 
 def same_values(one: Any, other: object) -> bool:
-    """Return whether two dataclasses are of one type and have equal values; NaN equals NaN."""
-    names = [item.name for item in fields(one)]
+    """Return whether two dataclasses are of one type and have equal values; NaN equals NaN.
+
+    Fields with `compare=False`, such as measured times, do not count.
+    """
+    names = [item.name for item in fields(one) if item.compare]
     return type(one) is type(other) and all(_same(getattr(one, name), getattr(other, name)) for name in names)
 
 
 def _same(one: Any, other: Any) -> bool:
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=True)
-    return bool(np.all(one == other))
+    return bool(np.all(one == other)) or (one != one and other != other)
 
 
 class ComparedByValue:

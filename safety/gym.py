@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium
 import numpy as np
+from gymnasium.utils import RecordConstructorArgs
 
 from brakeline.errors import BadRequest, BusError, TooLoose
 from brakeline.messaging.robot import Array, Robot
@@ -37,7 +38,7 @@ UNANSWERED = "unanswered"
 OUTCOMES = {"goal": "at_goal", "collision": "collision"}
 
 
-class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Replaces each action by the filter's decision on it, and subtracts a penalty from the reward.
 
     >>> from brakeline import Filter
@@ -52,7 +53,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
             plausible. Then the robot continues its backup plan.
         proposed: the action that the policy proposed.
         penalty: subtracted from the reward.
-        diagnostics: a dict of plain values: kind, verified, contained, margin [m], time_ms, model, reason, bound (the
+        diagnostics: a dict of plain values: kind, verified, contained, margin [m], model, reason, bound (the
             probability that a verified plan leaves its tube, as the validation report states it; NaN without one), and
             the proposed and the executed input.
     """
@@ -91,7 +92,12 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
                 service, `step` raises it, since only the answers state the probability.
             ValueError: `accept_bound` is not above 0 and at most 1.
         """
-        super().__init__(env)
+        kept = {"penalty": penalty, "state": state, "obstacles": obstacles, "actions": actions}
+        kept |= {"accept_bound": accept_bound, "turn_aside": turn_aside}
+        if not isinstance(filter, FilterClient):  # a client has the backup plan of one robot: no second one may use it
+            kept["filter"] = filter
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **kept)
+        gymnasium.Wrapper.__init__(self, env)
         self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
         self._limit = 1.0 if accept_bound is None else _checked_limit(self.client, accept_bound)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
@@ -197,7 +203,7 @@ def is_measurement_fault(error: BadRequest, robot: Robot, state: Any) -> bool:
 def diagnostics(answer: Answer | None, reason: str = "") -> dict[str, Any]:
     """Return the figures of a decision; reason: of a missing one."""
     if answer is None:
-        nothing = {"margin": np.nan, "time_ms": np.nan, "bound": np.nan, "model": ""}
+        nothing = {"margin": np.nan, "bound": np.nan, "model": ""}
         return {"kind": UNANSWERED, "verified": False, "contained": False, "reason": reason} | nothing
-    names = ("kind", "verified", "contained", "margin", "time_ms", "model", "reason")
+    names = ("kind", "verified", "contained", "margin", "model", "reason")
     return {name: getattr(answer, name) for name in names} | {"bound": np.nan if answer.bound is None else answer.bound}

@@ -6,6 +6,7 @@ import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -23,6 +24,7 @@ from brakeline.errors import CommandLost, MavlinkError, TelemetryMissing
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
+from brakeline.safety.model.acceleration_age import OLDEST
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period
 
@@ -49,6 +51,10 @@ class MavlinkVehicle(PeriodicVehicle):
     vehicle is where our map says, or whether a person holds it.
 
     Collisions and clearance come from the ground truth of a simulator, if there is one.
+
+    Attributes:
+        acceleration_age: the states hold the horizontal acceleration of this long ago [s]. What counts is the age in
+            the data of the model set (`brakeline.safety.model.acceleration_age`).
     """
 
     def __init__(
@@ -76,6 +82,8 @@ class MavlinkVehicle(PeriodicVehicle):
             MavlinkError: no autopilot answers, it refuses something, or `stop` returned true.
         """
         super().__init__(robot)
+        self.acceleration_age = flight.acceleration_age
+        self._accelerations: deque[tuple[float, Array]] = deque()  # times [s] and (3,), as old as `OLDEST` and older
         self._stop_requested, self._rejected = stop, rejected or RejectedMessages()
         self._origin = np.asarray(flight.origin)
         self.timing = FlightTiming()
@@ -142,6 +150,11 @@ class MavlinkVehicle(PeriodicVehicle):
         self._stop()
         self._velocity, self._stop_requested = None, lambda: False
         self._client.land(self._wait)
+
+    @property
+    def autopilot(self) -> str:
+        """The kind of autopilot: ardupilot, px4, or empty until it is known."""
+        return self._client.kind or ""
 
     @property
     def armed(self) -> bool:
@@ -279,9 +292,21 @@ class MavlinkVehicle(PeriodicVehicle):
             log.warning("the battery is at %.0f %%", battery)
 
     def _state(self, now: float) -> Array:
-        """Return the state (9,) at time `now`: the latest telemetry, extrapolated by its velocity and acceleration."""
+        """Return the state (9,) at time `now`: the latest telemetry, extrapolated by its velocity and acceleration.
+
+        Its horizontal acceleration is the one of `acceleration_age` ago.
+        """
         ahead = min(max(self._watch.age(now), 0.0), STALE)
-        return self._client.state(self._origin, ahead)
+        state = self._client.state(self._origin, ahead)
+        if self.acceleration_age and self._accelerations:
+            times, values = zip(*self._accelerations, strict=True)
+            state[6:8] = resampled(times, np.array(values), np.array([now - self.acceleration_age]))[0, :2]
+        return state
+
+    def _remember_acceleration(self, now: float) -> None:
+        self._accelerations.append((now, self._client.acceleration))
+        while len(self._accelerations) > 1 and self._accelerations[1][0] <= now - OLDEST:
+            self._accelerations.popleft()
 
     def _path(self, now: float, state: Array) -> Array:
         """Return S positions (S, 3) [m] at even times of the period that ends now in `state` (9,)."""
@@ -304,6 +329,7 @@ class MavlinkVehicle(PeriodicVehicle):
             with self._rejected.skip_on_error("mavlink"):
                 client.feed(data, peer)
         self._watch.note(now)
+        self._remember_acceleration(now)
         if self._mavlink_truth is not None and client.truth is not None and client.position is not None:
             self._mavlink_truth.take(client.truth, client.position + self._origin, client.velocity)
             client.truth = None

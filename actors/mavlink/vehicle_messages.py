@@ -23,6 +23,7 @@ from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.structured_text import parse_json
+from brakeline.safety.model.acceleration_age import OLDEST
 from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
 from brakeline.sim.vehicle import Period
@@ -72,6 +73,8 @@ def request_of(message: pb.FlightRequest) -> FlightRequest:
     origin = _vector("origin", message.origin, 3)
     if not 0.0 <= message.height <= FARTHEST or np.abs(origin).max() > FARTHEST:  # NaN fails too
         raise BadMessage(f"flight request: height {message.height} m, origin {origin.tolist()} m")
+    if not 0.0 <= message.acceleration_age <= OLDEST:
+        raise BadMessage(f"flight request: an acceleration of {message.acceleration_age} s ago")
     values: dict[str, Any] = {option.name: getattr(message, option.name) for option in fields(FlightSettings)}
     flight = FlightSettings(**values | {"origin": tuple(origin.tolist())})
     return FlightRequest(flight, robot, obstacles)

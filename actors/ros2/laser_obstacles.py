@@ -2,14 +2,14 @@
 
 A beam that hits at range r becomes a disc of radius
 
-    increment r + range error + heading error (r + m) + position error
+    increment r + way + range error + heading error (r + m) + position error
 
-with m the sensor's distance from the robot's position. The first part covers the gap to the next beam, since an edge
-may be anywhere in it; the others cover the error of the hit's position. Between the last beam and the first, the gap is
-wider by the sensor's way during the turn. Neighbouring hits that the body cannot pass
-between are joined to boxes, so that a wall is one obstacle and not a hundred. A beam without a hit is free up to the
-sensor's range. Something too near to be measured touches the body where the beam leaves it. Beams without information
-are left out here: `unknown_space.py` says what may be there.
+with m the sensor's distance from the robot's position. The increment and the way of the sensor from beam to beam cover
+the gap to the next beam, since an edge may be anywhere in it; a turn of the robot adds to the increment. The others
+cover the error of the hit's position. Between the last beam and the first, the gap is wider by the sensor's way during
+the turn. Neighbouring hits that the body cannot pass between are joined to boxes, so that a wall is one obstacle and
+not a hundred. A beam without a hit is free up to the sensor's range. Something too near to be measured touches the body
+where the beam leaves it. Beams without information are left out here: `unknown_space.py` says what may be there.
 
 Assumptions: nothing moves, and no obstacle is narrower than the gap between two beams at the distance where it matters
 (7 mm at 0.4 m with 360 beams). The scan shows an obstacle in the one gap behind an edge only after the robot has come
@@ -67,7 +67,8 @@ def obstacles(
     swing = errors.heading * math.hypot(mount.x, mount.y)  # a wrong heading also moves the sensor about the robot
     with np.errstate(invalid="ignore"):
         points = sensor + beams.ranges[:, None] * directions
-        radii = (beams.gap + errors.heading) * beams.ranges + swing + errors.range + errors.position
+        turn, way = _between_beams(beams, poses, sensor)
+        radii = (beams.gap + turn + errors.heading) * beams.ranges + way + swing + errors.range + errors.position
         far = np.linalg.norm(points - around, axis=1) > robot.sight + EXTRA_SIGHT + radii
     # A hit whose place is NaN counts as near: it makes no obstacle, and without one nothing is decided.
     near = ~(far | beams.too_near)
@@ -78,6 +79,14 @@ def obstacles(
     leaves = _leaving(sensor[beams.too_near] - around, directions[beams.too_near], robot.footprint)
     touching = around + (robot.footprint + size) * leaves
     return (*hits, *_joined(touching, np.full(len(touching), size), 2.0 * robot.footprint))
+
+
+def _between_beams(beams: LaserBeams, poses: Array, sensor: Array) -> tuple[float, float]:
+    """Return by how much the robot turns [rad], and how far the sensor moves [m], from one beam to the next."""
+    if len(poses) < 2:
+        return 0.0, 0.0
+    steps = max(abs(float(beams.angles[-1] - beams.angles[0])) / beams.gap, 1.0)
+    return abs(float(poses[-1, 2] - poses[0, 2])) / steps, float(np.linalg.norm(sensor[-1] - sensor[0])) / steps
 
 
 def _with_seam(

@@ -128,7 +128,7 @@ class RosInputs:
             if self._scan is None:
                 raise InputMissing("no scan yet")
             beams, frame = self._scan
-            self._check_age("the scan", float(beams.times[0]), now, self.limits.scan)
+            self._check_age("the scan", float(beams.times.min()), now, self.limits.scan)
             poses = self._odometry.at(beams.times)
             mount, base = self.settings.mount, self._base
             if mount is None and base:

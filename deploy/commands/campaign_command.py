@@ -27,7 +27,7 @@ COLLIDED = 3  # exit status
 class CampaignCommand:
     """The options of `brakeline campaign`."""
 
-    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Drive these robots."""
     arenas: tuple[str, ...] = ("default", "dense")
     """Drive in arenas of these names."""

@@ -43,14 +43,16 @@ class CertifyCommand:
     """Validate these error bounds of the linear modes (see docs/certificates.md). Defaults to all of them if you
     give --mode direct or recursion."""
     mode: Literal["one-step", "direct", "recursion"] | None = None
-    """Validate this prediction mode; one-step rolls out one learned period. Defaults to one-step, or to direct and
-    recursion if you give --certificates. A robot that stops by feedback has no mode one-step."""
+    """Validate this prediction mode: one-step rolls out one learned period, direct and recursion are linear. Defaults
+    to one-step, or to direct and recursion if you give --certificates. A robot that stops by feedback has no mode
+    one-step."""
     windows: Literal["plan", "free", "auto"] = "auto"
-    """Fit and validate on this kind of driving: plan takes the windows that brake as the filter does, free takes every
-    window, and auto takes every window if the others are too few."""
+    """In the linear modes, fit and validate on this kind of driving: plan takes the windows that brake as the filter
+    does, free takes every window, and auto takes every window if the others are too few."""
     few: bool = False
-    """Accept minutes of driving instead of hours: 60 windows of each length suffice, and each error bound is scaled
-    by 1.5 instead of 1.15, as after `collect --url`."""
+    """In the linear modes, accept minutes of driving instead of hours: 60 windows of each length suffice instead of
+    200, and each error bound is scaled by 1.5 instead of 1.15, as after `collect --url`. In mode one-step, only the
+    bound of the stopping distance is scaled like this."""
     outside: float = ModelConfig.outside
     """Let this share of the recorded plans leave their sets in mode one-step. A larger share makes the sets narrower
     and the stated bound larger."""
@@ -134,6 +136,10 @@ class CertifyCommand:
             mode = "direct" if robot.feedback else "one-step"
             return [(RESIDUAL, mode)]
         if mode == ONE_STEP:
+            if others := [name for name in self.certificates if name != RESIDUAL]:
+                raise ValueError(
+                    f"mode one-step has no error bound {', '.join(others)}: give --mode direct or recursion"
+                )
             return [(RESIDUAL, mode)]
         return list(product(self.certificates or KINDS, (mode,) if mode else MODES))
 
@@ -216,14 +222,14 @@ class CertifyCommand:
 
 
 def widening(report: ValidationReport) -> str:
-    """Say that envelopes are wider than usual, and why. Empty if they are not."""
+    """Say that error bounds are wider than usual, and why. Empty if they are not."""
     usual = ModelConfig().inflation
     if report.mode == ONE_STEP:
         return ""
     if report.inflation <= usual * 1.001 or report.inflation == ModelConfig().of_minutes().inflation:
         return ""
     return (
-        f"{report.certificate}, {report.mode}: every envelope is widened by {report.inflation:.3g}, not by "
+        f"{report.certificate}, {report.mode}: every error bound is widened by {report.inflation:.3g}, not by "
         f"{usual:g}, so that no more than {report.violations} of {report.windows} held-out plans leave their sets"
     )
 
@@ -264,8 +270,9 @@ def validation_table(rows: list[tuple[ValidationReport, str]]) -> StackingTable:
             *(width(value, s.unit) for value in (s.half_width_rest, s.half_width_full)),
             width(s.clearance_margin),
         )
-    starred = any(s.certificate == RESIDUAL and s.mode == "direct" for s, _ in rows)
-    table.caption = f"{'* the default; ' if starred else ''}half-widths of a full stop, largest axis"
+    table.caption = "half-widths of a full stop, largest axis"
+    if any(s.certificate == RESIDUAL and s.mode == "direct" for s, _ in rows):
+        table.caption = f"* the default of the linear modes; {table.caption}"
     if any(s.unit != "m" for s, _ in rows):
         table.caption += "; in joint space, shares of half the distance between a limit and the opposite one"
     return table

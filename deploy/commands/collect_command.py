@@ -13,6 +13,7 @@ from brakeline.deploy.commands.certify_command import bounds_in_words, validatio
 from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.data.simulated_recording import SEED, load_or_record
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
+from brakeline.safety.model.acceleration_age import OLDEST
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,9 @@ class CollectCommand:
             raise ValueError(f"--out {self.out} is a folder: give the path of a file, such as data.safetensors")
         if self.url and (self.trajectories is not None or self.physics != options.PhysicsOptions()):
             raise ValueError("--url ignores --trajectories and what changes the simulator: leave these options out")
+        age = self.first.acceleration_age
+        if age is not None and not 0.0 <= age <= OLDEST:
+            raise ValueError(f"--acceleration-age is a number of seconds from 0 to {OLDEST:g}, not {age:g}")
         if not self.url and (self.first != FirstFlightSettings() or self.accept_bound is not None):
             raise ValueError("the options of a first flight, such as --minutes and --accept-bound, need --url")
 

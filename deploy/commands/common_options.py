@@ -45,10 +45,12 @@ Method = Literal["ddpc", "secas", "sailr", "cbf", "psf", "none"]
 Robot = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(help="Use this robot. Give its name, or the path of a robot description (.toml)."),
+    tyro.conf.arg(help="Use this robot. Give its name, or the path of a robot description (.toml).", metavar="[ROBOT]"),
 ]
 Logs = Annotated[
-    tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Read these log files (.mcap) or run folders.")
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(help="Read these log files (.mcap) or run folders.", metavar="[LOG ...]"),
 ]
 Seed = Annotated[int, tyro.conf.arg(help="Draw everything random from this seed. The same seed gives the same result.")]
 ArenaName = Annotated[

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 from rich.markdown import Markdown
@@ -23,12 +23,15 @@ from brakeline.deploy.experiments.comparison_cells import (
     learning,
     quick,
 )
-from brakeline.deploy.experiments.experiment_jobs import Job, complete, task_hash
+from brakeline.deploy.experiments.experiment_jobs import complete, task_hash
 from brakeline.deploy.experiments.task_engine import Engine
 from brakeline.deploy.progress import say
 from brakeline.deploy.run.run_config import SEEDS
 from brakeline.learner.learner_config import TD3Config
 from brakeline.messaging.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from brakeline.deploy.experiments.conservatism import Conservatism
 
 QUICK = Path("runs/quick")
 OUTPUT = {"robots", "results", "quiet", "json"}
@@ -45,7 +48,7 @@ Results = list[dict[str, Any]]
 class CompareCommand:
     """The options of `brakeline compare`."""
 
-    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Compare the methods on these robots."""
     seeds: tuple[int, ...] | None = None
     """Train each method once from each of these seeds. Defaults to 0 to 9 where a batch trains, and to 0, 1 and 2 where
@@ -110,6 +113,8 @@ class CompareCommand:
         # A wrong option ends the command before the first of hours of training.
         jobs_of = {} if self.table or self.tune else {robot: self._jobs(robot) for robot in robots}
         jobs_of = {robot: (self._prepared(cells, results), others) for robot, (cells, others) in jobs_of.items()}
+        for measured in (measured for _, others in jobs_of.values() for measured in others if not self.again):
+            measured.check_recording(results)
         for robot in robots:
             if self.tune:
                 trials = tuning_jobs(robot, self._methods(robot), self.arenas)
@@ -166,7 +171,7 @@ class CompareCommand:
             import_module("stable_baselines3")  # a missing extra is told before hours of other trainings
         return methods
 
-    def _jobs(self, robot: str) -> tuple[list[CellConfig], list[Job]]:
+    def _jobs(self, robot: str) -> tuple[list[CellConfig], list[Conservatism]]:
         """Return the cells of a robot, and the other jobs."""
         from brakeline.deploy.experiments.conservatism import Conservatism
         from brakeline.messaging.task import check_penalty, robot_with_task

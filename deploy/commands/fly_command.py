@@ -24,7 +24,7 @@ TIMING_PREFIXES = ("periods ", "lateness", "worst", "link", "true", "estimate") 
 class FlyCommand:
     """The options of `brakeline fly`."""
 
-    robot: Annotated[str, tyro.conf.Positional] = "quadrotor"
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT]")] = "quadrotor"
     """Fly this robot. Give its name, or the path of a robot description (.toml)."""
     minutes: float = 10.0
     """Fly for this long [min]."""

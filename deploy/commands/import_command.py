@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class ImportCommand:
     """The options of `brakeline import`."""
 
-    sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG ...")]
     """Import these logs: CSV, JSON, Parquet, ROS bags, ArduPilot or PX4 logs, or Brakeline runs (docs/data.md)."""
     robot: str = "ground"
     """Read the log of this robot. Give its name, or the path of a description (.toml)."""

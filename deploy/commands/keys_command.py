@@ -23,9 +23,9 @@ from brakeline.safety.service.signature import KEY as SIGNING_KEY
 class KeysCommand:
     """The options of `brakeline keys`."""
 
-    folder: Annotated[Path, tyro.conf.Positional] = Path("keys")
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("keys")
     """Make the keys in this folder. The command makes the folder if it does not exist."""
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[NAME ...]")] = ()
     """Issue certificates to these processes. Each name begins with its role, such as actor-7. A process that has a
     certificate gets a new one."""
     host: tuple[str, ...] = ()
@@ -38,7 +38,8 @@ class KeysCommand:
     robots: tuple[str, ...] = (ANY,)
     """Let a new signer sign the models of these robots; * stands for all."""
     sign: tuple[Path, ...] = ()
-    """Sign these model files as they are. `brakeline certify --use --keys FOLDER` signs with the data set at hand."""
+    """Sign these model files as they are. To sign a model set together with its data set, use `brakeline certify --use
+    --keys FOLDER` instead."""
     hand_out: Path | None = None
     """Copy the files that each named process needs, and no others, to a folder of its name in this folder. Carry that
     folder to the machine of the process."""

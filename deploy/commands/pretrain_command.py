@@ -16,7 +16,8 @@ class PretrainCommand:
     """The options of `brakeline pretrain`."""
 
     method: Annotated[Literal["secas", "sailr", "cbf", "psf"], tyro.conf.Positional]
-    """Pre-train this rival method, or choose the settings of one that knows its model by hand."""
+    """Pre-train this rival method. The equations of cbf and psf are written by hand: for these, the command only
+    chooses the settings."""
     robot: Robot = "ground"
     samples: int | None = None
     """Drive this many steps. Defaults to the number that the comparison uses."""
@@ -41,7 +42,7 @@ class PretrainCommand:
         changed = {name: value for name in ("samples", "seed") if (value := getattr(self, name)) is not None}
         if changed and not hasattr(config, "samples"):
             raise ValueError(
-                f"{self.method} knows its model by hand and drives nothing: leave out --samples and --seed"
+                f"{self.method} has equations written by hand and needs no driving: leave out --samples and --seed"
             )
         model = pretrained(robot, self.method, replace(config, **changed), again=True)
         path = method_path(robot, self.method, ModelConfig())

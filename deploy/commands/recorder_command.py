@@ -18,7 +18,7 @@ from brakeline.logs.segment_rotation import Rotation
 class RecorderCommand:
     """The options of `brakeline recorder`."""
 
-    log: Annotated[Path, tyro.conf.Positional] = Path("runs/run.mcap")
+    log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[LOG]")] = Path("runs/run.mcap")
     """Write this log file (.mcap). If the file exists, the recorder writes the next one of the same log."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     name: str = "recorder"

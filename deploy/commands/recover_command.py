@@ -17,7 +17,7 @@ from brakeline.deploy.progress import under_way
 class RecoverCommand:
     """The options of `brakeline recover`."""
 
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG ...")]
     """Repair these log files (.mcap) or run folders. A repaired file takes the place of the damaged one, which stays
     beside it as *.mcap.damaged."""
     out: Path | None = None

@@ -37,15 +37,15 @@ class RobotCommand:
     action: Annotated[Literal["new", "check", "show"], tyro.conf.Positional]
     """Choose what to do: new writes a description with comments, check lists all mistakes in one, show prints what
     follows from it."""
-    file: Annotated[str, tyro.conf.Positional]
+    file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Write or read this description (.toml). With check and show, you may name a robot that comes with the program."""
     from_: Annotated[tuple[Path, ...], tyro.conf.arg(name="from")] = ()
     """With new, infer values from these logs of one robot (CSV, Parquet, ROS bags, logs of autopilots). The log of a
     run contains the whole description."""
     map: tuple[str, ...] = ()
-    """With --from, give the names of coordinates, inputs and the time, and their places in the log, each as
-    NAME=TABLE/FIELD (of a file of columns: NAME=COLUMN; then no other column is taken). The name of an input begins
-    with `command `."""
+    """With --from, name the coordinates, the inputs and the time, each with its place in the log: NAME=TABLE/FIELD, or
+    NAME=COLUMN for a file of columns (of which the command then reads no others). The name of an input begins with
+    `command `."""
     reading: Unprefixed[LogReadOptions] = field(default_factory=LogReadOptions)
     json: Json = False
 
@@ -114,9 +114,15 @@ class RobotCommand:
             if name != "inputs":
                 text = "\n".join(value) if isinstance(value, list) else value
                 text = f"{text:g}" if isinstance(text, float) else str(text)
-                rows.append((name.replace("_", " "), escape(text)))
+                rows.append((escape(_label(name)), escape(text)))
         print_result(self.json, values, plain_table((), rows))
         return 0
+
+
+def _label(name: str) -> str:
+    """Return a figure's name for people, with its unit in brackets: `period [s]` for `period_s`."""
+    words, _, last = name.replace("_", " ").rpartition(" ")
+    return f"{words} [{last}]" if last in ("s", "m") else f"{words} {last}".strip()
 
 
 def _code_problems(task: Task) -> tuple[list[tuple[str, str]], list[str]]:

@@ -18,7 +18,7 @@ from brakeline.messaging.task import robot_maybe_with_task
 class SafetyCommand:
     """The options of `brakeline safety`."""
 
-    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Serve these robots. Give their names, or paths of robot descriptions (.toml)."""
     endpoints: Unprefixed[BusOptions] = field(default_factory=BusOptions)
     filtering: Unprefixed[ServiceOptions] = field(default_factory=ServiceOptions)

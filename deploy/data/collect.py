@@ -50,11 +50,20 @@ class _Recipe:
 def record(
     robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0, restless: int = 0
 ) -> Iterator[Trajectory]:
+    """Yield the trajectories of `record_parts` one by one."""
+    return itertools.chain.from_iterable(record_parts(robot, trajectories, seed, conditions, first, restless))
+
+
+def record_parts(
+    robot: RobotWithTask, trajectories: int, seed: int, conditions: Conditions, first: int = 0, restless: int = 0
+) -> Iterator[list[Trajectory]]:
     """Yield trajectories from the robot's simulator, and after them `restless` short ones of restless driving.
 
-    Each one begins at rest and has its own random generator, seeded with (seed, number). Therefore a recording that
-    was interrupted can continue and give the same data: `first` trajectories exist already. Many robots at once, where
-    a batch simulates them, give what one after the other gives, up to rounding.
+    The trajectories of a part end at the same time. Save them before you ask for the next part, which takes a while.
+
+    Each trajectory begins at rest and has its own random generator, seeded with (seed, number). Therefore a recording
+    that was interrupted can continue and give the same data: `first` trajectories exist already. Many robots at once,
+    where a batch simulates them, give what one after the other gives, up to rounding.
 
     Raises:
         RuntimeError: the robot touched something.
@@ -66,10 +75,10 @@ def record(
     try:
         check_vehicles(robot, conditions)
     except NoBatch:
-        yield from (_recorded(robot, recipe, conditions) for recipe in recipes)
+        yield from ([_recorded(robot, recipe, conditions)] for recipe in recipes)
         return
     for k in range(0, len(recipes), AT_ONCE):
-        yield from _recorded_at_once(robot, recipes[k : k + AT_ONCE], conditions)
+        yield _recorded_at_once(robot, recipes[k : k + AT_ONCE], conditions)
 
 
 def _recorded(robot: RobotWithTask, recipe: _Recipe, conditions: Conditions) -> Trajectory:

@@ -223,16 +223,16 @@ def _too_loose(report: ValidationReport, data: Dataset) -> list[str]:
     wider = (
         "`certify` with a smaller --outside lets fewer of the plans leave them, except those with jumping inputs"
         if report.mode == ONE_STEP
-        else f"`certify --until-held` widens each envelope {report.excess:.2g} times, so that none of "
-        f"the {plans} plans leaves its set, and states at most {percent(upper_bound(0, plans))}; with "
+        else f"`certify --until-held` widens each error bound {report.excess:.2g} times, so that none of "
+        f"the {plans} plans leaves its set. It then states at most {percent(upper_bound(0, plans))}. With "
         f"{plans_needed(limit)} or more held-out plans `certify` widens them by itself, at most {MAX_INFLATION} times"
     )
     return [
         f"{bounded}; {violations} of {plans} held-out plans ({share}) left their sets: {_where(leaving)}",
         f"more minutes like these do not help: the share of {share} is above the limit of {percent(limit)}"
         if wanted is None
-        else f"{more} more minutes like these, {wanted} held-out plans, reach the limit only if no larger share than "
-        f"{share} of them leaves its sets",
+        else f"{more} more minutes like these, {wanted} held-out plans, reach the limit only if at most "
+        f"{share} of them leave their sets",
         *(f"{regime}: {_remedy(data.robot, regime)}" for regime in driving),
         *(text for part, text in ABOUT_PARTS.items() if part in parts),
         f"or wider sets: {wider}",
@@ -268,8 +268,8 @@ def _kinds_left(report: ValidationReport) -> tuple[ViolationGroup, ...]:
 def _where(leaving: Sequence[ViolationGroup]) -> str:
     """Describe the largest groups of violations, each with the number of plans in its regime."""
     shown = [
-        f"{one.plans}{f' by {one.part}' if one.part else ''} while {one.regime} (of {one.of} plans there; up to "
-        f"{one.excess:.2g} × its bound)"
+        f"{one.plans}{f' by {one.part}' if one.part else ''} while {one.regime} (of {one.of} such plans; errors up to "
+        f"{one.excess:.2g} × their bound)"
         for one in leaving[:MOST_SHOWN]
     ]
     rest = sum(one.plans for one in leaving[MOST_SHOWN:])

@@ -122,7 +122,7 @@ class FirstFlight:
         self._reached, self._missing = 0.0, list[str]()
 
     def fly(self, minutes: float) -> None:
-        """Fly all levels. An error of the vehicle ends the flight, and what was recorded stays."""
+        """Fly all levels. An error ends the flight, whatever it is, and what was recorded stays."""
         try:
             for level, share in zip(LEVELS, SHARES, strict=True):
                 if not any(self._predicted(level, 60.0 * minutes * share) for _ in range(TRIES)):
@@ -133,6 +133,9 @@ class FirstFlight:
                 self._reached = level
         except (MavlinkError, FlightEnded) as error:
             self._missing.append(str(error))
+        except Exception as error:  # a mistake of the program: what was recorded must not be lost with it
+            log.exception("the flight ends")
+            self._missing.append(f"the flight ended with an error: {type(error).__name__}: {error}")
         self._cut()
 
     def result(self, about: dict[str, str], store: Callable[[Dataset], object]) -> FirstFlightResult:

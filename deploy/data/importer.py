@@ -19,6 +19,7 @@ from brakeline.deploy.data.stamps import TIME, in_header_units, stamped
 from brakeline.errors import NoSource
 from brakeline.logs.mcap_container import is_ros
 from brakeline.messaging.robot import Robot
+from brakeline.safety.model.acceleration_age import about_age, acceleration_age_in
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.repeated_driving import repeated_driving
 
@@ -125,7 +126,8 @@ def import_sources(
     data = Dataset(
         robot,
         tuple(t for part in parts for t in part.data.trajectories),
-        {"origin": "import", "sources": ", ".join(path.name for path in paths)},
+        {"origin": "import", "sources": ", ".join(path.name for path in paths)}
+        | about_age(acceleration_age_in(part.data.about) for part in parts),
         max(part.data.chord_deviation for part in parts),
     )
     _refuse_copies(paths, parts)

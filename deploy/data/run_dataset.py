@@ -13,6 +13,7 @@ from brakeline.errors import BadData
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
+from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.repeated_driving import without_repeats
 
@@ -44,7 +45,7 @@ def from_log(path: Path, robot: Robot, last: int) -> tuple[Dataset, str]:
             f"{path}: no trajectory of {robot.name}, of which it has {len(steps)} steps{damage}. Other messages: "
             f"{content}. See what the log holds with `brakeline analyse {path}`, or name its robot with --robot"
         )
-    data = Dataset(robot, trajectories, {"origin": "log"})
+    data = Dataset(robot, trajectories, {"origin": "log"} | about_age(step.acceleration_age for step in steps))
     data.check()
     left_out = f"; {repeats} repeated episodes left out" if repeats else ""
     return data, f"{data.periods} of the last {len(steps)} steps of {robot.name} in {path}{left_out}{damage}"

@@ -18,7 +18,7 @@ from brakeline.messaging.task import RobotWithTask, needs_task
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.sim.sim_conditions import Conditions
 
-SAVE_EVERY = 20.0  # s: a killed recording loses no more than this
+SAVE_EVERY = 2.0  # s: a killed recording loses no more of what it has finished
 SEED = 20260
 RESTLESS_SHARE = 0.5  # restless trajectories, in addition, for each other one
 
@@ -75,18 +75,18 @@ def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, cond
         "continues.",
         markup=False,
     )
-    rest = collect.record(robot, trajectories, seed, conditions, len(driven), restless)
+    rest = collect.record_parts(robot, trajectories, seed, conditions, len(driven), restless)
     saved = time.monotonic()
     try:
         with under_way(f"recording {robot.name}", total) as advance:
             advance(len(driven))
-            for trajectory in rest:
-                advance()
-                driven.append(trajectory)
+            for finished in rest:
+                driven += finished
+                advance(len(finished))
                 if time.monotonic() - saved > SAVE_EVERY:
                     _keep(collect.dataset(robot, driven, seed, conditions, restless), part)
                     saved = time.monotonic()
-    except KeyboardInterrupt:
+    except BaseException:  # an interruption, or an error of the simulator
         if driven and _keep(collect.dataset(robot, driven, seed, conditions, restless), part):
             console.print(
                 f"[yellow]kept {len(driven)} of {total} trajectories[/]: run the same command again to continue"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 PART = 500  # episodes of a part
 AXES = ("arena", "policy", "model set", "perturbation")  # of the cells
+PACKAGES = ("brakeline", "mujoco", "numpy")  # whose versions a result states
+NOT_STATED = "not stated"
 NEAR = 0.05  # of the footprint: an episode that comes nearer is kept
 
 # What differs from the robot that was recorded. Names say the change; a value of None does nothing.
@@ -142,7 +145,8 @@ class CampaignPart:
                 again = driver.record(number, folder / log)
                 near.append({"episode": number, "closest": row["closest"], "again": again["closest"], "log": log})
         columns = {name: [row[name] for row in rows] for name in rows[0]}
-        return {"study": configuration(self), "episodes": columns, "near": near}
+        versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+        return {"study": configuration(self), "versions": versions, "episodes": columns, "near": near}
 
 
 @dataclass(frozen=True)
@@ -218,6 +222,7 @@ def _figures(cell: CampaignPart, results: Sequence[dict[str, Any]]) -> dict[str,
         "model_set": cell.model_set,
         "perturbation": cell.perturbation,
         "model": cell.model or "none",
+        "versions": sorted({result.get("versions", NOT_STATED) for result in results}),
         "episodes": episodes,
         "steps": count["steps"],
         "goals": count["goal"],
@@ -277,8 +282,10 @@ SEARCH_HEADS = ("arena", "model set", "perturbation", "episodes", "collisions", 
 def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
     """Return the heads and the texts of the table of cells.
 
-    The column of walkers that ran into the standing robot is left out where there are none.
+    The column of walkers that ran into the standing robot is left out where there are none, and the one of versions if
+    one version drove all cells.
     """
+    versions = ["; ".join(cell.get("versions", [NOT_STATED])) for cell in cells]
     columns = {
         **{name: [cell[name.replace(" ", "_")] for cell in cells] for name in AXES},
         "episodes": [f"{cell['episodes']:,}" for cell in cells],
@@ -299,6 +306,8 @@ def cell_table(cells: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[st
     }
     if not any(cell.get("contacts_standing") for cell in cells):
         del columns["run into, standing"]
+    if len({*versions}) > 1 or any(";" in text for text in versions):
+        columns["driven by"] = versions
     return list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
 
 

@@ -150,8 +150,25 @@ def table(results: Iterable[Result]) -> dict[str, Any]:
     for arena in study["arenas"]:
         parts[arena] = {m: evaluation_rows(g, f"{TRAINED}-{METHODS[m].filter}-{arena}") for m, g in groups.items()}
     parts["deployment"] = _deployment(groups, study["arenas"][0])
-    about = {"robot": study["robot"], "seeds": seeds}
+    about = {"robot": study["robot"], "seeds": seeds, "versions": cells_by_version(cells)}
     return about | {"steps": study["steps"], "episodes": study["episodes"], "parts": parts}
+
+
+def cells_by_version(cells: Iterable[Result]) -> dict[str, list[str]]:
+    """Return the names of the cells by the versions of Brakeline and of the packages that made them."""
+    names: dict[str, list[str]] = {}
+    for cell in cells:
+        versions = ", ".join(f"{package} {number}" for package, number in cell.get("versions", {}).items())
+        names.setdefault(versions or "not stated", []).append(f"{cell['study']['method']}-s{cell['study']['seed']}")
+    return names
+
+
+def version_note(versions: dict[str, list[str]]) -> str:
+    """Return which version made which cells, or an empty text if one made all."""
+    if len(versions) < 2:
+        return ""
+    made = [f"{version} ({', '.join(names)})" for version, names in versions.items()]
+    return f"{len(versions)} versions made the cells: {'; '.join(made)}"
 
 
 DEPLOYMENT = (  # name, method of the training, policy and filter of the evaluation
@@ -237,6 +254,8 @@ def markdown(figures: dict[str, Any]) -> str:
         "intervention cut (SAILR) do not count for the steps to 90 % and for the goals of a third.",
         "",
     ]
+    if note := version_note(figures["versions"]):
+        lines += [f"**{note}.**", ""]
     for part, methods in figures["parts"].items():
         rows = []
         for row in next(iter(methods.values()), {}):

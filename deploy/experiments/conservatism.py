@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from brakeline.deploy.data.certification import certify
+from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.comparison_table import markdown_table
 from brakeline.deploy.experiments.evaluate import in_process
-from brakeline.deploy.experiments.experiment_jobs import configuration
+from brakeline.deploy.experiments.experiment_jobs import configuration, result_path, stored_result
 from brakeline.deploy.experiments.trials import EpisodeTable, fresh_trial
-from brakeline.errors import BadData, ErrorBoundError
+from brakeline.errors import BadData, ErrorBoundError, ResultError
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import arena_kind, robot_with_task
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_config import KINDS, MODES, ModelConfig
 
 ORACLE = "astar"
@@ -40,6 +42,18 @@ class Conservatism:
     @property
     def name(self) -> str:
         return "conservatism"
+
+    def check_recording(self, results: Path) -> None:
+        """Raise ResultError if the stored result is of another recording than the one in use."""
+        path, recording = result_path(results, self), record_path(robot_with_task(self.robot))
+        if not (path.exists() and recording.exists()):
+            return
+        stored, present = stored_result(path).get("data"), Dataset.load(recording).steady().digest()
+        if stored != present:
+            raise ResultError(
+                f"{path} was measured on another recording ({stored}) than {recording} ({present}): move it away, and "
+                "it is measured again, or give --no-conservatism"
+            )
 
     def run(self, folder: Path, say: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
         """Return one row per error bound and mode; a row without a model set gives the reason."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
-from brakeline.deploy.experiments.comparison_table import markdown_table, steps_to_learn
+from brakeline.deploy.experiments.comparison_table import cells_by_version, markdown_table, steps_to_learn, version_note
 from brakeline.deploy.experiments.experiment_jobs import stored_result
 from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.tuning_trials import SETTINGS, best_learner, best_threshold, value_in_use
@@ -118,6 +118,7 @@ def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
     )
     errors = ", ".join(f"{name}: {most:g}" for name, most in zip(robot.state, robot.measurement_bound, strict=True))
     arenas = "; ".join(f"`{arena}`: {_arena(task.arenas[arena])}" for arena in robot_results.arenas)
+    note = version_note(cells_by_version(cell for cells in robot_results.cells.values() for cell in cells))
     rewards = {name: value for name, value in asdict(task.reward).items() if name != "correction_penalty"}
     rows = [
         ("inputs", low_high),
@@ -134,6 +135,7 @@ def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
         ),
         ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
         *_correction_settings(robot_results),
+        *([("versions", note)] if note else []),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])

@@ -21,6 +21,7 @@ from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.widening import RESERVE
+from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.calibration_samples import FOLDS
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet
@@ -260,7 +261,8 @@ class Adaptation:
         widening, version, robot = self.widening, self.version, self.robot
         try:
             trajectories, _ = without_repeats(robot, tuple(trajectories_of(steps, robot)))
-            data = Dataset(robot, trajectories, {"origin": "adaptation", "why": why})
+            about = {"origin": "adaptation", "why": why} | about_age(step.acceleration_age for step in steps)
+            data = Dataset(robot, trajectories, about)
             data.check()
             in_use = self.in_use(version)
             covered = _coverage(in_use, data)

@@ -46,7 +46,7 @@ class RunConfig:
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}  # for this and all nested dataclasses
 
-    robots: Annotated[tuple[str, ...], tyro.conf.Positional] = ("ground",)
+    robots: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT ...]")] = ("ground",)
     """Train these robots. Give their names, or paths of robot descriptions (.toml). Each has a learner and actors of
     its own; all share the safety service."""
     method: Internal[str] = "ddpc"

@@ -20,6 +20,7 @@ from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import IN_USE, Model, archive_path, load
+from brakeline.safety.model.acceleration_age import acceleration_age_in
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import check_bound
@@ -51,10 +52,27 @@ def models_of_new_run(config: RunConfig, folder: Path) -> tuple[RunConfig, list[
                 shutil.copyfile(path, archived.with_suffix(path.suffix))
         write_atomically(archived.with_name(IN_USE), model.version.encode())
         models.append(model)
+        config = _with_acceleration_age(config, model)
     modes = {model.model_config.mode for model in models if isinstance(model, ModelSet)}
     if config.model_config.mode == AUTO and len(modes) == 1:
         config = replace(config, model_config=replace(config.model_config, mode=modes.pop()))
     return config, models
+
+
+def _with_acceleration_age(config: RunConfig, model: Model) -> RunConfig:
+    """Let the vehicles of a flight report accelerations of the age with which the model was recorded.
+
+    Raises:
+        BadModel: another age was asked for.
+    """
+    age = acceleration_age_in(model.about)
+    for flight in config.flights:
+        if flight.acceleration_age not in (0.0, age):
+            raise BadModel(
+                f"the model set in use was recorded with the horizontal acceleration of {age:g} s ago, not of "
+                f"{flight.acceleration_age:g} s ago: leave out --acceleration-age"
+            )
+    return replace(config, flights=tuple(replace(flight, acceleration_age=age) for flight in config.flights))
 
 
 def models_of_resumed_run(config: RunConfig, folder: Path) -> list[Model]:

@@ -9,7 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-FIGURES = ("episodes", "cost an episode", "worst", "reward", "unverified", "outside", "decisions")
+FIGURES = (
+    *("episodes", "cost an episode", "highest cost of an episode", "reward an episode"),
+    *("unverified steps", "steps outside", "decisions"),
+)
 HEAD = ("robot", "policy", "filter", *FIGURES)
 
 

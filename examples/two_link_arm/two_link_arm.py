@@ -23,8 +23,8 @@ from brakeline.deploy.cli import main as brakeline
 DESCRIPTION = Path(__file__).with_name("two_link_arm.toml")
 ROBOT = robot_named(str(DESCRIPTION))
 STEP = 0.002  # s of the physics
-LOGGED = 10  # physics steps between two rows of the log
-REACH = np.array([1.7, 2.4])  # rad; the driver of the recording stays within, which is a little beyond the limits
+STEPS_PER_ROW = 10  # physics steps between two rows of the log
+REACH = np.array([1.7, 2.4])  # rad; the recording stays within these angles, which are a little beyond the limits
 MODEL = """
 <mujoco>
   <compiler angle="radian"/>
@@ -86,7 +86,7 @@ class Arm:
 
 
 def record(path: Path, minutes: float, generator: np.random.Generator) -> Path:
-    """Drive the arm as an operator with a joystick would, and write what it measured as CSV."""
+    """Drive the arm as an operator with a joystick would, and write the measured states and the inputs as CSV."""
     arm, held, left, time = Arm(generator), np.zeros(2), 0, 0.0
     with path.open("w", newline="") as file:
         log = csv.writer(file)
@@ -107,9 +107,9 @@ def record(path: Path, minutes: float, generator: np.random.Generator) -> Path:
             command = np.clip(command, ROBOT.low(), ROBOT.high())
             start = arm.true[-1:]
             arm.drive(command)
-            for i, true in enumerate(np.concatenate([start, arm.true])[:-1:LOGGED]):
+            for i, true in enumerate(np.concatenate([start, arm.true])[:-1:STEPS_PER_ROW]):
                 row = np.concatenate([arm.measured(true), command])
-                log.writerow([f"{time + i * LOGGED * STEP:.3f}", *(f"{value:.6f}" for value in row)])
+                log.writerow([f"{time + i * STEPS_PER_ROW * STEP:.3f}", *(f"{value:.6f}" for value in row)])
             time += ROBOT.period
     return path
 
@@ -119,9 +119,9 @@ def certify(log: Path, folder: Path, accept_bound: float) -> ModelSet:
     os.environ["BRAKELINE_DATA"] = str(folder / "data")
     robot = str(DESCRIPTION)
     accepting = ["--accept-bound", str(accept_bound)]
-    for words in (["import", str(log), "--robot", robot], ["certify", robot, "--use", *accepting]):
-        if brakeline(words):
-            raise SystemExit(f"brakeline {words[0]} failed")
+    for command in (["import", str(log), "--robot", robot], ["certify", robot, "--use", *accepting]):
+        if brakeline(command):
+            raise SystemExit(f"brakeline {command[0]} failed")
     return ModelSet.load(folder / "data" / ROBOT.name / "residual-one-step.safetensors")
 
 
@@ -147,36 +147,36 @@ def attack(safety: InProcess | None, episodes: int, steps: int, seed: int) -> tu
         Figures, and the true joint angles (T, 2) at every tenth physics step.
     """
     generator = np.random.default_rng(seed)
-    arm, kinds, nearest, beyond, times, places = Arm(generator), [], [], 0, [], []
-    most = np.array([limit.most for limit in ROBOT.limits])
+    arm, kinds, excesses, beyond, times, joints = Arm(generator), [], [], 0, [], []
+    limits = np.array([limit.most for limit in ROBOT.limits])
     for _ in range(episodes):
         while True:  # a start well within the limits
             start = generator.uniform([-1.4, -2.1], [1.4, 2.1])
             if start.sum() < 2.6:
                 break
         arm.reset(start)
-        adversary, most_seen = Adversary(generator), -np.inf
+        adversary, excess = Adversary(generator), -np.inf  # of an episode, beyond its nearest limit [rad]
         if safety is not None:
             safety.reset()
         for _ in range(steps):
             action = adversary()
             if safety is not None:
-                answer = safety.decide(arm.measured(), action)  # no word about free space: there is no space
+                answer = safety.decide(arm.measured(), action)  # no obstacles: the arm has only limits
                 kinds.append(answer.kind)
                 times.append(answer.time_ms)
                 action = answer.action
             arm.drive(action)
-            most_seen = max(most_seen, float((arm.true @ ROBOT.limit_weights.T - most).max()))
-            places.append(arm.true[::10, :2])
-        nearest.append(most_seen)
-        beyond += most_seen > 0.0
+            excess = max(excess, float((arm.true @ ROBOT.limit_weights.T - limits).max()))
+            joints.append(arm.true[::10, :2])
+        excesses.append(excess)
+        beyond += excess > 0.0
     figures = {"episodes": episodes, "steps": episodes * steps, "episodes beyond a limit": beyond}
-    figures |= {"most beyond a limit [rad]": max(nearest)} if beyond else {"nearest to a limit [rad]": -max(nearest)}
+    figures |= {"most beyond a limit [rad]": max(excesses)} if beyond else {"nearest to a limit [rad]": -max(excesses)}
     if kinds:
-        figures["median nearest of an episode [rad]"] = -float(np.median(nearest))
+        figures["median nearest of an episode [rad]"] = -float(np.median(excesses))
         figures |= {kind: kinds.count(kind) for kind in sorted(set(kinds))}
         figures["median decision [ms]"] = float(np.median(times))
-    return figures, np.concatenate(places)
+    return figures, np.concatenate(joints)
 
 
 def draw(path: Path, with_filter: np.ndarray, without: np.ndarray) -> None:
@@ -187,8 +187,8 @@ def draw(path: Path, with_filter: np.ndarray, without: np.ndarray) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, 2, figsize=(9.0, 4.2), sharex=True, sharey=True, layout="constrained")
-    for axis, places, title in zip(axes, (with_filter, without), ("with the filter", "without it"), strict=True):
-        axis.plot(*places.T, ",", alpha=0.4)
+    for axis, joints, title in zip(axes, (with_filter, without), ("with the filter", "without it"), strict=True):
+        axis.plot(*joints.T, ",", alpha=0.4)
         line = np.linspace(-4.0, 4.0, 2)
         for limit in ROBOT.limits:
             a, b = limit.weights[:2]
@@ -206,18 +206,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="Periods in an episode.")
     parser.add_argument("--accept-bound", type=float, default=0.01, help="Largest share of plans outside their tubes.")
     parser.add_argument("--picture", type=Path, help="Draw where the arm went into this image.")
-    words = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        log = record(folder / "drive.csv", words.minutes, np.random.default_rng(0))
-        model = certify(log, folder, words.accept_bound)
-    safety = InProcess(Filter(model), words.accept_bound)
-    behind, filtered = attack(safety, words.episodes, words.steps, seed=1)
+        log = record(folder / "drive.csv", options.minutes, np.random.default_rng(0))
+        model = certify(log, folder, options.accept_bound)
+    safety = InProcess(Filter(model), options.accept_bound)
+    behind, filtered = attack(safety, options.episodes, options.steps, seed=1)
     print("behind the filter:", behind)
-    free, unfiltered = attack(None, min(words.episodes, 20), words.steps, seed=1)
+    free, unfiltered = attack(None, min(options.episodes, 20), options.steps, seed=1)
     print("without it:", free)
-    if words.picture is not None:
-        draw(words.picture, filtered, unfiltered)
+    if options.picture is not None:
+        draw(options.picture, filtered, unfiltered)
 
 
 if __name__ == "__main__":

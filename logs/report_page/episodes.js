@@ -1,6 +1,6 @@
 // The nearest misses, and the picker of episodes with their viewer.
 
-const PERCEIVED = [["free", "free", "free space by the scan"], ["hits", "hit", "hits of the scan"], ["movers", "mover", "moving obstacle and its reachable set"], ["promises", "reserved", "reserved by other robots"]];
+const PERCEIVED = [["free", "free", "free space by the scan"], ["hits", "hit", "hits of the scan"], ["movers", "mover", "moving obstacle and its reachable set"], ["reservations", "reserved", "reserved by other robots"]];
 
 /** Say what was decided at the point `k`, and why. */
 function why(episode, k) {

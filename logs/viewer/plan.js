@@ -2,7 +2,7 @@
 // A scene has
 //   obstacles [{kind, at, size, yaw}], half (of the edge of a square arena, or null), floor, ceiling (heights or null), goal, goal_radius, start,
 //   points [[x, y] or [x, y, z]], kinds (a letter of KINDS for each point), first (step of the first point; 0 if left out), pose [x, y, heading or null, z or nothing], footprint, discs, and
-//   decision {from, boxes, arrows, edge, free, hits, movers, swept, promises}, or nothing.
+//   decision {from, boxes, arrows, edge, free, hits, movers, swept, reservations}, or nothing.
 
 const ABOVE = [0, 1], ASIDE = [0, 2]; // the axes of a drawing from above, and of one from the side (towards the north)
 
@@ -62,14 +62,14 @@ function tubeMarks(v, { from, boxes }, footprint) {
 }
 
 /** Free space and hits of the scan, moving obstacles with the sets that they can reach, reservations of other robots. */
-function perceivedMarks(v, { free = [], hits = [], movers = [], swept = [], promises = [] }) {
+function perceivedMarks(v, { free = [], hits = [], movers = [], swept = [], reservations = [] }) {
   const outline = free.length && !v.side ? [tag("polygon", { points: points(v, free), fill: color("free"), "fill-opacity": 0.07, stroke: color("free"), "stroke-width": 1, class: "free" })] : [];
   return [
     ...outline,
     ...hits.map((hit) => dot(v, hit, 1.3, { fill: color("hit"), class: "hit" })),
     ...swept.flat().map((reach) => disc(v, reach, { fill: color("mover"), "fill-opacity": 0.12, class: "swept" })),
     ...movers.map((mover) => disc(v, mover, { fill: color("mover"), "fill-opacity": 0.8, class: "mover" })),
-    ...promises.map((reserved) => box(v, reserved, { fill: color("reserved"), "fill-opacity": 0.12, stroke: color("reserved"), "stroke-opacity": 0.5, class: "promise" })),
+    ...reservations.map((reserved) => box(v, reserved, { fill: color("reserved"), "fill-opacity": 0.12, stroke: color("reserved"), "stroke-opacity": 0.5, class: "reservation" })),
   ];
 }
 

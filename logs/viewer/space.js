@@ -180,11 +180,11 @@ function addEdge(group, edge, size) {
 
 /** The decision at the pose: tube, plan, arrows, half-space, and what the robot perceives. */
 function addDecision(group, scene, thick) {
-  const { movers = [], swept = [], free = [], hits = [], promises = [], boxes = [], from, arrows = [], edge } = { movers: scene.movers, ...scene.decision };
+  const { movers = [], swept = [], free = [], hits = [], reservations = [], boxes = [], from, arrows = [], edge } = { movers: scene.movers, ...scene.decision };
   const lift = (points) => points.map(([x, y, z]) => [x, y, z ?? LOW]);
   for (const mover of movers ?? []) round(group, mover, material("mover"), TALL);
   for (const reach of swept.flat()) round(group, reach, material("mover", 0.06));
-  for (const reserved of promises) addBox(group, reserved, "reserved", 0.12);
+  for (const reserved of reservations) addBox(group, reserved, "reserved", 0.12);
   if (free.length) line(group, lift(free), "free", { loop: true });
   if (hits.length) {
     const geometry = new THREE.BufferGeometry().setFromPoints(lift(hits).map((p) => new THREE.Vector3(...p)));

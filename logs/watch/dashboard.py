@@ -195,7 +195,9 @@ class Dashboard:
             panels = []
             for name, panel in sorted(self._panels.items()):
                 others = [self._panels[actor] for actor in panel.fleet if actor != name and actor in self._panels]
-                panels.append(panel.view(most) | {"promises": [box for other in others for box in other.reservation]})
+                panels.append(
+                    panel.view(most) | {"reservations": [box for other in others for box in other.reservation]}
+                )
             return {"robots": panels, "silent": now - self._last_message} | self._figures
 
     def _counts(self) -> dict[str, Any]:

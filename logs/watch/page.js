@@ -31,13 +31,13 @@ function card(robot) {
 /** The running episode of a robot, for the viewer. */
 function episodeOf(robot) {
   const { path, pose, tube, arena } = robot, last = Math.max(0, robot.kinds.length - 1);
-  const decision = { from: pose.slice(0, path.z ? 3 : 2), boxes: tube, arrows: robot.arrows, edge: robot.edge, promises: robot.promises, ...robot.around };
+  const decision = { from: pose.slice(0, path.z ? 3 : 2), boxes: tube, arrows: robot.arrows, edge: robot.edge, reservations: robot.reservations, ...robot.around };
   const begun = robot.kinds.length > 0, flat = !path.z;
   return {
     ...arena, start: robot.first ? null : arena.start, actor: robot.actor, robot: robot.robot, episode: robot.number, first: robot.first, period: robot.period,
     footprint: robot.footprint, discs: robot.discs, kinds: begun ? robot.kinds : "n", clearance: begun ? robot.clearance : [0],
     x: begun ? path.x : [pose[0]], y: begun ? path.y : [pose[1]], z: flat ? null : begun ? path.z : [pose[2]],
-    heading: robot.heading && (begun ? robot.heading : [pose.at(-1)]), tubes: tube.length || robot.promises.length || robot.around.hits?.length || robot.around.movers?.length ? { [last]: decision } : {},
+    heading: robot.heading && (begun ? robot.heading : [pose.at(-1)]), tubes: tube.length || robot.reservations.length || robot.around.hits?.length || robot.around.movers?.length ? { [last]: decision } : {},
   };
 }
 
@@ -55,7 +55,7 @@ function drawRobot(robot) {
   reason.textContent = robot.kind === "" ? "" : [robot.said, inputs.join(", "), robot.trust].filter(Boolean).join(" · ");
   const { top, bottom } = box.getBoundingClientRect();
   if (!robot.arena.half || bottom < 0 || top > innerHeight) return; // off the screen: 200 robots must not stall the page
-  const key = JSON.stringify([robot.number, robot.first, robot.kinds.length, robot.pose, robot.tube[0], robot.promises]);
+  const key = JSON.stringify([robot.number, robot.first, robot.kinds.length, robot.pose, robot.tube[0], robot.reservations]);
   if (box.dataset.shown === key) return; // nothing has moved since the last event
   box.dataset.shown = key;
   const shown = episodeOf(robot), [x, y] = robot.pose, reach = CLOSE * robot.footprint;

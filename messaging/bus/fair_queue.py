@@ -1,7 +1,7 @@
 """A queue that serves clients in turn: many queries of one client delay another client's query by at most one.
 
-The newest query of a client comes first. When more is asked than can be answered, a query that has waited for long gets
-its answer too late anyway, and in the order of arrival all of them would.
+The newest query of a client comes first. In an overload, a query that has waited for long gets its answer too late
+anyway. If the queue served the queries in their order of arrival, all of them would get their answers too late.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MAX_CLIENTS = 1024
 
 
 class FairQueue(Generic[T]):
-    """Queries by client. Not thread-safe."""
+    """The waiting queries of each client. Not thread-safe."""
 
     def __init__(self) -> None:
         self._waiting: dict[str, deque[T]] = {}  # by client, in the order of their turns
@@ -25,7 +25,7 @@ class FairQueue(Generic[T]):
         return sum(map(len, self._waiting.values()))
 
     def add(self, client: str, query: T) -> T | None:
-        """Add a query; return the query that has lost its place, if any."""
+        """Add a query. Returns the query that is dropped for it, or None: the client's oldest one, or the new one."""
         if client not in self._waiting:
             if len(self._waiting) == MAX_CLIENTS:
                 return query

@@ -85,10 +85,11 @@ class BackupPlan:
         seen (n,): last measured state.
         widening: the last states and inputs, and the factor on the sets of the next decision.
         turn_aside: its requests let the filter turn a blocked robot aside (`Request.turn_aside`).
+        acceleration_age: age of the horizontal acceleration in the measured states [s] (`Request.acceleration_age`).
     """
 
-    def __init__(self, robot: Robot, turn_aside: bool = False) -> None:
-        self.robot, self.turn_aside = robot, turn_aside
+    def __init__(self, robot: Robot, turn_aside: bool = False, acceleration_age: float = 0.0) -> None:
+        self.robot, self.turn_aside, self.acceleration_age = robot, turn_aside, acceleration_age
         self.widening = Widening(robot)
         self.reset()
 

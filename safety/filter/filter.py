@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from brakeline.errors import BadRequest
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array
 from brakeline.messaging.scan import MAX_SCAN_AGE
@@ -79,6 +80,7 @@ class Filter:
         bound: the share of plans outside their tubes that the model set states.
         outside_share: see `Decision`.
         start: factor on the sets of a request without past window (see `OneStep.start`).
+        acceleration_age: age of the horizontal acceleration in the states of the recorded data [s].
     """
 
     observed = 0  # the filter reads no observation
@@ -121,6 +123,7 @@ class Filter:
         self.regressor = np.array(robot.regressor, dtype=np.intp)
         self._score = None if model.one_step is None else WindowScore(model, model.one_step)
         self.outside_share = 0.0 if model.one_step is None else model.model_config.outside
+        self.acceleration_age = model.acceleration_age
         self.start = 1.0 if model.one_step is None else model.one_step.start
         self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
 
@@ -176,6 +179,7 @@ class Filter:
             BadRequest: a value is missing, not finite or of the wrong size; the error names the field.
         """
         record = DecisionRecord(perf_counter_ns())
+        self._check_age(request.acceleration_age)
         if self.ordinary(request):
             check_surroundings(self.robot, request)
         else:
@@ -241,6 +245,7 @@ class Filter:
         Raises:
             BadRequest: an array has the wrong shape, or a row is not valid; the error names the field and the row.
         """
+        self._check_age(0.0)
         return self._batch.decide(requests)
 
     def decide_all(self, requests: Sequence[Request]) -> list[Decision]:
@@ -252,13 +257,23 @@ class Filter:
         from brakeline.safety.filter.batch.request_arrays import RequestArrays
 
         fitting = [i for i, request in enumerate(requests) if RequestArrays.fits(request, self.ordinary)]
-        if len(fitting) < WORTH_A_BATCH * self.robot.horizon or not self._batch.covers:
+        few = len(fitting) < WORTH_A_BATCH * self.robot.horizon
+        if few or self.acceleration_age or not self._batch.covers:
             return [self.decide(request) for request in requests]
         for i in fitting:
             check_surroundings(self.robot, requests[i])
         answers = self.decide_batch(RequestArrays.of([requests[i] for i in fitting]))
         decided = {i: answers.row(row) for row, i in enumerate(fitting)}
         return [decided[i] if i in decided else self.decide(request) for i, request in enumerate(requests)]
+
+    def _check_age(self, age: float) -> None:
+        """Raise BadRequest if the states hold accelerations of another age than those of the recording."""
+        if age != self.acceleration_age:
+            raise BadRequest(
+                "acceleration_age",
+                f"the model set was recorded with the horizontal acceleration of {self.acceleration_age:g} s ago; this "
+                f"state has that of {age:g} s ago: report the same one",
+            )
 
     def _note_unrecorded(self, wanted: Array, search: PlanSearch, candidate: PlanCandidate | None) -> None:
         """If the proposal itself (m,) is outside the recorded range, say that the candidate adjusts it."""

@@ -70,6 +70,8 @@ class Request(ComparedByValue):
             it. In joint space there is no space to describe: no request needs it.
         turn_aside: the filter turns a blocked robot towards the nearest direction in which it can drive on
             (docs/method.md §4). Robots without a heading and a turn rate ignore it, as the rivals do.
+        acceleration_age: the horizontal acceleration in the states is the one of this long ago [s]. It must be the age
+            with which the model set was recorded (`ModelSet.acceleration_age`).
     """
 
     state: Array
@@ -88,6 +90,7 @@ class Request(ComparedByValue):
     turn_aside: bool = False
     widening: float = 1.0
     past: PastWindow | None = None
+    acceleration_age: float = 0.0
 
     def __post_init__(self) -> None:
         """Convert arrays to the type and the memory layout that compiled code needs."""
@@ -152,9 +155,9 @@ class Decision(ComparedByValue):
     verified: bool = True
     contained: bool = True
     compared: bool = False
-    time_ms: float = 0.0
-    solve_ms: float = 0.0
-    verify_ms: float = 0.0
+    time_ms: float = field(default=0.0, compare=False)
+    solve_ms: float = field(default=0.0, compare=False)
+    verify_ms: float = field(default=0.0, compare=False)
     solver: str = ""
     iterations: int = 0
     broken: int = 0

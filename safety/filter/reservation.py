@@ -8,8 +8,8 @@ a box along the world's axes. The last box is reserved for all time after the pl
 each period, a reservation loses its first box and keeps its last. The filter decides robots one after the other, each
 against the current reservations of all others. So disjoint reservations stay disjoint: a robot without a new plan keeps
 its old reservation, and the others were checked against that one. The filter checks the whole reservation, corners
-included. A robot without a verified plan gets a reservation that may touch another one. While two reservations touch,
-the committed plans of these robots do not count as verified.
+included. A robot without a verified plan gets a reservation that may touch another one. A robot that was decided before
+is then decided again. While two reservations touch, the committed plans of these robots do not count as verified.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.messaging.robot import Array, Robot
 
-PATH, AFTER = "the path within a period", "the way after the stop"
+PATH, AFTER = "the path within a period", "the stopping distance"
 STANDING, SLOW, TURNING, FAST, BOTH = "standing", "slow", "turning", "fast", "fast and turning"
 REGIMES = (STANDING, SLOW, TURNING, FAST, BOTH)
 STILL = 0.05  # share of the inputs' bounds; a robot stands if every speed and input is below it

@@ -45,7 +45,7 @@ class ModelConfig:
             raise ValueError(f"no windows are called {self.windows!r}; there are: {', '.join(WINDOWS)}")
         if not 1.0 <= self.inflation < math.inf:
             raise ValueError(
-                f"an envelope scaled by {self.inflation} bounds nothing: inflation is a number of 1 or more"
+                f"an error bound scaled by {self.inflation} bounds nothing: inflation is a number of 1 or more"
             )
         if not 0.0 < self.outside <= MOST_OUTSIDE:
             raise ValueError(f"a share of {self.outside:g} of windows outside is not between 0 and {MOST_OUTSIDE:g}")

@@ -20,6 +20,7 @@ from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout
+from brakeline.safety.model.acceleration_age import acceleration_age_in
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN
@@ -59,6 +60,11 @@ class ModelSet:
     stands: int = 0  # periods after which a plan has brought the robot to a stand; 0: at its end
     in_place: InPlace | None = None  # predictors for plans in place, if the data support them
     one_step: OneStep | None = None  # the predictor of mode one-step
+
+    @property
+    def acceleration_age(self) -> float:
+        """Age of the horizontal acceleration in the states of its data [s]. Raises BadModel."""
+        return acceleration_age_in(self.about)
 
     @property
     def moving(self) -> int:

@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from brakeline.errors import ErrorBoundError
+from brakeline.errors import BadData, ErrorBoundError
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples, samples_of
 from brakeline.safety.model.dataset import Dataset
@@ -99,7 +99,7 @@ def choose(
             count = len(regression.fit(candidate).features.terms)
             candidates.append((replace(candidate, error=error, features=count), regression))
     candidates = sorted((pair for pair in candidates if np.isfinite(pair[0].error)), key=lambda pair: pair[0].error)
-    good = [pair for pair in candidates if pair[0].error <= GOOD * candidates[0][0].error][:MOST_GOOD]
+    good = _good_candidates(candidates, s)
     choices = []
     for number, (candidate, regression) in enumerate(good):
         progress(TRIED + (CHOSEN - TRIED) * number / len(good))
@@ -108,6 +108,23 @@ def choose(
     narrow = [pair for pair in choices if pair[0].width <= SIMPLER * least]
     choice, regression = min(narrow, key=lambda pair: (pair[0].candidate.features, pair[0].width))
     return choice, [c for c, _ in candidates], regression
+
+
+def _good_candidates(candidates: list[tuple[Candidate, Regression]], s: Samples) -> list[tuple[Candidate, Regression]]:
+    """Return the candidates whose sets are compared, from the least out-of-fold error on. None of them diverges.
+
+    Raises:
+        BadData: all of them diverge.
+    """
+    good: list[tuple[Candidate, Regression]] = []
+    for candidate, regression in candidates:
+        if len(good) == MOST_GOOD or (good and candidate.error > GOOD * good[0][0].error):
+            break
+        if not regression.diverges(candidate, s):
+            good.append((candidate, regression))
+    if not good:
+        raise BadData("every predictor of one period leads absurdly far away over a plan: record more driving")
+    return good
 
 
 def _distances(robot: Robot, errors: Array) -> Array:

@@ -16,6 +16,7 @@ Index = NDArray[np.int64]
 
 PENALTIES = (1.0, 3.0)  # of the selection
 RIDGE = 1e-9  # of the fit, as a share of each feature's square: for features that nearly depend on each other
+ABSURD = 100.0  # times the largest recorded value: so far leads only a prediction whose features feed each other
 MOST_AT_ONCE = 10_000  # periods whose features are in memory at once
 
 
@@ -107,6 +108,13 @@ class Regression:
         scaled = phi / np.sqrt(np.maximum((phi**2).sum(0), 1e-300))
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled.T @ scaled), 0.0))
         return float(singular[0]), float(singular[-1] / max(singular[0], 1e-300))
+
+    def diverges(self, candidate: Candidate, s: Samples) -> bool:
+        """Return whether a fit to all folds, or to all but one, predicts a window that leads absurdly far away."""
+        most = ABSURD * np.abs(s.after).max((0, 1))
+        fits = (self.fit(candidate, without=i) for i in (*self.folds, -1))
+        # NaN diverges, too
+        return not all((np.abs(one_step.rollouts(self._robot, s.z)) <= most).all() for one_step in fits)
 
     def out_of_fold(self, candidate: Candidate, s: Samples) -> Array:
         """Return the errors (T, N, n + d·discs) of windows, each predicted without its fold."""

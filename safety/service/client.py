@@ -83,6 +83,7 @@ def request_message(
         time=time,
         fleet=fleet,
         widening=backup_plan.widening.factor,
+        acceleration_age=backup_plan.acceleration_age,
     )
     set_measurement(message, scan_in(scan))
     _set_history(message, backup_plan)
@@ -279,9 +280,10 @@ class SafetyClient(BusClient):
     'allowed'
     """
 
-    def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE) -> None:
+    def __init__(self, bus: Bus, robot: Robot | str, deadline: float = DEADLINE, acceleration_age: float = 0.0) -> None:
+        """acceleration_age: your states hold the horizontal acceleration of this long ago [s]."""
         super().__init__(bus, robot, deadline)
-        self.backup_plan = BackupPlan(self.robot)
+        self.backup_plan = BackupPlan(self.robot, acceleration_age=acceleration_age)
 
     @classmethod
     def open(

@@ -8,7 +8,7 @@ answer = client.decide(state, action, [], known_free=True)     # a map says that
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -42,7 +42,7 @@ class Answer(Decision):
     """
 
     action: Array
-    queue_ms: float = 0.0
+    queue_ms: float = field(default=0.0, compare=False)
     token_rejected: bool = False
     plan_tokens: tuple[bytes, ...] = ()
 

@@ -42,13 +42,14 @@ class InProcess:
     'allowed'
     """
 
-    def __init__(self, method: Method, accept_bound: float | None = None) -> None:
+    def __init__(self, method: Method, accept_bound: float | None = None, acceleration_age: float = 0.0) -> None:
         """Make a client.
 
         Args:
             method: the filter or a rival.
             accept_bound: largest accepted probability that a verified plan leaves its tube, as the model set's
                 validation report states it. Defaults to the limit in the robot's description.
+            acceleration_age: your states hold the horizontal acceleration of this long ago [s].
 
         Raises:
             TypeError: `method` is neither.
@@ -60,7 +61,7 @@ class InProcess:
 
         check_bound(getattr(method, "model", None), method.robot, accept_bound)
         self.method = method
-        self.backup_plan = BackupPlan(method.robot)
+        self.backup_plan = BackupPlan(method.robot, acceleration_age=acceleration_age)
 
     @property
     def robot(self) -> Robot:
@@ -136,6 +137,7 @@ class InProcess:
             observation=observation_in(observation),
             known_free=known_free_in(known_free),
             turn_aside=backup_plan.turn_aside,
+            acceleration_age=backup_plan.acceleration_age,
             widening=backup_plan.widening.factor,
             past=backup_plan.past,
         )

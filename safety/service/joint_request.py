@@ -1,7 +1,8 @@
 """Requests of robots that share a world: the order of the decisions, and the reservations that each is checked against.
 
 The service keeps nothing about a robot. A request carries the robot's current reservation, and the tubes of the robots
-decided before in the same batch replace theirs. So a batch must hold all robots of a world. If one is missing, the
+decided before in the same batch replace theirs. If a later one without a verified plan touches a robot that was decided
+before, the service decides that robot again. So a batch must hold all robots of a world. If one is missing, the
 service refuses the whole world, and all its robots brake inside their reservations.
 """
 
@@ -54,11 +55,14 @@ def group_by_fleet(requests: Sequence[pb.Request]) -> list[list[int]]:
     return alone + list(shared.values())
 
 
-def reservations_for(
-    name: str, reservations: Mapping[str, Reservation] | None
-) -> tuple[Reservation | None, OtherReservations | None]:
-    """Return the robot's own reservation and those of the others; None for a robot without a fleet."""
+def other_reservations(name: str, reservations: Mapping[str, Reservation] | None) -> OtherReservations | None:
+    """Return the reservations of the other robots; None without any, or for a robot without a fleet."""
     if reservations is None:
-        return None, None
-    others = [reservation for other, reservation in reservations.items() if other != name]
-    return reservations[name], OtherReservations.to(others)
+        return None
+    return OtherReservations.to([reservation for other, reservation in reservations.items() if other != name])
+
+
+def touches_another(name: str, reservations: Mapping[str, Reservation]) -> bool:
+    """Return whether the robot's reservation touches another robot's."""
+    others = other_reservations(name, reservations)
+    return others is not None and others.touch(reservations[name])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,16 +18,21 @@ from brakeline.messaging.bus import BusSettings, Sample
 from brakeline.messaging.bus.identity import certified_name, speaks_for
 from brakeline.messaging.process_runtime import Process
 from brakeline.messaging.rejected_messages import headline
-from brakeline.messaging.robot import Robot, refuse_shipped_name, shipped_robots
+from brakeline.messaging.robot import refuse_shipped_name, shipped_robots
 from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.topics import DECIDE, MODEL
 from brakeline.safety.filter.backup_plan import UNVERIFIED
 from brakeline.safety.filter.filter import Filter
-from brakeline.safety.filter.request import Decision, check_for_filter
+from brakeline.safety.filter.request import check_for_filter
 from brakeline.safety.filter.reservation import Reservation
 from brakeline.safety.methods import IN_USE, Method, Model, archive_path, load, ready
 from brakeline.safety.model.stated_bound import check_bound
-from brakeline.safety.service.joint_request import check_fleet, group_by_fleet, reservations_for
+from brakeline.safety.service.joint_request import (
+    check_fleet,
+    group_by_fleet,
+    other_reservations,
+    touches_another,
+)
 from brakeline.safety.service.plan_token import PlanAuthenticator
 from brakeline.safety.service.signature import SignedModel, TrustedSigners
 from brakeline.safety.service.wire import batch_of, decision_reply, digest, error_reply, request_of, reservation_of
@@ -143,13 +149,18 @@ class ServiceCounts:
     decide_ms: float = 0.0
     busy_time: float = 0.0  # s
 
-    def add(self, decision: Decision, finite: bool) -> None:
-        """Count a decision; finite: whether its proposal was."""
+    def add(self, reply: pb.Reply, finite: bool) -> None:
+        """Count a reply; finite: whether the proposal was."""
+        if not reply.HasField("decision"):
+            self.errors += 1
+            return
+        decision = reply.decision
         self.decisions += 1
         self.decide_ms += decision.time_ms
         self.compared += decision.compared
         self.violations += not decision.contained
         self.unverified += not decision.verified
+        self.token_rejected += decision.token_rejected
         self.not_finite += not finite
 
     def figures(self) -> dict[str, float]:
@@ -206,14 +217,37 @@ class BatchHandler:
 
     def _decide_world(self, messages: Sequence[pb.Request], receipt: Receipt) -> list[pb.Reply]:
         """Return the replies about the robots of one world."""
-        if not messages[0].fleet:
-            return [self._decide(message, receipt) for message in messages]
         try:
-            check_fleet(messages)
-            reservations = {message.actor: self._current_reservation(message) for message in messages}
+            if messages[0].fleet:
+                check_fleet(messages)
+                replies = self._decide_fleet(messages, receipt)
+            else:
+                replies = [self._decide(message, receipt) for message in messages]
         except (BadRequest, UnknownRobot) as error:
-            return [self._refuse(error) for _ in messages]
-        return [self._decide(message, receipt, reservations) for message in messages]
+            replies = [error_reply(error) for _ in messages]
+        for message, reply in zip(messages, replies, strict=True):
+            self.counts.add(reply, all(map(math.isfinite, message.action)))
+            if reply.HasField("decision") and not reply.decision.contained:
+                log.warning("%s, step %d: outside the predicted set", receipt.about(message), message.step)
+        return replies
+
+    def _decide_fleet(self, messages: Sequence[pb.Request], receipt: Receipt) -> list[pb.Reply]:
+        """Return the replies about the robots of a fleet, decided one after the other.
+
+        A robot without a verified plan may reserve space that touches a robot that was decided before. That robot is
+        decided again. Each round but the last leaves one more robot without a verified plan.
+
+        Raises:
+            BadRequest, UnknownRobot: the reservation of a robot is not known.
+        """
+        asked = {message.actor: self._current_reservation(message) for message in messages}
+        now = dict(asked)
+        replies = [self._decide(message, receipt, asked, now) for message in messages]
+        for _ in messages if not all(reply.decision.verified for reply in replies) else ():
+            for i, message in enumerate(messages):
+                if replies[i].decision.verified and touches_another(message.actor, now):
+                    replies[i] = self._decide(message, receipt, asked, now)
+        return replies
 
     def _current_reservation(self, message: pb.Request) -> Reservation:
         """Return the reservation of a fleet's robot. One that stands without it reserves the space it stands in."""
@@ -236,44 +270,43 @@ class BatchHandler:
         return method.standing_reservation(request.state, request.widening)
 
     def _decide(
-        self, message: pb.Request, receipt: Receipt, reservations: dict[str, Reservation] | None = None
+        self,
+        message: pb.Request,
+        receipt: Receipt,
+        asked: Mapping[str, Reservation] | None = None,
+        now: dict[str, Reservation] | None = None,
     ) -> pb.Reply:
-        """Return the reply about one robot; reservations: of its world's robots, in which its own is replaced."""
+        """Return the reply about one robot.
+
+        Args:
+            message: its request. receipt: who asked.
+            asked: the reservations that the requests of its world hold.
+            now: the present reservations of its world's robots, in which the robot's new one replaces its own.
+        """
         try:
             method = self.models.method_for(message)
-            token_rejected = self._reject_token(message, method.robot, receipt.holder)
-            own, others = reservations_for(message.actor, reservations)
+            authentic = self.authenticator is None or self.authenticator.is_authentic(
+                message, method.robot, receipt.holder
+            )
+            own, others = None if asked is None else asked[message.actor], other_reservations(message.actor, now)
             request = request_of(message, method.robot, own, others)
+            if not authentic:
+                request = dataclasses.replace(request, model=UNVERIFIED)
             queue_ms = (perf_counter_ns() - receipt.time) * 1e-6
             decision = method.decide(request)
         except (BadRequest, UnknownRobot) as error:
-            return self._refuse(error)
+            return error_reply(error)
         except Exception as error:  # the robot brakes on the error reply, and the service goes on
             log.exception("decide failed for %s", receipt.about(message))
-            return self._refuse(error)
-        self.counts.add(decision, request.finite)
-        if not decision.contained:
-            log.warning("%s, step %d: outside the predicted set", receipt.about(message), message.step)
-        if reservations is not None and decision.reservation is not None:
-            reservations[message.actor] = decision.reservation
+            return error_reply(error)
+        if now is not None and decision.reservation is not None:
+            now[message.actor] = decision.reservation
         reply = decision_reply(decision, queue_ms)
-        reply.robot, reply.decision.token_rejected = method.robot.name, token_rejected
+        reply.robot, reply.decision.token_rejected = method.robot.name, not authentic
         if self.authenticator is not None and decision.verified:
             tokens = self.authenticator.plan_tokens(message, reply.decision, method.robot, receipt.holder)
             reply.decision.plan_tokens.extend(tokens)
         return reply
-
-    def _reject_token(self, message: pb.Request, robot: Robot, asker: str) -> bool:
-        """Return whether a request's plan token does not match its plan. If so, mark the plan as unverified."""
-        rejected = self.authenticator is not None and not self.authenticator.is_authentic(message, robot, asker)
-        if rejected:
-            self.counts.token_rejected += 1
-            message.model = UNVERIFIED
-        return rejected
-
-    def _refuse(self, error: Exception) -> pb.Reply:
-        self.counts.errors += 1
-        return error_reply(error)
 
 
 @dataclass(frozen=True)

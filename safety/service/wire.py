@@ -144,6 +144,7 @@ def request_of(
         turn_aside=message.turn_aside,
         widening=message.widening or 1.0,
         past=_past_of(message, robot),
+        acceleration_age=message.acceleration_age,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -264,3 +265,19 @@ def test_after_an_interruption_the_vehicle_brakes_and_nobody_flies_it_any_more(d
         autopilot.flight.armed = True
         time.sleep(0.5)
         assert len(setpoints(frames)) == sent
+
+
+@of_one_autopilot
+def test_a_state_holds_the_horizontal_acceleration_of_some_time_ago(flying: Flying, monkeypatch) -> None:
+    """From a rise of 10 m/s³ along x until now, and of 20 m/s³ along y, 0.2 s ago is 2 and 4 m/s² less."""
+    vehicle, now = flying[0], time.monotonic()
+    times = np.linspace(now - 1.0, now, 101)
+    rising = deque((t, np.array([10.0, 20.0, 30.0]) * (t - now)) for t in times)
+    monkeypatch.setattr(vehicle, "_remember_acceleration", lambda now: None)
+    monkeypatch.setattr(vehicle, "_accelerations", rising)
+    present = vehicle._state(now)
+    monkeypatch.setattr(vehicle, "acceleration_age", 0.2)
+    state = vehicle._state(now)
+    np.testing.assert_allclose(state[6:8], [-2.0, -4.0], atol=1e-6)
+    np.testing.assert_allclose(state[:6], present[:6], atol=0.05)
+    assert abs(state[8]) < 2.0, "the vertical one is the present one"

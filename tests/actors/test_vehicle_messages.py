@@ -38,7 +38,9 @@ MAP = (
     Obstacle("box", (1.0, -2.0, 0.5), (1.0, 2.0, 3.0), 0.3, -0.1),
     Obstacle("sphere", (0.0, 4.0, 2.0), (0.5,), motion=Motion((0.1, 0.0, 0.0), 0.01, 0.02, acceleration=0.5)),
 )
-REQUEST = FlightRequest(FlightSettings("udpin:0.0.0.0:14540", 7, 9000, 2.5, (1.0, -2.0, 0.1), True, True), LATE, MAP)
+REQUEST = FlightRequest(
+    FlightSettings("udpin:0.0.0.0:14540", 7, 9000, 2.5, (1.0, -2.0, 0.1), True, True, 0.2), LATE, MAP
+)
 
 
 @pytest.mark.parametrize("robot", [robot_named("quadrotor"), robot_named("quadrotor-late")])

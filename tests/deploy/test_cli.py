@@ -371,6 +371,13 @@ def test_show_prints_a_description(command, figures, robot):
         ("train --deadline nan --out runs/none", "deadline = nan is not finite"),
         ("train --practice -1 --out runs/none", "practice = -1.0 is not 0 or more"),
         ("ros2 ground --free-at-start -1", "--free-at-start is a number from 0 on, not -1"),
+        ("evaluate ground --payload 1e99", "--payload is a number from -1e+09 to 1e+09, not 1e+99"),
+        (
+            "evaluate ground --episodes 10000000000000000000000",
+            "--episodes is a number from -1e+09 to 1e+09, not 1e+22",
+        ),
+        ("train --learner.td3.multiplier-rate 1e30", "--learner.td3.multiplier-rate is a number from"),
+        ("fly --origin 0 0 -1e30", "--origin is a number from"),
         ("status --wait -1", "--wait is a number from 0 on, not -1"),
     ],
 )

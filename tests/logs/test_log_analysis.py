@@ -224,7 +224,7 @@ def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Mes
 
 def test_it_is_shown_whole(figures: dict[str, Any]) -> None:
     text = printed(show(figures, verbose=True))
-    words = ("closest approach", "network", "95 %:", "over training", "half-width", "bound_step 0.003", "primal_inf")
+    words = ("closest approach", "network", "95 %:", "over the run", "half-width", "bound_step 0.003", "primal_inf")
     assert not [word for word in words if word not in text]
 
 

@@ -51,7 +51,7 @@ def test_steps_adjusted_for_clearance_are_counted_where_every_adjusted_step_says
         new.step(step)
     figures = closed_loop([new])
     assert (figures["interventions"], figures["adjusted"], figures["for_clearance"]) == (3, 3, 2)
-    assert for_clearance(figures) == "2 of 3 adjusted proposals were verified themselves"
+    assert for_clearance(figures) == "2 of 3 adjusted steps: the filter verified the proposal too"
     for step in some_steps():  # as logged by a version that did not say
         old.step(step)
     figures = closed_loop([old])

@@ -106,13 +106,13 @@ def drive(say: Say, tmp_path: Path) -> tuple[Dashboard, LogAnalysis]:
 def test_the_live_page_and_the_report_have_the_perceived_surroundings(drive: tuple[Dashboard, LogAnalysis]) -> None:
     board, analysis = drive
     a, b = board.view()["robots"]
-    assert np.allclose(a["promises"], [[2.0, 0.0, 0.25, 0.35]] * 3) and np.allclose(b["promises"][0][0], 0.0)
+    assert np.allclose(a["reservations"], [[2.0, 0.0, 0.25, 0.35]] * 3) and np.allclose(b["reservations"][0][0], 0.0)
     assert a["around"]["movers"] == [[1.0, 0.5, 0.2]] and len(a["around"]["swept"][0]) == 3
     assert len(a["around"]["free"]) > 50 < len(a["around"]["hits"])
     [(_, pictures)] = analysis.by_label().values()
     shown = {item["actor"]: item for item in pictures["galleries"]["ground"]["episodes"]}
     tube = shown["a"]["tubes"][1]
-    assert tube["promises"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and shown["b"]["tubes"][1]["promises"][0][0] == 0.0
+    assert tube["reservations"] == [[2.0, 0.0, 0.25, 0.35]] * 3 and shown["b"]["tubes"][1]["reservations"][0][0] == 0.0
     assert tube["movers"] == [[1.0, 0.5, 0.2]] and 20 < len(tube["free"]) <= 48 and len(tube["hits"]) <= 90
     assert shown["a"]["kinds"] == "eee"
 
@@ -129,15 +129,16 @@ def test_browsers_draw_the_perceived_surroundings(
     write(path, analysis.figures(), analysis.by_label())
     show(tab, path)
     tab.value("document.querySelector('#picker [data-view=above]').click()")
-    shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in ("free", "hit", "mover", "swept", "promise")}
-    assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "promise": 3}
+    marks = ("free", "hit", "mover", "swept", "reservation")
+    shown = {name: drawn(tab, name, "#picker", ".episode-map") for name in marks}
+    assert shown == {"free": 1, "hit": 90, "mover": 1, "swept": 3, "reservation": 3}
     legend = tab.value("document.querySelector('#picker').textContent")
     assert "reserved by other robots" in legend and "recovering" in legend
     with LivePageServer(board.view) as server, watched(tab, server):
         tab.value("document.querySelectorAll('[data-view=above]').forEach(button => button.click())")
         tab.until("document.querySelectorAll('.stage svg').length === 2")
-        shown = {name: drawn(tab, name, "#robots") for name in ("free", "mover", "swept", "promise")}
-        assert shown == {"free": 4, "mover": 4, "swept": 12, "promise": 12}, "two robots, each on two maps"
+        shown = {name: drawn(tab, name, "#robots") for name in ("free", "mover", "swept", "reservation")}
+        assert shown == {"free": 4, "mover": 4, "swept": 12, "reservation": 12}, "two robots, each on two maps"
         assert drawn(tab, "hit", "#robots") > 100
         robots = tab.value("document.querySelector('#robots').innerHTML")
         assert "--recovering" in robots, "recovering has its color"

@@ -1,6 +1,8 @@
 """Console tables never truncate a cell, in files and in terminals."""
 
-from brakeline.logs.stacking_table import StackingTable
+import pytest
+
+from brakeline.logs.stacking_table import StackingTable, plain_table
 from tests.logs.sample_log import printed
 
 CELLS = [f"the cell of column {i}, which is not short" for i in range(6)]
@@ -21,3 +23,9 @@ def test_a_table_has_its_full_width_in_a_file_and_is_stacked_where_less_is_allow
         assert "column 5:" in text and max(map(len, text.splitlines())) < width + 40  # and colours
     monkeypatch.setenv("COLUMNS", "80")
     assert "column 5:" in shown() and "not short" in shown().replace("\n", " ")
+
+
+@pytest.mark.parametrize("width", [None, 20])
+def test_the_units_of_columns_are_shown(width):
+    text = printed(plain_table(("decision [ms]", "speed [m/s]"), [("1.2", "0.25")]), width)
+    assert "decision [ms]" in text and "speed [m/s]" in text

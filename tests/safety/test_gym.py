@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.in_process import InProcess
+from brakeline.sim.registration import ENVIRONMENTS, register
 from tests.safety.toys import Toy, car, discs, near, puck, seen
 
 CAR, PUCK = car("gym-car"), puck("gym-puck")
@@ -206,6 +208,19 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
             alone[i].reset()
         fresh = ended
     assert infos["diagnostics"]["kind"].shape == (count,)
+
+
+@pytest.mark.filterwarnings("ignore:.*(symmetric and normalized space|different from the unwrapped version).*")
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_a_wrapped_environment_passes_the_check_of_gymnasium(name):
+    register()
+    ready = Filter.load(ENVIRONMENTS[name])
+    env = SafetyWrapper(gymnasium.make(name), ready, penalty=1.0)
+    check_env(env, skip_render_check=True)
+    assert env.step(np.zeros(env.action_space.shape))[4]["safety"].time_ms > 0.0
+    assert env.spec.make().penalty == 1.0
+    with pytest.raises(TypeError, match="filter"):  # two robots must not share a backup plan
+        SafetyWrapper(gymnasium.make(name), InProcess(ready)).spec.make()
 
 
 class Faulty(Toy):

@@ -17,12 +17,14 @@ from brakeline.messaging.obstacle import Shapes
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, Request
+from brakeline.safety.model import one_step_regression
 from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, START, driving_kinds
 from brakeline.safety.model.fitting import fit_model_set
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, ModelConfig, ModelSet
-from brakeline.safety.model.one_step_fitting import fit_one_step
+from brakeline.safety.model.one_step_fitting import choose, fit_one_step
+from brakeline.safety.model.one_step_regression import Regression
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import Shape, shares, spread_features, typical_plans
 from brakeline.safety.model.validation import validate_one_step
@@ -243,6 +245,25 @@ def test_too_little_driving_and_stops_by_feedback_are_refused():
         fit_one_step(Dataset(ROBOT, (few,)), CONFIG)
     with pytest.raises(ErrorBoundError, match="feedback"):
         fit_one_step(Dataset(puck("puck"), (whole,)), CONFIG)
+
+
+def test_a_predictor_that_leads_absurdly_far_away_is_not_compared(monkeypatch):
+    """A flight was lost to a candidate whose products fed each other until a rollout was infinite."""
+    s = samples_of(driven(trajectories=3).joined())
+    choice, _, regression = choose(ROBOT, s)
+    assert choice.candidate.degree > 1 and not regression.diverges(choice.candidate, s)
+    fit = Regression.fit
+
+    def exploding(self, candidate, without=-1, weight=0.0):
+        one_step = fit(self, candidate, without, weight)
+        return replace(one_step, C=1e200 * one_step.C) if candidate.degree > 1 and without == 3 else one_step
+
+    monkeypatch.setattr(Regression, "fit", exploding)
+    assert regression.diverges(choice.candidate, s)
+    assert choose(ROBOT, s)[0].candidate.degree == 1
+    monkeypatch.setattr(one_step_regression, "ABSURD", 1e-3)
+    with pytest.raises(BadData, match=r"leads absurdly far away.*record more driving"):
+        choose(ROBOT, s)
 
 
 # --- the half-widths of the sets follow from the errors of recorded windows -------------------------------------------

@@ -118,7 +118,7 @@ class RequestArrays:
     def fits(request: Request, check: FastRequestCheck) -> bool:
         """Return whether a request has a place in a batch. `check`: the robot's own check of all numbers."""
         others = request.movers, request.scan, request.reservation, request.other_reservations
-        return all(other is None for other in others) and check(request)
+        return all(other is None for other in others) and not request.acceleration_age and check(request)
 
     @staticmethod
     def of(requests: Sequence[Request]) -> RequestArrays:

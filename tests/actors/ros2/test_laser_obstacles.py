@@ -157,6 +157,48 @@ def test_each_beam_starts_where_the_robot_was_at_its_time():
     assert sorted(o.position[0] for o in hits) == pytest.approx([-0.475, 0.5])
 
 
+# rad/s of the robot, and the side to which the lidar turns
+TURNS = list(itertools.product((1.5, -1.5, 0.0), (1.0, -1.0)))
+
+
+@pytest.mark.parametrize("rate, side", TURNS)
+def test_hits_are_where_they_are_whichever_way_robot_and_lidar_turn(rate, side):
+    """The lidar turns twice a second on a robot that drives along an arc: as if it stood, hits would be off."""
+    mount, times = PlanarPose(-0.032, 0.02, 2.0), np.arange(BEAMS) / (2.0 * BEAMS) - 0.25
+    headings = 0.7 + rate * times
+    places = 0.2 * times[:, None] * np.sinc(0.5 * rate * times / math.pi)[:, None]  # the chord of an arc
+    middle = 0.7 + 0.5 * rate * times
+    poses = np.column_stack([places * np.stack([np.cos(middle), np.sin(middle)], axis=1), headings])
+    beams = read(scan_of(np.full(BEAMS, np.inf), angle_increment=side * 2.0 * math.pi / BEAMS))
+    sensor = poses[:, :2] + np.stack([rotate(np.array([mount.x, mount.y]), heading) for heading in headings])
+    ways = headings + mount.yaw + beams.angles
+    directions = np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    around = 2.0 * math.pi * np.arange(8) / 8
+    posts = [Obstacle(CYLINDER, (0.6 * math.cos(a), 0.6 * math.sin(a)), (0.05,)) for a in around]
+    ranges = np.array([cast(posts, at, way[None], 3.5)[0] for at, way in zip(sensor, directions, strict=True)])
+    beams, exact = replace(beams, ranges=ranges), HitErrors(0.0, 0.0, 0.0)
+    hits = (sensor + ranges[:, None] * directions)[ranges < 3.5]
+    shapes = Shapes.of(obstacles(beams, poses, mount, GROUND, exact, np.zeros(2)), 2)
+    assert len(hits) > 50 and shapes.distance(hits).min(axis=0).max() <= 1e-9
+    assert shapes.distance(0.6 * np.stack([np.cos(around + 0.39), np.sin(around + 0.39)], axis=1)).min() > 0.05
+    as_if_it_stood = obstacles(beams, np.tile(poses[BEAMS // 2], (BEAMS, 1)), mount, GROUND, exact, np.zeros(2))
+    assert rate == 0.0 or Shapes.of(as_if_it_stood, 2).distance(hits).min(axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize("rate, side", TURNS)
+def test_an_obstacle_that_ends_just_before_the_next_beam_is_contained_to_its_end(rate, side):
+    """A robot that turns with its lidar spreads the beams; one that drives moves them apart."""
+    beams = read(scan_of(np.full(BEAMS, np.inf), angle_increment=side * 2.0 * math.pi / BEAMS))
+    times, poses = np.arange(BEAMS) / (2.0 * BEAMS), np.zeros((BEAMS, 3))
+    poses[:, 0], poses[:, 2] = side * 2.0 * times, rate * times
+    last = int(np.argmin(np.abs(np.abs(poses[:, 2] + beams.angles) - 1.5 * math.pi)))  # to the side, across the way
+    ways = poses[:, 2] + beams.angles
+    hit, beyond = (poses[i, :2] + 0.8 * np.array([math.cos(ways[i]), math.sin(ways[i])]) for i in (last, last + 1))
+    beams = replace(beams, ranges=np.where(np.arange(BEAMS) == last, 0.8, beams.ranges))
+    shapes = Shapes.of(obstacles(beams, poses, PlanarPose(), GROUND, HitErrors(0.0, 0.0, 0.0), hit), 2)
+    assert shapes.distance((0.01 * hit + 0.99 * beyond)[None]).min() <= 1e-9
+
+
 @pytest.mark.parametrize("turn", [1, -1])
 def test_an_obstacle_that_ends_between_the_last_beam_and_the_first_is_contained_to_its_end(turn):
     """The lidar turns ten times a second on a robot at 0.25 m/s: its last beam begins 25 mm ahead of the first."""

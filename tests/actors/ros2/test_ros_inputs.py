@@ -234,6 +234,17 @@ def test_an_old_scan_counts_as_missing(inputs):
         inputs.obstacles(np.zeros(2), 10.7)
 
 
+def test_the_oldest_beam_of_a_scan_counts_as_its_age(inputs):
+    """Some drivers state the end of a turn as its time, and a negative time between two beams."""
+    for turn, refused in ((0.5, False), (0.8, True)):
+        inputs.on_scan(scan_of(np.full(BEAMS, math.inf), time_increment=-turn / BEAMS))
+        if refused:
+            with pytest.raises(InputMissing, match=r"the scan is 0\.85 s old"):
+                inputs.obstacles(np.zeros(2), 10.05)
+        else:
+            assert inputs.obstacles(np.zeros(2), 10.05) == ()
+
+
 def test_a_command_counts_until_its_age_limit(inputs):
     assert inputs.command(10.6) is None
     inputs.on_command(cdr.twist(math.nan, 0.0), 10.6)

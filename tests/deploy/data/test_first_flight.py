@@ -121,6 +121,19 @@ def test_what_ends_a_flight_or_makes_its_sets_wide_is_named(fault, minutes, line
     assert (recording.level == 0.0 and vehicle.fastest < 1.5) or "fickle" not in fault
 
 
+def test_an_error_of_the_program_ends_a_flight_and_what_was_recorded_is_stored(monkeypatch) -> None:
+    def diverge(*_, **__):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    stored = list[Dataset]()
+    flight = FirstFlight(Sluggish(), LATE, BOX, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(np.linalg, "lstsq", diverge)
+        flight.fly(2.0)
+    missing = flight.result({}, stored.append).missing
+    assert stored[0].periods > 50 and "the flight ended with an error: LinAlgError: SVD did not converge" in missing
+
+
 def test_the_rule_turns_back_before_the_wall_and_lets_go_of_the_rest() -> None:
     level = QUADROTOR.high()
     near = np.array([31.0, -2.0, 30.0, 5.0, *[0.0] * 5])

@@ -19,6 +19,7 @@ from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.errors import BadData, BadModel, NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.safety.model.acceleration_age import ENTRY
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kinds
 from brakeline.safety.model.model_config import AUTO
@@ -140,13 +141,13 @@ def test_many_robots_at_once_record_what_one_after_the_other_records(robot, cond
 def elsewhere(tmp_path, monkeypatch):
     """An empty store, with small recordings only."""
     monkeypatch.setenv("BRAKELINE_DATA", str(tmp_path / "data"))
-    recordings, record, load_or_record = [], collect.record, simulated_recording.load_or_record
+    recordings, record, load_or_record = [], collect.record_parts, simulated_recording.load_or_record
 
     def few(robot, path=None, trajectories=8, *how, **more):
         return load_or_record(robot, path, trajectories, *how, **more)
 
     monkeypatch.setattr(simulated_recording, "load_or_record", few)
-    monkeypatch.setattr(collect, "record", lambda *how: (recordings.append(how), record(*how))[1])
+    monkeypatch.setattr(collect, "record_parts", lambda *how: (recordings.append(how), record(*how))[1])
     return recordings
 
 
@@ -231,13 +232,13 @@ def test_what_is_imported_is_not_recorded_over(elsewhere, short, monkeypatch, ca
     """Neither while it is recorded, nor by a changed description, nor by `brakeline collect`."""
     data = simulated_recording.load_or_record(GROUND, trajectories=1)
     driven = replace(data, about={"origin": "a log", "source": "drive.csv", "sources": "drive.csv"})
-    path, record = data_paths.record_path(GROUND), collect.record
+    path, record = data_paths.record_path(GROUND), collect.record_parts
 
     def interrupted(*how):
         driven.save(path)
         yield from record(*how)
 
-    monkeypatch.setattr(collect, "record", interrupted)
+    monkeypatch.setattr(collect, "record_parts", interrupted)
     for again in (True, False):
         path.unlink()
         with pytest.raises(BadData, match="is kept"):
@@ -315,20 +316,25 @@ def test_the_last_steps_of_a_log(tmp_path):
     data, note = from_log(log, GROUND, last=60)
     assert [len(t.inputs) for t in data.trajectories] == [9, 49]
     assert "58 of the last 60 steps" in note and data.about == {"origin": "log"}
+    for step in made:
+        step.acceleration_age = 0.2
+    aged = written(tmp_path / "aged.mcap", (("step/ground/a", step, i) for i, step in enumerate(made)))
+    assert from_log(aged, GROUND, last=60)[0].about == {"origin": "log", ENTRY: "0.2"}
     with pytest.raises(BadData, match="no trajectory of ground"):
         from_log(written(tmp_path / "none.mcap", ()), GROUND, last=60)
 
 
-def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys):
-    drive = collect.record
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch, capsys, failure):
+    parts = collect.record_parts
 
     def interrupted(*given):
-        yield from itertools.islice(drive(*given), 2)
-        raise KeyboardInterrupt
+        yield next(parts(*given))[:2]
+        raise failure
 
     with monkeypatch.context() as patch:
-        patch.setattr(collect, "record", interrupted)
-        with pytest.raises(KeyboardInterrupt):
+        patch.setattr(collect, "record_parts", interrupted)
+        with pytest.raises(failure):
             simulated_recording.load_or_record(GROUND, trajectories=4)
     assert not data_paths.record_path(GROUND).exists()
     assert "recording ground once" in (told := capsys.readouterr().err) and "kept 2 of 6" in told
@@ -338,6 +344,25 @@ def test_an_interrupted_recording_is_gone_on_from(elsewhere, short, monkeypatch,
     again = data_paths.record_path(GROUND).with_name("fresh.safetensors")
     fresh = simulated_recording.load_or_record(GROUND, again, trajectories=4)
     assert whole.digest() == fresh.digest(), "the same data as in one go"
+
+
+def test_a_killed_recording_loses_no_trajectory_that_is_finished(short, monkeypatch, tmp_path):
+    """Robots that a batch simulates finish together: all are saved before the next ones begin."""
+    monkeypatch.setattr(collect, "AT_ONCE", 3)
+    record_at_once, path = collect._recorded_at_once, tmp_path / "record.safetensors"
+    times, saved = iter(range(0, 1000, 30)), []
+
+    def slow(robot, recipes, conditions):
+        if recipes[0].number:
+            saved.append(len(Dataset.load(path.with_name("record.part.safetensors")).trajectories))
+        now = next(times)
+        monkeypatch.setattr(simulated_recording, "time", SimpleNamespace(monotonic=lambda: now))
+        return record_at_once(robot, recipes, conditions)
+
+    monkeypatch.setattr(collect, "_recorded_at_once", slow)
+    monkeypatch.setattr(simulated_recording, "time", SimpleNamespace(monotonic=lambda: -30))
+    simulated_recording.load_or_record(GROUND, path, 6)
+    assert saved == [3, 6]
 
 
 def test_a_recording_on_a_full_disk_goes_on_and_waits_for_room(monkeypatch, tmp_path, capsys):

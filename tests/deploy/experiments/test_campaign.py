@@ -49,6 +49,18 @@ def test_the_parts_of_a_cell_add_up(driven):
     assert "| dense | trained | residual | as-recorded | 6 |" in text and "0: 0.00 % [0.00, 45.93]" in text
 
 
+def test_the_table_names_the_versions_that_drove_the_episodes_if_there_are_several(driven):
+    parts, results, _ = driven
+    (cell,) = cells_of(parts, results, Path("runs"))
+    assert "driven by" not in cell_table([cell])[0] and cell["versions"][0].startswith("brakeline ")
+    older = {name: value for name, value in results[0].items() if name != "versions"}
+    (mixed,) = cells_of(parts, [older, results[1]], Path("runs"))
+    heads, (row,) = cell_table([mixed])
+    assert row[heads.index("driven by")] == f"{cell['versions'][0]}; not stated"
+    before = {name: value for name, value in cell.items() if name != "versions"}  # in the table of an earlier campaign
+    assert [row[-1] for row in cell_table([before, cell])[1]] == ["not stated", cell["versions"][0]]
+
+
 def test_a_campaign_goes_on_after_the_episodes_that_it_has_and_adds_up_one_model_set(driven, monkeypatch):
     parts, results, folder = driven
     monkeypatch.setattr(CampaignPart, "run", lambda *_: pytest.fail("driven again"))

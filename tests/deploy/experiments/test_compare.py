@@ -15,6 +15,7 @@ from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.commands.collect_command import CollectCommand
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store, rival_pretraining
+from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.experiments import bootstrap, cell_run, compared_methods
 from brakeline.deploy.experiments.bootstrap import mean, rate, ratio
 from brakeline.deploy.experiments.campaign import CampaignPart
@@ -37,6 +38,7 @@ from brakeline.deploy.experiments.comparison_table import (
     table,
     written,
 )
+from brakeline.deploy.experiments.conservatism import Conservatism
 from brakeline.deploy.experiments.experiment_jobs import configuration, result_path, task_hash, write
 from brakeline.deploy.experiments.experiment_jobs import read as read_result
 from brakeline.deploy.experiments.stored_cells import stored_cells
@@ -53,6 +55,7 @@ from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging import task
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import read_task, robot_with_task
+from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ModelConfig
 from tests.robots import GROUND
 
@@ -405,6 +408,20 @@ def test_cells_of_a_robot_of_ones_own_behind_another_model_set_are_refused(tmp_p
             stored_cells(tmp_path, car)
         result_path(tmp_path, cell).unlink()
     assert len(stored_cells(tmp_path, car)) == 1 and read_result(tmp_path, before[2]) is not None
+
+
+def test_error_bounds_that_were_measured_on_another_recording_are_refused(data_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(compare_command, "complete", lambda *_: pytest.fail("a training began"))
+    monkeypatch.setattr(model_store, "method_for", lambda *_: SimpleNamespace(version="1"))
+    job, command = Conservatism("ground"), CompareCommand(("ground",), (0,), methods=("none",), results=tmp_path)
+    digest = Dataset.load(record_path(GROUND)).steady().digest()
+    for stored, accepted in ((digest, True), ("1ec1979cbe07", False)):
+        write(tmp_path, job, {"study": configuration(job), "data": stored, "rows": []})
+        with pytest.raises(pytest.fail.Exception if accepted else ResultError, match=r"began|on another recording"):
+            command.run()
+    for other in (replace(command, again=True), replace(command, conservatism=False)):
+        with pytest.raises(pytest.fail.Exception, match="a training began"):
+            other.run()
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from brakeline.deploy.data import model_store
 from brakeline.deploy.experiments import bootstrap, conservatism
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
+from brakeline.deploy.experiments.comparison_table import markdown, table
 from brakeline.deploy.experiments.conservatism import Conservatism
 from brakeline.deploy.experiments.evaluate import FRESH
 from brakeline.deploy.experiments.experiment_jobs import configuration
@@ -113,6 +114,19 @@ def test_the_page_says_which_filters_were_made_several_times(results):
     assert "| sets from recorded driving |" in page(results, ["ground"])
     change(results / "ground" / "ddpc-s1.json", lambda cell: cell["model"].update(version="2"))
     assert "| sets from recorded driving; made 2 times: 1, 2 |" in page(results, ["ground"])
+
+
+def test_page_and_table_name_the_versions_that_made_the_cells_if_there_are_several(results):
+    versions = {"brakeline": "0.3.0", "mujoco": "4.0.0"}
+    paths = sorted((results / "ground").glob("*-s*.json"))
+    for path in paths:
+        change(path, lambda cell: cell.update(versions=versions))
+    assert "versions made" not in page(results, ["ground"]) + markdown(table(stored_cells(results, "ground")))
+    change(results / "ground" / "none-s1.json", lambda cell: cell.update(versions=versions | {"brakeline": "0.2.0"}))
+    change(results / "ground" / "none-s2.json", lambda cell: cell.pop("versions"))
+    notes = "brakeline 0.3.0, mujoco 4.0.0 (", "brakeline 0.2.0, mujoco 4.0.0 (none-s1)", "not stated (none-s2)"
+    for text in page(results, ["ground"]), markdown(table(stored_cells(results, "ground"))):
+        assert "3 versions made the cells" in text and all(note in text for note in notes)
 
 
 def test_cells_of_two_learners_are_not_mixed_and_the_page_names_their_settings(results):

@@ -14,6 +14,7 @@ from brakeline.deploy.data.first_flight import FirstFlight
 from brakeline.deploy.run import first_flight_run
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import BadData, FlightEnded, MavlinkError
+from brakeline.safety.model.acceleration_age import ENTRY
 from brakeline.safety.model.dataset import Dataset
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode
@@ -67,7 +68,25 @@ def test_a_flight_whose_model_set_is_interrupted_is_stored(
     path = tmp_path / "flown.safetensors"
     with pytest.raises(KeyboardInterrupt):
         first_flight_run.fly(LATE, url, 0, replace(SETTINGS, minutes=0.1), path)
-    assert Dataset.load(path).periods > 10
+    data = Dataset.load(path)
+    assert data.periods > 10 and ENTRY not in data.about
+
+
+@pytest.mark.parametrize(("given", "recorded"), [(None, "0.2"), (0.0, None), (0.4, "0.4")])
+def test_behind_ardupilot_the_states_hold_the_acceleration_of_a_period_ago(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, given: float | None, recorded: str | None
+) -> None:
+    path, ages = tmp_path / "flown.safetensors", list[float]()
+
+    def record(self: FirstFlight, level: float, seconds: float) -> None:
+        ages.append(self._vehicle.acceleration_age)
+        raise FlightEnded("that is enough")
+
+    monkeypatch.setattr(FirstFlight, "_record", record)
+    monkeypatch.setattr(FirstFlight, "result", lambda self, about, store: about)
+    with served(Autopilot(quadrotor(floor=0.02), "ardupilot")) as url:
+        about = first_flight_run.fly(LATE, url, 0, replace(SETTINGS, acceleration_age=given), path)
+    assert about.get(ENTRY) == recorded and ages == [float(recorded or 0.0)]
 
 
 def test_a_pilot_who_took_the_vehicle_keeps_it(

@@ -3,9 +3,11 @@
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from brakeline.actors.actor_settings import FlightSettings
 from brakeline.deploy.data.data_paths import model_path, note_mode
 from brakeline.deploy.run.launcher import prepare
 from brakeline.deploy.run.processes import CONFIG
@@ -13,6 +15,8 @@ from brakeline.deploy.run.run_config import RunConfig, encode, load
 from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import BadModel, TooLoose
 from brakeline.learner import checkpoint
+from brakeline.messaging.robot import robot_named
+from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.model_config import AUTO, DIRECT, ONE_STEP
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.robots import GROUND
@@ -73,6 +77,25 @@ def test_a_run_whose_model_set_is_lost_or_too_loose_is_not_resumed(folder):
     model_in_run(config, folder, GROUND).unlink()
     with pytest.raises(BadModel, match=r"can't be resumed: no model of ground.*Start a new run"):
         prepare(config, folder, resume=True)
+
+
+def test_a_vehicle_reports_accelerations_of_the_age_in_the_model_set(folder):
+    late = robot_named("quadrotor-late")
+    flown = ModelSet.load(Path(__file__).parents[2] / "stored" / "quadrotor-late.safetensors")
+    mode = ModelConfig(mode=flown.model_config.mode)
+    replace(flown, about=flown.about | about_age([0.2])).save(model_path(late, mode))
+    note_mode(late, mode)
+    config = RunConfig(
+        robots=(late.name,),
+        policy="astar",
+        flights=(FlightSettings("udpin:127.0.0.1:14550"),),
+        actors=1,
+        accept_bound=1.0,
+    )
+    assert prepare(config, folder, resume=False).flights[0].acceleration_age == 0.2
+    other = replace(config, flights=(replace(config.flights[0], acceleration_age=0.1),))
+    with pytest.raises(BadModel, match=r"of 0\.2 s ago, not of 0\.1 s ago: leave out --acceleration-age"):
+        prepare(other, folder.with_name("other"), resume=False)
 
 
 # --- mode auto uses the model set that was put to use last, whatever the times of the files are -------------------
