@@ -21,10 +21,10 @@ from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod, PeriodicVeh
 from brakeline.actors.mavlink.takeoff import TELEMETRY, Takeoff
 from brakeline.actors.mavlink.telemetry import TRUTH, Array, resampled
 from brakeline.errors import CommandLost, MavlinkError, TelemetryMissing
+from brakeline.messaging.acceleration_age import OLDEST
 from brakeline.messaging.byte_links import open_link
 from brakeline.messaging.rejected_messages import RejectedMessages
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.acceleration_age import OLDEST
 from brakeline.sim.quadrotor import SAMPLES
 from brakeline.sim.vehicle import Period
 
@@ -54,7 +54,7 @@ class MavlinkVehicle(PeriodicVehicle):
 
     Attributes:
         acceleration_age: the states hold the horizontal acceleration of this long ago [s]. What counts is the age in
-            the data of the model set (`brakeline.safety.model.acceleration_age`).
+            the data of the model set (`brakeline.messaging.acceleration_age`).
     """
 
     def __init__(

@@ -18,12 +18,12 @@ from brakeline.actors.mavlink.periodic_vehicle import ControlPeriod
 from brakeline.actors.mavlink.telemetry import Array
 from brakeline.errors import BadInput, BadLink, BadMessage, CommandLost, HandoverRefused, MavlinkError
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.acceleration_age import OLDEST
 from brakeline.messaging.obstacle import FARTHEST, Obstacle
 from brakeline.messaging.obstacle_messages import obstacle_messages
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.robot_description import robot_from_description
 from brakeline.messaging.structured_text import parse_json
-from brakeline.safety.model.acceleration_age import OLDEST
 from brakeline.safety.service.wire import array_of, obstacles_of
 from brakeline.sim.quadrotor import QUADROTOR, SAMPLES
 from brakeline.sim.vehicle import Period

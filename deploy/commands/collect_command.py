@@ -13,7 +13,7 @@ from brakeline.deploy.commands.certify_command import bounds_in_words, validatio
 from brakeline.deploy.commands.command_output import errors, print_result
 from brakeline.deploy.data.simulated_recording import SEED, load_or_record
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
-from brakeline.safety.model.acceleration_age import OLDEST
+from brakeline.messaging.acceleration_age import OLDEST
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from brakeline.deploy.data.sources.source_table import Table
 from brakeline.deploy.data.stamps import TIME, in_header_units, stamped
 from brakeline.errors import NoSource
 from brakeline.logs.mcap_container import is_ros
+from brakeline.messaging.acceleration_age import about_age, acceleration_age_in
 from brakeline.messaging.robot import Robot
-from brakeline.safety.model.acceleration_age import about_age, acceleration_age_in
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.repeated_driving import repeated_driving
 

@@ -12,8 +12,8 @@ import numpy as np
 from brakeline.errors import BadData
 from brakeline.logs.reader import open_log
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import INPUT_TOLERANCE, Robot
-from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.dataset import Dataset, Trajectory
 from brakeline.safety.model.repeated_driving import without_repeats
 

@@ -17,11 +17,11 @@ from brakeline.deploy.data.certification import certify, certify_update
 from brakeline.deploy.data.run_dataset import runs_of, trajectories_of
 from brakeline.errors import BadData, BadModel, BadStep, ErrorBoundError, Implausible
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.widening import RESERVE
-from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.calibration_samples import FOLDS
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.model_set import ONE_STEP, ModelConfig, ModelSet

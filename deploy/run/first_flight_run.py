@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brakeline.errors import CommandLost, MavlinkError
+from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.stop_signals import stop_on_signals
-from brakeline.safety.model.acceleration_age import about_age
 
 if TYPE_CHECKING:
     from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle

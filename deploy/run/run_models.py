@@ -16,11 +16,11 @@ from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.progress import console
 from brakeline.deploy.run.run_config import RunConfig
 from brakeline.errors import BadModel
+from brakeline.messaging.acceleration_age import acceleration_age_in
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import Robot
 from brakeline.messaging.task import robot_maybe_with_task
 from brakeline.safety.methods import IN_USE, Model, archive_path, load
-from brakeline.safety.model.acceleration_age import acceleration_age_in
 from brakeline.safety.model.model_config import AUTO
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.stated_bound import check_bound

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from brakeline.errors import BadModel, UnknownRobot
+from brakeline.messaging.acceleration_age import acceleration_age_in
 from brakeline.messaging.atomic_files import write_atomically
 from brakeline.messaging.robot import FORMER_LAYOUTS, Array, Robot, refuse_shipped_name, robot_named
 from brakeline.messaging.robot_description import robot_from_description
@@ -20,7 +21,6 @@ from brakeline.messaging.robot_files import REAL_TIME_SUFFIX
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.structured_text import parse_json
 from brakeline.safety.filter.reachable_tube import Tube, recursion_maps, stack_direct, stack_recursive, stack_rollout
-from brakeline.safety.model.acceleration_age import acceleration_age_in
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_config import DIRECT as DIRECT
 from brakeline.safety.model.model_config import FREE, PLAN

@@ -6,11 +6,11 @@ import pytest
 
 from brakeline.errors import BadData, BadModel, BadRequest
 from brakeline.messaging import brakeline_pb2 as pb
+from brakeline.messaging.acceleration_age import ENTRY, about_age, acceleration_age_in
 from brakeline.safety.filter.backup_plan import BackupPlan
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import ALLOWED
-from brakeline.safety.model.acceleration_age import ENTRY, about_age, acceleration_age_in
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess

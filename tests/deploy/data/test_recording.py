@@ -19,7 +19,7 @@ from brakeline.deploy.data.excitation import excitation, restless_excitation
 from brakeline.deploy.data.run_dataset import from_log, trajectories_of
 from brakeline.errors import BadData, BadModel, NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
-from brakeline.safety.model.acceleration_age import ENTRY
+from brakeline.messaging.acceleration_age import ENTRY
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.driving_kinds import JUMPING, RESTLESS, driving_kinds
 from brakeline.safety.model.model_config import AUTO

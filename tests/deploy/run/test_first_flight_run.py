@@ -14,7 +14,7 @@ from brakeline.deploy.data.first_flight import FirstFlight
 from brakeline.deploy.run import first_flight_run
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import BadData, FlightEnded, MavlinkError
-from brakeline.safety.model.acceleration_age import ENTRY
+from brakeline.messaging.acceleration_age import ENTRY
 from brakeline.safety.model.dataset import Dataset
 from brakeline.sim.autopilot.endpoint import Autopilot
 from brakeline.sim.autopilot.flight_modes import Mode

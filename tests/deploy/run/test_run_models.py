@@ -15,8 +15,8 @@ from brakeline.deploy.run.run_config import RunConfig, encode, load
 from brakeline.deploy.run.run_models import model_in_run
 from brakeline.errors import BadModel, TooLoose
 from brakeline.learner import checkpoint
+from brakeline.messaging.acceleration_age import about_age
 from brakeline.messaging.robot import robot_named
-from brakeline.safety.model.acceleration_age import about_age
 from brakeline.safety.model.model_config import AUTO, DIRECT, ONE_STEP
 from brakeline.safety.model.model_set import ModelConfig, ModelSet
 from tests.robots import GROUND
