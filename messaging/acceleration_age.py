@@ -1,9 +1,9 @@
 """The age of the horizontal acceleration in the measured states of a flying vehicle.
 
 An autopilot follows a setpoint with limited acceleration and jerk. How far it has come is not in its velocity and its
-acceleration now. The velocity now and the acceleration a period ago say more about it: behind an ArduCopter, sets for a
-stop from full speed become half as wide (docs/your_ardupilot.md). So a state may hold the acceleration of some time
-ago. Then the recorded data say so in `about`, the model set takes it over, and each request says it too.
+acceleration now. The velocity now and the acceleration a period ago say more about it (docs/method.md §13). So a state
+may hold the acceleration of some time ago. Then the recorded data say so in `about`, the model set takes it over, and
+each request says it too.
 """
 
 from __future__ import annotations

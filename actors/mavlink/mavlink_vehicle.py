@@ -152,11 +152,6 @@ class MavlinkVehicle(PeriodicVehicle):
         self._client.land(self._wait)
 
     @property
-    def autopilot(self) -> str:
-        """The kind of autopilot: ardupilot, px4, or empty until it is known."""
-        return self._client.kind or ""
-
-    @property
     def armed(self) -> bool:
         """Whether the vehicle is armed, by its last heartbeat."""
         return self._client.armed
