@@ -196,7 +196,7 @@ def test_a_flipped_bit_in_what_a_model_set_states_is_noticed(model):
 
 def test_invalid_configurations_and_data_that_support_no_model_are_refused(data):
     for bad in ({"certificate": "hope"}, {"mode": "magic"}, {"inflation": 0.9}, {"inflation": float("nan")}):
-        with pytest.raises(ValueError, match=r"certificate|mode|envelope"):
+        with pytest.raises(ValueError, match=r"certificate|mode|inflation"):
             ModelConfig(**bad)
     with pytest.raises(BadData, match="trajectory"):
         fit_model_set(replace(data, trajectories=data.trajectories[:1]), ModelConfig())
