@@ -39,7 +39,9 @@ MAX_DRIFT = 0.4  # m in `AHEAD` periods: above it the drift of the vehicle's est
 PIECE = 60  # periods per trajectory: validation holds out whole trajectories
 REACTION, BRAKING = 1.0, 1.5  # s and m/s²: worse than any real vehicle
 RETURN_SPEED = 0.5  # share of the level's speed, towards the middle, near a wall
-NEAR = 0.3  # share of the distance to the wall from which the next manoeuvre leads back
+NEAR = 0.3  # share of the distance to the wall from which the next leg leads back
+STOPS, LEFT_EARLY = 0.3, 0.5  # shares of the legs that stop, and of the stops that end before the vehicle stands
+HASTY, LONGEST = 0.25, 15  # share of the targets that are left within three periods; periods that bound the others
 OUTSIDE = 10.0  # m beyond the box at which the flight ends
 ORIGIN = "maiden flight"
 
@@ -68,32 +70,40 @@ class Box:
         return float(np.max(np.abs(state[:3] - self.middle) - self.half))
 
 
-def draw_manoeuvre(robot: Robot, share: float, before: Array, rng: np.random.Generator) -> list[Array]:
-    """Draw a manoeuvre: random targets, each held or left at once, then a plan like the filter's: inputs (3,).
+def draw_leg(
+    robot: Robot, box: Box, share: float, state: Array, before: Array, rng: np.random.Generator
+) -> list[Array]:
+    """Draw a leg of the flight: a target that is held or left at once, or a plan like the filter's: inputs (3,).
 
-    Its lead-in is shorter than that of `excitation`, so that some minutes of flight have enough plans.
+    Errors are largest in fast flight, so minutes must hold much of it: only some legs stop, and some stops are left
+    early. Targets lead away from a near wall.
+
+    Args:
+        robot: the robot in real time.
+        box: the region of the flight.
+        share: of the largest inputs.
+        state (9,): the measured state.
+        before (3,): the input in force, in m/s.
+        rng: the source of randomness.
     """
-    inputs = [before]
-    for _ in range(rng.integers(4)):
-        target = share * random_target(robot, rng)
-        for _ in range(rng.integers(1, 4 if rng.random() < 0.6 else 12)):
+    target = _inwards(share * random_target(robot, rng), state, box)
+    if not before.any() or rng.random() >= STOPS:
+        inputs = [before]
+        for _ in range(rng.integers(1, 4 if rng.random() < HASTY else LONGEST)):
             inputs.append(limit_slew(robot, inputs[-1], target))
-    chosen = limit_slew(robot, inputs[-1], share * random_target(robot, rng))
+        return inputs[1:]
     waiting = replace(robot.in_lockstep(), free_steps=1)
-    inputs += list((waiting.plan_matrix() @ chosen).reshape(waiting.horizon, -1))
+    plan = list((waiting.plan_matrix() @ limit_slew(robot, before, target)).reshape(waiting.horizon, -1))
+    if rng.random() < LEFT_EARLY:
+        return plan[: rng.integers(1, len(plan))]
     standing = rng.integers(3) if rng.random() < 0.9 else 12
-    return inputs[1:] + [np.zeros(robot.action_dim)] * int(standing)
+    return plan + [np.zeros(robot.action_dim)] * int(standing)
 
 
-def mirror_inwards(inputs: list[Array], state: Array, box: Box, period: float, rng: np.random.Generator) -> list[Array]:
-    """Mirror a manoeuvre on each axis on which it would lead from near a wall towards it, on other axes at random.
-
-    The manoeuvre must begin at rest: mirrored inputs do not continue a motion.
-    """
-    away = np.asarray(inputs).sum(0) * period
+def _inwards(target: Array, state: Array, box: Box) -> Array:
+    """Return a target (3,) that leads to the middle on each axis on which the vehicle is near a wall."""
     offset = (state[:3] - box.middle) / box.half
-    signs = np.where(np.abs(offset) > NEAR, -np.sign(offset * away), rng.choice([-1.0, 1.0], 3))
-    return [np.where(signs == 0.0, 1.0, signs) * u for u in inputs]
+    return np.where(np.abs(offset) > NEAR, -np.sign(offset) * np.abs(target), target)
 
 
 @dataclass(frozen=True)
@@ -175,7 +185,7 @@ class FirstFlight:
         log.info("flying at %.0f %% of its speed: %.1f m/s per axis, for %.0f s", 100 * level, bounds.max(), seconds)
         vehicle.wait(vehicle.current_period.number + 1)
         self._cut()
-        end = self._periods + round(seconds / robot.period)
+        end = self._periods + max(round(seconds / robot.period), 2 * PIECE)  # one trajectory to fit, one to hold out
         while self._periods < end:
             for wanted in self._next(level):
                 if self._period(wanted, bounds):
@@ -185,13 +195,10 @@ class FirstFlight:
 
     def _next(self, level: float) -> list[Array]:
         period = self._vehicle.current_period
-        inputs = draw_manoeuvre(self._robot, level, period.input, self._rng)
-        if not period.input.any():
-            return mirror_inwards(inputs, period.report.measured, self._box, self._robot.period, self._rng)
-        return inputs
+        return draw_leg(self._robot, self._box, level, period.report.measured, period.input, self._rng)
 
     def _period(self, wanted: Array, level: Array) -> bool:
-        """Fly one period; return True if the manoeuvre must end (box rule or gap). Raises FlightEnded."""
+        """Fly one period; return True if the leg must end (box rule or gap). Raises FlightEnded."""
         vehicle, before = self._vehicle, self._vehicle.current_period
         allowed = self._box.constrain(before.report.measured, wanted, level)
         vehicle.commit(allowed[None], before.number + 1)
