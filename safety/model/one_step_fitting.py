@@ -176,18 +176,17 @@ def fit_one_step(
     s = samples_of(data.joined())
     choice, candidates, regression = choose(robot, s, model_config.outside, progress)
     chosen, full = choice.candidate, choice.full
-    scores, positions, others = _scores(robot, s, regression, choice, progress)
+    scores, positions, others = window_scores(robot, _shares_used(robot, s, regression, choice, progress))
     kinds = driving_kinds(robot, s.z, s.start)
     joint_space = not robot.position_dim  # the limited coordinates are scored with the plan
     factors = SetFactors.of(scores, others, kinds, model_config.outside, same=joint_space)
     one_step = replace(regression.fit(chosen, weight=choice.weight), start=factors.start)
     errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
     shape = shape_with_chords(robot, s.z, errors, s.chords, full, choice.level)
-    n, d, N = s.after.shape[2], robot.position_dim, robot.horizon
-    scale = np.full(n, factors.plan)
-    first_scale = np.where(np.arange(n) < d, factors.plan, factors.first)
-    steps = tuple(shape.bound(robot, k, slice(n), scale if k > 1 else first_scale) for k in range(1, N + 1))
-    chords = [shape.bound(robot, k, slice(n, n + 1), scale[:1]) for k in range(1, N + 1)]
+    n, N = s.after.shape[2], robot.horizon
+    first, later, of_chords = scales(robot, factors, n)
+    steps = tuple(shape.bound(robot, k, slice(n), first if k == 1 else later) for k in range(1, N + 1))
+    chords = [shape.bound(robot, k, slice(n, n + 1), of_chords) for k in range(1, N + 1)]
     measured = len(robot.regressor)
     known = np.hstack([s.v[:, :measured], s.v[:, measured + robot.action_dim :]])  # without the period's own input
     model = ModelSet(
@@ -202,9 +201,8 @@ def fit_one_step(
         one_step=one_step,
     )
     used, used_first = (factors.shares(part, others, kinds) for part in (scores, positions))
-    return model, Calibration(
-        chosen, tuple(candidates), factors.plan, used, used_first, s, *regression.quality(one_step)
-    )
+    largest = float(factors.plan.max())
+    return model, Calibration(chosen, tuple(candidates), largest, used, used_first, s, *regression.quality(one_step))
 
 
 def _stacked(bounds: list[ErrorBound]) -> ErrorBound:
@@ -269,30 +267,52 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
     return Choice(candidate, weight, level, float(width_of[weight, level]), full)
 
 
-def _scores(
-    robot: Robot, s: Samples, regression: Regression, choice: Choice, progress: Progress
-) -> tuple[Array, Array, Array]:
-    """Return three scores (T,) of each window, from the folds that it is not in.
+def _shares_used(robot: Robot, s: Samples, regression: Regression, choice: Choice, progress: Progress) -> Array:
+    """Return how much of its sets each window used (T, N, n' + 1), from the folds that it is not in.
 
-    Returns:
-        The largest ratio of positions, coordinates that a limit needs and chord deviations; the same for the positions
-        after one period; and that of the other coordinates after one period.
+    The last coordinate are the chord deviations.
     """
-    scores = np.zeros((3, len(s.z)))
+    used = np.zeros((*s.after.shape[:2], s.after.shape[2] + 1))
     for i in regression.folds:
         progress(CHOSEN + (SCORED - CHOSEN) * i / len(regression.folds))
         held = s.fold == i
         one_step = regression.fit(choice.candidate, i, choice.weight)
         errors = (s.after - one_step.rollouts(robot, s.z)) / one_step.stretches(robot, s.z)[..., None]
         shape = shape_with_chords(robot, s.z[~held], errors[~held], s.chords[~held], choice.full, choice.level)
-        widths = shape.widths(spread_features(robot, s.z[held]))
-        scores[:, held] = window_scores(robot, errors[held], s.chords[held], widths)
-    return scores[0], scores[1], scores[2]
+        used[held] = window_shares(errors[held], s.chords[held], shape.widths(spread_features(robot, s.z[held])))
+    return used
 
 
-def window_scores(robot: Robot, errors: Array, chords: Array, widths: Array) -> Array:
-    """Return the scores (3, T) of `_scores` from errors (T, N, n'), chords (T, N) and half-widths (T, N, n' + 1)."""
+def window_shares(errors: Array, chords: Array, widths: Array) -> Array:
+    """Return the shares (T, N, n' + 1) of half-widths (T, N, n' + 1) that errors (T, N, n') and chords (T, N) used."""
+    return shares(np.concatenate([np.abs(errors), chords[..., None]], axis=2), widths)
+
+
+def window_scores(robot: Robot, used: Array) -> tuple[Array, Array, Array]:
+    """Return the scores of windows that used these shares (T, N, n' + 1) of their sets.
+
+    Returns:
+        The largest share (G, T) of each position, each coordinate that a limit needs, and the chord deviations; the
+        shares (d, T) of the positions after one period; the largest one (T,) of the other coordinates after one period.
+    """
     d = robot.position_dim
-    used = shares(np.concatenate([np.abs(errors), chords[..., None]], axis=2), widths)
-    whole = used[..., [*range(d), *extra_coordinates(robot), -1]].max((1, 2))
-    return np.stack([whole, used[:, 0, :d].max(1, initial=0.0), used[:, 0, d:-1].max(1, initial=0.0)])
+    return used[..., _of_plans(robot)].max(1).T, used[:, 0, :d].T, used[:, 0, d:-1].max(1, initial=0.0)
+
+
+def scales(robot: Robot, factors: SetFactors, count: int) -> tuple[Array, Array, Array]:
+    """Return the factors on the sets of `count` predicted coordinates.
+
+    Coordinates that no plan needs have the largest factor of those that it needs.
+
+    Returns:
+        Those after one period (count,), those after each further period (count,), and that on chord deviations (1,).
+    """
+    later = np.full(count + 1, factors.plan.max())
+    later[_of_plans(robot)] = factors.plan
+    first = np.where(np.arange(count) < robot.position_dim, later[:-1], factors.first)
+    return first, later[:-1], later[-1:]
+
+
+def _of_plans(robot: Robot) -> list[int]:
+    """Return the places of the coordinates that a plan needs after every period, and of the chord deviations."""
+    return [*range(robot.position_dim), *extra_coordinates(robot), -1]

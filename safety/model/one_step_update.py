@@ -22,7 +22,13 @@ from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.one_step import OneStep
-from brakeline.safety.model.one_step_fitting import PLANS_EVERY, Calibration, window_scores
+from brakeline.safety.model.one_step_fitting import (
+    PLANS_EVERY,
+    Calibration,
+    scales,
+    window_scores,
+    window_shares,
+)
 from brakeline.safety.model.one_step_regression import RIDGE, Candidate
 from brakeline.safety.model.set_factors import SetFactors
 from brakeline.safety.model.set_shape import plans_from, shares, stop_from_full_speed
@@ -93,15 +99,15 @@ class Trial:
         old_weight, instruments: of `Correction.fit`.
         one_step: the predictor.
         factors: on the half-widths, from the out-of-fold scores.
-        scores (3, T): out-of-fold scores of the windows.
-        width: mean factor on the last sets of positions.
+        scores: out-of-fold scores of the windows (`window_scores`).
+        width: mean factor on the last sets.
     """
 
     old_weight: float
     instruments: bool
     one_step: OneStep
     factors: SetFactors
-    scores: Array
+    scores: tuple[Array, Array, Array]
     width: float
 
 
@@ -124,24 +130,24 @@ def update_one_step(in_use: ModelSet, data: Dataset, outside: float) -> tuple[Mo
     choices = product(OLD_WEIGHTS, (False, True))
     trials = [_tried(in_use, s, correction, widths, kinds, choice, outside) for choice in choices]
     best = min(trials, key=lambda trial: trial.width if np.isfinite(trial.width) else np.inf)
-    first, plan = np.full(s.after.shape[2], best.factors.plan), best.factors.plan
-    first[robot.position_dim :] = best.factors.first
+    first, later, of_chords = scales(robot, best.factors, s.after.shape[2])
     recorded = recorded_domain(data)
     model = replace(
         in_use,
         robot=robot,
         layout="",
         model_config=replace(in_use.model_config, outside=outside),
-        steps=(_scaled(in_use.steps[0], first), *(_scaled(step, plan) for step in in_use.steps[1:])),
-        chord_deviations=_scaled(in_use.chord_deviations, plan),
+        steps=(_scaled(in_use.steps[0], first), *(_scaled(step, later) for step in in_use.steps[1:])),
+        chord_deviations=_scaled(in_use.chord_deviations, of_chords),
         stopping_distance=_scaled(in_use.stopping_distance, _stopping_factor(in_use, data, s)),
         domain=np.stack([np.minimum(in_use.domain[0], recorded[0]), np.maximum(in_use.domain[1], recorded[1])]),
         about=data.about | {"data": data.digest(), "periods": str(data.periods), "updates": in_use.version},
         one_step=replace(best.one_step, start=best.factors.start),
     )
-    used, used_first = (best.factors.shares(part, best.scores[2], kinds) for part in best.scores[:2])
+    scores, positions, others = best.scores
+    used, used_first = (best.factors.shares(part, others, kinds) for part in (scores, positions))
     features = Candidate(0, 1, best.old_weight, best.instruments, features=len(best.one_step.features.terms))
-    return model, Calibration(features, (), plan, used, used_first, s, 0.0, 0.0)
+    return model, Calibration(features, (), float(best.factors.plan.max()), used, used_first, s, 0.0, 0.0)
 
 
 def _tried(
@@ -158,21 +164,22 @@ def _tried(
     widths (T, N, n' + 1): half-widths of the model set in use.
     """
     robot = in_use.robot
-    scores, one_step = _scores(robot, s, correction, choice, widths), correction.fit(*choice)
+    scores = window_scores(robot, _shares_used(robot, s, correction, choice, widths))
     factors = SetFactors.of(scores[0], scores[2], kinds, outside, same=not robot.position_dim)
-    return Trial(*choice, one_step, factors, scores, factors.plan * _stretched(in_use, s, one_step))
+    one_step, mean = correction.fit(*choice), float(np.exp(np.log(factors.plan).mean()))
+    return Trial(*choice, one_step, factors, scores, mean * _stretched(in_use, s, one_step))
 
 
-def _scores(robot: Robot, s: Samples, correction: Correction, choice: tuple[float, bool], widths: Array) -> Array:
-    """Return the scores (3, T) of the windows by their half-widths (T, N, n' + 1), each predicted without its fold."""
-    scores = np.zeros((3, len(s.z)))
+def _shares_used(robot: Robot, s: Samples, correction: Correction, choice: tuple[float, bool], widths: Array) -> Array:
+    """Return how much of its half-widths (T, N, n' + 1) each window used, each predicted without its fold."""
+    used = np.zeros_like(widths)
     for i in range(len(correction.gram)):
         held, one_step = s.fold == i, correction.fit(*choice, without=i)
         with np.errstate(invalid="ignore"):  # a rollout may diverge: `shares` takes NaN for infinity
             errors = s.after[held] - one_step.rollouts(robot, s.z[held])
             errors /= one_step.stretches(robot, s.z[held])[..., None]
-        scores[:, held] = window_scores(robot, errors, s.chords[held], widths[held])
-    return scores
+        used[held] = window_shares(errors, s.chords[held], widths[held])
+    return used
 
 
 def _stretched(in_use: ModelSet, s: Samples, one_step: OneStep) -> float:

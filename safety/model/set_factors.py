@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +20,22 @@ class SetFactors:
     """Factors on the shape, for each part of a plan's sets.
 
     Attributes:
-        plan: on positions, coordinates that a limit needs and chord deviations.
+        plan (G,): on each position, each coordinate that a limit needs, and the chord deviations.
         first: on the other coordinates after one period.
         start: further factor on all of them within a plan's length of an episode's start, at least 1.
     """
 
-    plan: float
+    plan: Array
     first: float
     start: float
 
     @staticmethod
     def of(plan: Array, first: Array, kinds: dict[str, Mask], outside: float, same: bool = False) -> SetFactors:
-        """Return the least factors that leave at most a share `outside` of the windows of every kind outside.
+        """Return factors that leave at most a share `outside` of the windows of every kind outside.
+
+        Over all windows, one factor holds for all coordinates: of a share `outside`, any coordinate may leave. A kind
+        of driving with few windows may need much larger sets for a few events, such as the loss of height in fast
+        turns. Then only the coordinates that leave get larger factors.
 
         Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude. For all
         driving, `plan` would have to be several times as large. No plan of the filter jumps like this, so only `first`
@@ -39,25 +43,50 @@ class SetFactors:
         although the robot drove on, and all of them decide about all sets.
 
         Args:
-            plan (T,), first (T,): scores of the windows, for both parts.
+            plan (G, T), first (T,): scores of the windows, for both parts.
             kinds: the windows (T,) of each kind of driving.
             outside: the share.
-            same: whether both parts have the same factor.
+            same: whether all parts have the same factor.
         """
         begun = ~kinds[START] | (kinds[START].mean() > MOST_STARTS)
-        others = [np.ones(len(plan), dtype=bool), *(kind for name, kind in kinds.items() if name != START)]
-        for_plan = max(_quantile(plan[kind & begun & ~kinds[JUMPING]], outside) for kind in others)
-        for_first = max(_quantile(first[kind & begun], outside) for kind in others)
+        steady = begun & ~kinds[JUMPING]
+        others = [kind for name, kind in kinds.items() if name != START]
+        for_all = _quantile(plan[:, steady].max(0), outside)
+        for_plan = np.max([_of_each(plan[:, kind & steady], outside, for_all) for kind in others], axis=0)
+        for_first = max(_quantile(first[kind & begun], outside) for kind in (begun, *others))
         if same:
-            for_plan = for_first = max(for_plan, for_first)
-        at_start = _quantile(plan[~begun], outside) / for_plan, _quantile(first[~begun], outside) / for_first
-        return SetFactors(for_plan, for_first, max(1.0, *at_start))
+            for_first = max(float(for_plan.max()), for_first)
+            for_plan = np.full(len(plan), for_first)
+        factors = SetFactors(for_plan, for_first, 1.0)
+        used = factors.shares(plan, np.zeros_like(first), kinds), first / for_first
+        return replace(factors, start=max(1.0, *(_quantile(part[~begun], outside) for part in used)))
 
     def shares(self, plan: Array, first: Array, kinds: dict[str, Mask]) -> Array:
-        """Return how much of its sets each window used (T,), from its scores; above 1, it is outside."""
+        """Return how much of its sets each window used (T,), from its scores; above 1, it is outside.
+
+        plan (g, T): the scores of the first g coordinates.
+        """
         with np.errstate(invalid="ignore"):
-            both = np.maximum(plan / self.plan, first / self.first) / np.where(kinds[START], self.start, 1.0)
+            most = (plan / self.plan[: len(plan), None]).max(0, initial=0.0)
+            both = np.maximum(most, first / self.first) / np.where(kinds[START], self.start, 1.0)
         return np.where(np.isnan(both), np.inf, both)
+
+
+def _of_each(scores: Array, outside: float, least: float) -> Array:
+    """Return factors (G,), at least `least`, that leave at most a share `outside` of the windows outside.
+
+    The windows outside are those with the largest scores. Each coordinate holds all others.
+
+    scores (G, T): of each coordinate.
+    """
+    scores = np.where(np.isnan(scores), np.inf, scores)
+    held = np.argsort(scores.max(0))[: _rank(scores.shape[1], outside)]
+    return np.asarray(np.maximum(scores[:, held].max(1, initial=0.0), least))
+
+
+def _rank(count: int, outside: float) -> int:
+    """Return which of `count` scores, from the smallest on, bounds all but a share `outside` of new ones."""
+    return min(math.ceil((count + 1) * (1.0 - outside)), count)
 
 
 def _quantile(scores: Array, outside: float) -> float:
@@ -68,4 +97,4 @@ def _quantile(scores: Array, outside: float) -> float:
     if not len(scores):
         return 1.0
     scores = np.where(np.isnan(scores), np.inf, scores)
-    return max(1.0, float(np.sort(scores)[min(math.ceil((len(scores) + 1) * (1.0 - outside)), len(scores)) - 1]))
+    return max(1.0, float(np.sort(scores)[_rank(len(scores), outside) - 1]))

@@ -306,10 +306,24 @@ def test_each_kind_of_driving_has_its_share_outside_and_only_starts_have_a_facto
     first[-1] = 1.2
     at = np.arange(len(plan))
     kinds = {START: at >= 3100, "rare": (at >= 3000) & (at < 3100), JUMPING: at == 7}
-    factors = SetFactors.of(plan, first, kinds, 0.001)
-    assert (factors.plan, factors.first, factors.start) == (2.0, 1.0, 1.5)
-    assert factors.shares(plan, first, kinds).max() == 1.0
-    assert SetFactors.of(plan, first, kinds, 0.05).plan == 2.0  # of the hundred rare ones, five may be outside
+    factors = SetFactors.of(plan[None], first, kinds, 0.001)
+    assert (*factors.plan, factors.first, factors.start) == (2.0, 1.0, 1.5)
+    assert factors.shares(plan[None], first, kinds).max() == 1.0
+    assert SetFactors.of(plan[None], first, kinds, 0.05).plan == 2.0  # of the hundred rare ones, five may be outside
+
+
+def test_a_kind_of_driving_that_leaves_by_one_coordinate_widens_that_one_alone():
+    rng, at = np.random.default_rng(0), np.arange(4000)
+    plan, rare = rng.uniform(0.0, 1.5, (3, 4000)), (at >= 3000) & (at < 3500)
+    plan[1, 3000:3008] = 6.0
+    kinds = {START: at < 0, JUMPING: at < 0, "rare": rare}
+    for outside in (0.003, 0.01):
+        factors = SetFactors.of(plan, np.zeros(4000), kinds, outside)
+        assert factors.plan[[0, 2]].max() <= 1.5 and factors.plan[1] == 6.0
+        used = factors.shares(plan, np.zeros(4000), kinds)
+        assert (used > 1.0).mean() <= outside and (used[rare] > 1.0).mean() <= outside
+    assert SetFactors.of(plan, np.zeros(4000), kinds, 0.02).plan[1] < 1.5, "eight of five hundred may be outside"
+    assert SetFactors.of(plan, np.zeros(4000), kinds, 0.003, same=True).plan.tolist() == [6.0] * 3
 
 
 def test_pieces_of_a_recording_with_many_gaps_are_no_starts_of_their_own():
@@ -318,8 +332,8 @@ def test_pieces_of_a_recording_with_many_gaps_are_no_starts_of_their_own():
     plan[::10] = 2.0
     for starts, expected in ((3000, (2.0, 1.0)), (1000, (2.0, 1.0)), (700, (1.0, 2.0))):
         plan[at >= starts] = 0.5
-        factors = SetFactors.of(plan, plan, {START: at < starts, JUMPING: at < 0}, 0.001)
-        assert (factors.plan, factors.start) == expected and factors.first == factors.plan
+        factors = SetFactors.of(plan[None], plan, {START: at < starts, JUMPING: at < 0}, 0.001)
+        assert (*factors.plan, factors.start) == expected and factors.first == factors.plan
 
 
 def test_an_error_that_is_no_number_counts_as_outside():
@@ -328,8 +342,8 @@ def test_an_error_that_is_no_number_counts_as_outside():
     first = np.full(2000, 0.5)
     kinds = {START: np.arange(2000) < 50, JUMPING: np.zeros(2000, dtype=bool)}
     for place in (7, 1400):
-        plan = np.full(2000, 2.0)
-        plan[place] = np.nan
+        plan = np.full((1, 2000), 2.0)
+        plan[0, place] = np.nan
         factors = SetFactors.of(plan, first, kinds, 0.01)
         assert factors.plan == 2.0 and np.flatnonzero(factors.shares(plan, first, kinds) > 1.0).tolist() == [place]
         assert max(SetFactors.of(plan, first, kinds, 0.0).plan, SetFactors.of(plan, first, kinds, 0.0).start) == np.inf
@@ -343,8 +357,8 @@ def test_an_error_that_is_no_number_counts_as_outside():
 
 
 def test_inputs_that_jump_widen_the_set_of_the_next_state_but_not_those_of_plans():
-    plan, first = np.full(3000, 0.5), np.full(3000, 0.9)
-    plan[7] = first[7] = 4.0
+    plan, first = np.full((1, 3000), 0.5), np.full(3000, 0.9)
+    plan[0, 7] = first[7] = 4.0
     at = np.arange(3000)
     factors = SetFactors.of(plan, first, {START: at < 3, JUMPING: at == 7}, 0.001)
-    assert (factors.plan, factors.first, factors.start) == (1.0, 4.0, 1.0)
+    assert (*factors.plan, factors.first, factors.start) == (1.0, 4.0, 1.0)
