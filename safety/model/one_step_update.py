@@ -17,7 +17,7 @@ from brakeline.errors import ErrorBoundError
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.calibration_samples import Samples, samples_of
 from brakeline.safety.model.dataset import Dataset
-from brakeline.safety.model.driving_kinds import driving_kinds
+from brakeline.safety.model.driving_kinds import JUMPING, driving_kinds
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.fitting import stopping_distance_of_stops
 from brakeline.safety.model.model_set import ModelSet
@@ -125,6 +125,7 @@ def update_one_step(in_use: ModelSet, data: Dataset, outside: float) -> tuple[Mo
         raise ErrorBoundError("only a model set of mode one-step can be updated")
     s = samples_of(data.joined())
     correction, kinds = Correction.of(robot, before, s), driving_kinds(robot, s.z, s.start)
+    kinds[JUMPING] = np.zeros(len(s.z), dtype=bool)  # the shape was fitted without them, and the robot drives like that
     chords = in_use.chord_deviations.half_widths(s.z)[..., None]
     widths = np.concatenate([np.stack([step.half_widths(s.z) for step in in_use.steps], 1), chords], axis=2)
     choices = product(OLD_WEIGHTS, (False, True))
