@@ -184,8 +184,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         """Return the attributes for a copy. Raises TypeError: a copied simulation would not go on as this one."""
         if self._vehicle is not None:
             raise TypeError(
-                "an environment whose episode has begun cannot be copied: copy it before the first reset, or make another "
-                'and repeat the episode by reset(options={"episode_seed": info["episode_seed"]}) and its actions'
+                "an environment whose episode has begun cannot be copied: copy it before the first reset, or make "
+                'another and repeat the episode by reset(options={"episode_seed": info["episode_seed"]}) and its actions'
             )
         return self.__dict__
 
