@@ -185,7 +185,7 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
         if self._vehicle is not None:
             raise TypeError(
                 "an environment whose episode has begun cannot be copied: copy it before the first reset, or make "
-                'another and repeat the episode by reset(options={"episode_seed": info["episode_seed"]}) and its actions'
+                'another and repeat the episode by reset(options={"episode_seed": ...}) and its actions'
             )
         return self.__dict__
 
