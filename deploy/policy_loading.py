@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.quantity_names import column_names
-from brakeline.errors import BadWeights, NoSource
+from brakeline.errors import BadInput, BadWeights, NoSource, UnknownTask
 from brakeline.messaging.policy_weights import MLP, POLICY
 from brakeline.messaging.task import RobotWithTask
+from brakeline.messaging.task_code import load_code
 from brakeline.sim.scripted_policies import Policy, scripted
 
 UNTRAINED, TRAINED = "untrained", "trained"
@@ -25,19 +26,55 @@ def policy_named(name: str, robot: RobotWithTask, seed: int) -> Policy:
 
     Args:
         name: a scripted policy, a stored one (`trained` and others in policies/, or beside the task file), `untrained`,
-            the folder of a run, a weights file, or a CSV file of inputs as `brakeline excite` prints them.
+            the folder of a run, a weights file, `FILE.py:CLASS` for code of your own, or a CSV file of inputs as
+            `brakeline excite` prints them.
         seed: of scripted and untrained policies.
 
     Raises:
         ValueError: there is no such name or file.
         BadWeights: the file is no policy of this robot.
+        UnknownTask: the code cannot be loaded, or makes no policy.
     """
     policies = robot.task.policies
     if name in policies:
         return scripted(name, robot, np.random.default_rng(seed))
+    if is_own_code(name):
+        return _own_policy(name, robot, np.random.default_rng(seed))
     if name.endswith(".csv"):
         return replayed(Path(name), robot)
     return driving(network_named(name, robot, seed))
+
+
+def is_own_code(name: str) -> bool:
+    """Return whether a policy's name is a place in a Python file: `FILE.py:CLASS`."""
+    return ".py:" in name
+
+
+def _own_policy(place: str, robot: RobotWithTask, generator: np.random.Generator) -> Policy:
+    """Return the object that a class in a Python file makes for this robot, as a policy. Raises UnknownTask.
+
+    The policy raises BadInput if the object returns anything but an input.
+    """
+    make = load_code(place, Path())
+    try:
+        policy: Policy = make(robot, generator)
+    except TypeError as error:
+        raise UnknownTask(
+            f"{place} cannot be called with (robot, generator), as a policy's class is: {error}"
+        ) from error
+    if not callable(policy):
+        raise UnknownTask(f"an object of {place} cannot be called with (observation, info): define __call__")
+
+    def checked(observation: NDArray[np.float32], info: dict[str, Any]) -> NDArray[np.float64]:
+        action = np.asarray(policy(observation, info), dtype=float)
+        if action.shape != (robot.action_dim,):
+            inputs = ", ".join(robot.action)
+            raise BadInput(
+                f"{place} returned an array of shape {action.shape}: return {robot.action_dim} numbers ({inputs})"
+            )
+        return action
+
+    return checked
 
 
 def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
@@ -53,8 +90,8 @@ def network_named(name: str, robot: RobotWithTask, seed: int) -> MLP:
     if not path.is_file():
         names = ", ".join([*sorted(stored), UNTRAINED, *robot.task.policies])
         raise ValueError(
-            f"no policy is called {name!r} and no such file exists; there are: {names}, or the path of a weights file "
-            "or of a run's folder"
+            f"no policy is called {name!r} and no such file exists; there are: {names}, or the path of a weights file, "
+            "of a run's folder, or FILE.py:CLASS"
         )
     if robot.late:
         with suppress(BadWeights):  # the weights may be of a training in lockstep

@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from brakeline.errors import BadRequest, BusError, TooLoose
+from brakeline.errors import BadRequest, BusError, Mismatch, TooLoose
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import percent
@@ -107,6 +107,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._now: tuple[Any, dict[str, Any]] | None = None
         self._memory = memory_of(self.client.robot)
         self._scan: RangeMeasurement | None = None
+        self._plan: Any = None  # the plan that this wrapper committed to last
 
     @classmethod
     def load(cls, env: gymnasium.Env[Any, Any], model: Path | str, penalty: float = 0.0, **how: Any) -> Self:
@@ -128,6 +129,7 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._now = self.env.reset(seed=seed, options=options)
         self.client.reset()
+        self._plan = self.backup_plan.plan
         self._memory.reset()
         self._remember()
         return self._now
@@ -135,10 +137,14 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._now is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
+        if self.backup_plan.plan is not self._plan:
+            raise Mismatch(
+                "another environment uses this client, which has the backup plan of one robot: make one for each"
+            )
         before = self.backup_plan.next_input
         proposed = np.asarray(self._actions.action_to_control(action), dtype=float)
         answer, reason = self._decide(proposed)
-        executed = self.backup_plan.next_input
+        executed, self._plan = self.backup_plan.next_input, self.backup_plan.plan
         safe_action = cast_action(self._actions.control_to_action(executed), self.env.action_space)
         observation, reward, terminated, truncated, info = self.env.step(safe_action)
         if (record := getattr(self.client, "record_outcome", None)) is not None:  # of a `RecordedClient`

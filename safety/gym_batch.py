@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from brakeline.errors import Mismatch
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
 
@@ -23,7 +24,8 @@ class BatchSafetyWrapper(VectorWrapper):
     """Replaces the actions of N robots by the filter's decisions on them, and subtracts penalties from the rewards.
 
     The environment gives `infos["state"]` (N, n) and `infos["obstacles"]`, a dict of the arrays of `ObstacleArrays`,
-    as `brakeline.sim.batch.batch_env.BatchNavigationEnv` does. `VectorSafetyWrapper` takes every other environment.
+    and the methods `begin_step(inputs)` and `end_step()` as `brakeline.sim.batch.batch_env.BatchNavigationEnv` does.
+    `VectorSafetyWrapper` takes every other environment. Put other wrappers around this one, not inside it.
 
     `step` adds to `infos`: `outcome` (a `BatchOutcome`), `executed` (N, m), `penalty` (N,), and `compared` and
     `contained` (N,): whether the filter predicted the new state, and whether the state is in that set.
@@ -40,11 +42,18 @@ class BatchSafetyWrapper(VectorWrapper):
         """Wrap an environment; see `SafetyWrapper` for the arguments. `RowByRow` makes a filter of a rival.
 
         Raises:
+            Mismatch: the environment has no `begin_step` and `end_step`, or other wrappers around it.
             TooLoose: the validation report states a larger probability than accepted, or there is no report.
             ValueError: batches do not decide for this kind of robot.
         """
         from brakeline.safety.model.stated_bound import check_bound
 
+        if not hasattr(env.unwrapped, "begin_step"):
+            raise Mismatch(f"{env} has no begin_step and end_step: give it to VectorSafetyWrapper")
+        if env is not env.unwrapped:
+            raise Mismatch(
+                f"BatchSafetyWrapper steps {env.unwrapped} itself, past {env}: put it inside all other wrappers"
+            )
         super().__init__(env)
         check_bound(getattr(filter, "model", None), filter.robot, accept_bound)
         self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs, turn_aside), penalty

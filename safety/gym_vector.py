@@ -33,7 +33,7 @@ class VectorSafetyWrapper(VectorWrapper):
     The arguments are those of `SafetyWrapper` for k environments: `state(env, observations, infos)` returns (k, n),
     `obstacles` returns k lists, and `actions` maps (k, m). `step` adds to `infos`: `safety` (k answers; None for an
     environment that is reset in this step, or whose state is missing or not usable), `penalty` (k,) and `diagnostics`
-    (a dict of k values each).
+    (a dict of k values each; of a reset environment, the inputs say nothing).
     """
 
     def __init__(
@@ -102,7 +102,8 @@ class VectorSafetyWrapper(VectorWrapper):
         infos = infos | {
             "safety": safety,
             "penalty": penalty,
-            "diagnostics": {name: np.array([row[name] for row in figures]) for name in figures[0]},
+            "diagnostics": {name: np.array([row[name] for row in figures]) for name in figures[0]}
+            | {"proposed": proposed, "executed": executed},
         }
         self._now = observations, infos
         return observations, np.asarray(rewards) - penalty, terminated, truncated, infos
@@ -161,6 +162,8 @@ class VectorSafetyWrapper(VectorWrapper):
         assert self._now is not None
         states = self._state(self.env, *self._now)
         near = self._obstacles(self.env, *self._now) if self.client.robot.position_dim else [None] * self.num_envs
+        if isinstance(near, dict):
+            raise Mismatch("the obstacles are arrays, not a list for each environment: use BatchSafetyWrapper")
         near = [] if near is None else near
         if not len(near) and all(scan is not None for scan in self._scans):  # the scans alone show free space
             near = [None] * self.num_envs

@@ -180,6 +180,15 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             raise gymnasium.error.ResetNeeded("call reset() before step() and render()")
         return self._vehicle
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy. Raises TypeError: a copied simulation would not go on as this one."""
+        if self._vehicle is not None:
+            raise TypeError(
+                "an environment whose episode has begun cannot be copied: copy it before the first reset, or make "
+                'another and repeat the episode by reset(options={"episode_seed": ...}) and its actions'
+            )
+        return self.__dict__
+
     def alter(self, **changes: float) -> None:
         """Change the vehicle's physics in this and all later episodes (`Vehicle.alter`)."""
         self._changes |= changes

@@ -135,13 +135,18 @@ class CampaignCommand:
         """Check the names of a cell, make the model set that it needs, and note the versions of all files."""
         from brakeline.deploy.data.model_store import method_for
         from brakeline.deploy.experiments.experiment_jobs import task_hash
-        from brakeline.deploy.policy_loading import policy_hash, policy_named
+        from brakeline.deploy.policy_loading import is_own_code, policy_hash, policy_named
         from brakeline.messaging.task import arena_kind
 
         arena_kind(robot, cell.arena)
         if cell.policy.endswith(".csv"):
             raise ValueError(
                 f"{cell.policy}: written inputs are one sequence, but a campaign's episodes are independent"
+            )
+        if is_own_code(cell.policy):
+            raise ValueError(
+                f"{cell.policy}: a campaign goes on later, and cannot see whether the files that your code reads have "
+                "changed: drive it with `brakeline evaluate`"
             )
         policy_named(cell.policy, robot, 0)
         what, model = cell.evaluation(), ""

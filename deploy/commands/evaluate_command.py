@@ -23,8 +23,8 @@ class EvaluateCommand:
     robot: options.Robot = "ground"
     policy: str = "astar"
     """Evaluate this policy: trained, trained-by-scan (both stored in policies/), untrained, random, greedy, adversary,
-    astar, careful (astar far from obstacles), the folder of a run, a weights file, or a CSV file of inputs as
-    `brakeline excite` prints them."""
+    astar, careful (astar far from obstacles), the folder of a run, a weights file, FILE.py:CLASS, or a CSV
+    file of inputs as `brakeline excite` prints them."""
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     arena: options.ArenaName = "default"

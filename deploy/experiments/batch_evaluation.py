@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from brakeline.actors.episode_runner import EPISODE_STRIDE
 from brakeline.deploy.batch_robots import BatchRobots
 from brakeline.deploy.data.model_store import method_for
-from brakeline.deploy.policy_loading import network_named
+from brakeline.deploy.policy_loading import is_own_code, network_named
 from brakeline.errors import NoBatch
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.policy_weights import MLP
@@ -109,8 +109,9 @@ def batch_filter(robot: RobotWithTask, evaluation: Evaluation) -> BatchMethod | 
     """Return what decides, or None for the method `none`. Raises NoBatch if no batch has this policy or fleet."""
     if evaluation.fleet:
         raise NoBatch(f"robots of a fleet see each other, which no batch simulates: {ONE_BY_ONE}")
-    if evaluation.policy in robot.task.policies or evaluation.policy.endswith(".csv"):
-        raise NoBatch(f"a batch is driven by a network, not by {evaluation.policy}: {ONE_BY_ONE}")
+    name = evaluation.policy
+    if name in robot.task.policies or name.endswith(".csv") or is_own_code(name):
+        raise NoBatch(f"a batch is driven by a network, not by {name}: {ONE_BY_ONE}")
     if evaluation.method == "none":
         return None
     return batch_method(method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound))

@@ -19,8 +19,9 @@ from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner
 from brakeline.deploy.data.model_store import method_for
 from brakeline.deploy.experiments.batch_evaluation import batch_filter, drive_batch
+from brakeline.deploy.experiments.episode_table import COLUMNS, Column, EpisodeTable
 from brakeline.deploy.experiments.evaluate import FRESH, Evaluation, in_process
-from brakeline.deploy.experiments.trials import COLUMNS, Column, EpisodeTable, TrialLog, take_step
+from brakeline.deploy.experiments.trials import TrialLog, take_step
 from brakeline.deploy.policy_loading import network_named
 from brakeline.deploy.vehicle_factory import environment
 from brakeline.errors import NoBatch

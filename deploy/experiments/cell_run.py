@@ -23,9 +23,10 @@ from brakeline.deploy.experiments.comparison_cells import (
     Report,
     TrialConfig,
 )
+from brakeline.deploy.experiments.episode_table import EpisodeTable
 from brakeline.deploy.experiments.evaluate import FRESH, in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration
-from brakeline.deploy.experiments.trials import EpisodeTable, TrialLog, run_trial, train_in_lockstep
+from brakeline.deploy.experiments.trials import TrialLog, run_trial, train_in_lockstep
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED, driving, network_named
 from brakeline.deploy.run.batch_trainer import BatchTrainer
 from brakeline.deploy.vehicle_factory import environment

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.experiments.bootstrap import MeanEstimate, mean, rate, ratio
 from brakeline.deploy.experiments.compared_methods import METHODS, NONE
-from brakeline.deploy.experiments.trials import CONTACTS
+from brakeline.deploy.experiments.episode_table import CONTACTS
 from brakeline.deploy.policy_loading import TRAINED, UNTRAINED
 from brakeline.messaging.robot import Array
 from brakeline.safety.model.model_config import DDPC

@@ -16,9 +16,10 @@ from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.data_paths import record_path
 from brakeline.deploy.data.simulated_recording import load_or_record
 from brakeline.deploy.experiments.comparison_table import markdown_table
+from brakeline.deploy.experiments.episode_table import EpisodeTable
 from brakeline.deploy.experiments.evaluate import in_process
 from brakeline.deploy.experiments.experiment_jobs import configuration, result_path, stored_result
-from brakeline.deploy.experiments.trials import EpisodeTable, fresh_trial
+from brakeline.deploy.experiments.trials import fresh_trial
 from brakeline.errors import BadData, ErrorBoundError, ResultError
 from brakeline.messaging.stated_share import percent
 from brakeline.messaging.task import arena_kind, robot_with_task

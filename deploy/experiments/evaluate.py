@@ -12,6 +12,7 @@ from typing import Any, Literal
 from brakeline.actors.decision_guard import Ask
 from brakeline.actors.episode_runner import ActorIdentity, EpisodeRunner, RobotGroup, run_episode
 from brakeline.deploy.data.model_store import method_for
+from brakeline.deploy.experiments.episode_table import COLUMNS, EpisodeTable
 from brakeline.deploy.experiments.task_engine import Engine, Say, unsaid
 from brakeline.deploy.policy_loading import file_named, policy_named
 from brakeline.deploy.run.run_config import SEEDS
@@ -32,6 +33,7 @@ FRESH = SEEDS  # added to the seed, so that no training run has the same episode
 EPISODES_A_PART = 100  # a part of an evaluation, which another process may run
 EPISODES_OF_A_BATCH = 1000  # the same for a batch, which waits for its last episodes at the end of a part
 POLICY_SEEDS = 1_000  # from an episode's number to the seed of a scripted policy
+ROWS = {name: column for name, column in COLUMNS.items() if name != "milliseconds"}  # of each episode; times differ
 
 AfterEpisode = Callable[[EpisodeStats], Any]
 Backend = Literal["single", "batch"]
@@ -140,11 +142,13 @@ class DrivenEpisodes:
         stats: statistics by actor.
         periods: control periods.
         touches: contacts between two robots, for any reason.
+        rows: figures of each episode by name, in the order in which the episodes began (`EpisodeTable.columns`).
     """
 
     stats: dict[str, EpisodeStats]
     periods: int
     touches: int
+    rows: dict[str, list[float]]
 
 
 @dataclass(frozen=True)
@@ -192,28 +196,32 @@ class EvaluationPart:
         else:
             driver, policy, question = prepare_evaluation(robot, evaluation, self.first)
             group, policies = RobotGroup([driver]), [policy]
-        stats, periods = {runner.identity.actor: EpisodeStats() for runner in group.runners}, 0
+        stats, table = {runner.identity.actor: EpisodeStats() for runner in group.runners}, EpisodeTable(ROWS)
+        periods = 0
         for number in range(self.first, self.first + self.rounds):
             for steps in run_episode(group, policies, question, number):
                 periods += 1
                 for step in steps:
                     stats[step.actor].step(step)
+                    table.step(step)
             for actor in stats.values():
                 after_episode(actor)
-        return DrivenEpisodes(stats, periods, 0 if world is None else world.touches)
+        return DrivenEpisodes(stats, periods, 0 if world is None else world.touches, table.columns())
 
     def _drive_batch(self, after_episode: AfterEpisode) -> DrivenEpisodes:
         from brakeline.deploy.experiments.batch_evaluation import drive_batch
 
         stats: defaultdict[str, EpisodeStats] = defaultdict(EpisodeStats)
+        table = EpisodeTable(ROWS)
 
         def take(step: pb.Step) -> None:
             stats[step.actor].step(step)
+            table.step(step)
             if step.terminated or step.truncated:
                 after_episode(stats[step.actor])
 
         drive_batch(self.robot_with_task, self.evaluation, self.first, self.rounds, take)
-        return DrivenEpisodes(dict(stats), sum(one.steps for one in stats.values()), 0)
+        return DrivenEpisodes(dict(stats), sum(one.steps for one in stats.values()), 0, table.columns())
 
 
 def progress_line(stats: EpisodeStats) -> str:
@@ -241,6 +249,8 @@ def evaluate(
     robot: RobotWithTask, evaluation: Evaluation, after_episode: AfterEpisode = lambda stats: None
 ) -> dict[str, Any]:
     """Run `evaluation.episodes` episodes in this process, and return their closed-loop metrics.
+
+    `by_episode` has a list for each figure of `ROWS`, in the order of the episodes. A fleet has none.
 
     The metrics of a fleet are also given by kind, by robot, and for its worlds. The function calls
     `after_episode` after every episode with the statistics of its part (`parts_of`) so far.
@@ -276,6 +286,8 @@ def _figures(robot: RobotWithTask, evaluation: Evaluation, parts: Sequence[Drive
                 "goals_per_minute": 60.0 * figures["goals"] / seconds if seconds else None,
             },
         }
+    else:
+        figures["by_episode"] = {name: [value for part in parts for value in part.rows[name]] for name in ROWS}
     filtered = evaluation.method == DDPC
     return figures | {
         "method": evaluation.method,

@@ -1,9 +1,10 @@
-"""A policy by the folder of the run that trained it."""
+"""A policy by the folder of the run that trained it, and by a class in a file of your own."""
 
 import numpy as np
 import pytest
 
-from brakeline.deploy.policy_loading import file_named, network_named, policy_hash
+from brakeline.deploy.policy_loading import file_named, network_named, policy_hash, policy_named
+from brakeline.errors import BadInput, UnknownTask
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
 
@@ -24,3 +25,54 @@ def test_the_folder_of_a_run_stands_for_its_policy(tmp_path, learner):
 def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no policy of ground: name the folder of a training"):
         network_named(str(tmp_path), GROUND, 0)
+
+
+AGENT = """
+class Agent:
+    def __init__(self, robot, generator):
+        self.input = 0.5 * robot.high() + generator.uniform(0.0, 1e-3, robot.action_dim)
+
+    def __call__(self, observation, info):
+        return self.input
+
+class Alone:
+    pass
+
+class Silent:
+    def __init__(self, robot, generator):
+        pass
+"""
+
+
+def test_a_class_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
+    (tmp_path / "agent.py").write_text(AGENT)
+    monkeypatch.chdir(tmp_path)
+    first, again, other = (
+        policy_named(name, GROUND, seed)(None, {})
+        for name, seed in (("agent.py:Agent", 3), (f"{tmp_path}/agent.py:Agent", 3), ("agent.py:Agent", 4))
+    )
+    assert np.allclose(first, 0.5 * GROUND.high(), atol=1e-3)
+    assert np.array_equal(first, again) and not np.array_equal(first, other), "the seed decides"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("agent.py:Alone", r"cannot be called with \(robot, generator\)"),
+        ("agent.py:Silent", "define __call__"),
+        ("agent.py:Nobody", "no code that can be loaded"),
+        ("gone.py:Agent", "no code that can be loaded"),
+    ],
+)
+def test_code_that_makes_no_policy_is_refused(tmp_path, monkeypatch, name, said):
+    (tmp_path / "agent.py").write_text(AGENT)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UnknownTask, match=said):
+        policy_named(name, GROUND, 0)
+
+
+def test_anything_but_an_input_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "agent.py").write_text(AGENT.replace("return self.input", "return [*self.input, 0.0]"))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInput, match=r"shape \(3,\): return 2 numbers \(speed \[m/s\], turn rate \[rad/s\]\)"):
+        policy_named("agent.py:Agent", GROUND, 0)(None, {})

@@ -201,6 +201,10 @@ def test_a_vector_decides_as_its_environments_do_alone(ready, mode):
             assert np.array_equal(infos["safety"][i].plan, decision.plan)
             assert rewards[i] == -infos["penalty"][i]
         assert [one is None for one in infos["safety"]] == resets.tolist()
+        executed, proposed = (infos["diagnostics"][name] for name in ("executed", "proposed"))
+        assert np.array_equal(proposed, normalised(CAR).action_to_control(actions))
+        for i, decision in wanted:
+            assert np.array_equal(executed[i], decision.action)
         ended = terminated | truncated
         if mode == gymnasium.vector.AutoresetMode.DISABLED and ended.any():
             observations, _ = many.reset(options={"reset_mask": ended})
@@ -221,6 +225,19 @@ def test_a_wrapped_environment_passes_the_check_of_gymnasium(name):
     assert env.spec.make().penalty == 1.0
     with pytest.raises(TypeError, match="filter"):  # two robots must not share a backup plan
         SafetyWrapper(gymnasium.make(name), InProcess(ready)).spec.make()
+
+
+def test_two_environments_never_share_a_client(ready):
+    """It has one backup plan: with that of the other robot, each would stand before no obstacle, without a word."""
+    client = InProcess(ready, accept_bound=1.0)
+    first, second = (SafetyWrapper(Toy(CAR), client, **HOW) for _ in range(2))
+    for env in (first, second, first):  # one after the other is allowed
+        env.reset(seed=0)
+        env.step(np.ones(2, np.float32))
+    second.reset(seed=0)
+    with pytest.raises(Mismatch, match="another environment uses this client"):
+        first.step(np.ones(2, np.float32))
+    second.step(np.ones(2, np.float32))
 
 
 class Faulty(Toy):
@@ -353,6 +370,12 @@ def test_an_empty_list_means_free_space_and_none_means_unknown_space(ready, many
     assert np.all(stepped([]) == "allowed")
     with pytest.raises(BadRequest, match="known_free"):
         stepped(None)
+
+
+def test_a_vector_with_obstacles_as_arrays_is_sent_to_its_wrapper(ready):
+    env = wrapped(Toy(CAR), ready, many=True, obstacles=lambda *_: {"centers": np.zeros((1, 0, 2))}, **SCANNED)
+    with pytest.raises(Mismatch, match="use BatchSafetyWrapper"):
+        env.step(np.ones((1, 2), np.float32))
 
 
 def test_a_missing_scan_frees_nothing(ready):

@@ -3,11 +3,13 @@
 import math
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from brakeline.errors import BadRequest
+from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.robot import robot_named
 from brakeline.messaging.task import robot_with_task
@@ -21,6 +23,7 @@ from brakeline.safety.filter.widening import WINDOWS, Widening
 from brakeline.safety.gym_batch import BatchSafetyWrapper
 from brakeline.safety.service.in_process import InProcess
 from brakeline.sim.batch.batch_env import BatchNavigationEnv
+from brakeline.sim.navigation_env import NavigationEnv
 from tests.safety.test_batch import one_step
 
 GROUND = robot_with_task("ground")
@@ -184,3 +187,14 @@ def test_a_step_that_resets_a_robot_compares_and_costs_nothing() -> None:
     env.step(np.tile([0.2, 0.0], (8, 1)))
     assert env.plans.input_in_force[:, 0].all(), "no robot is reset again"
     env.close()
+
+
+def test_the_wrapper_refuses_an_environment_whose_steps_it_would_bypass() -> None:
+    """It steps the innermost environment itself, so a wrapper inside it would see resets, and no steps."""
+    env = BatchNavigationEnv(GROUND, 2)
+    with pytest.raises(Mismatch, match="inside all other wrappers"):
+        BatchSafetyWrapper(RecordEpisodeStatistics(env), SAFETY)
+    RecordEpisodeStatistics(BatchSafetyWrapper(env, SAFETY)).close()
+    vector = gymnasium.vector.SyncVectorEnv([lambda: NavigationEnv(GROUND)])
+    with pytest.raises(Mismatch, match="VectorSafetyWrapper"):
+        BatchSafetyWrapper(vector, SAFETY)

@@ -236,7 +236,8 @@ def test_steps_outside_their_sets_are_counted_and_not_logged_one_by_one(tmp_path
     ("change", "said"),
     [({"perturbations": ("earthquake",)}, "no perturbation"), ({"model_sets": ("hope",)}, "no model set"),
      ({"arenas": ("moon",)}, "moon"), ({"policies": ("nobody",)}, "nobody"),
-     ({"policies": ("inputs.csv",)}, "written inputs"), ({"policies": ("random", "random")}, "would hold two results")],
+     ({"policies": ("inputs.csv",)}, "written inputs"), ({"policies": ("agent.py:Agent",)}, "brakeline evaluate"),
+     ({"policies": ("random", "random")}, "would hold two results")],
 )  # fmt: skip
 def test_a_mistyped_name_ends_it_before_it_begins(data_folder, tmp_path, change, said):
     with pytest.raises(ValueError, match=said):

@@ -39,11 +39,11 @@ from brakeline.deploy.experiments.comparison_table import (
     written,
 )
 from brakeline.deploy.experiments.conservatism import Conservatism
+from brakeline.deploy.experiments.episode_table import EpisodeTable
 from brakeline.deploy.experiments.experiment_jobs import configuration, result_path, task_hash, write
 from brakeline.deploy.experiments.experiment_jobs import read as read_result
 from brakeline.deploy.experiments.stored_cells import stored_cells
 from brakeline.deploy.experiments.task_engine import Engine
-from brakeline.deploy.experiments.trials import EpisodeTable
 from brakeline.deploy.experiments.tuning_trials import tuning_jobs, values_of
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import ResultError

@@ -27,6 +27,13 @@ def test_the_figures_are_those_of_one_robot_after_the_other(data_folder, method)
     assert batch["closest_approach"] == pytest.approx(single["closest_approach"], abs=1e-3)
     assert (batch["collisions"] > 0) == (method == "none"), "what the filter prevents"
     assert batch["containment"]["steps"] == (batch["steps"] if method == "ddpc" else 0)
+    for figures in (single, batch):
+        rows = figures["by_episode"]
+        assert {len(column) for column in rows.values()} == {6}
+        assert sum(rows["goal"]) == figures["goals"] and sum(rows["steps"]) == figures["steps"]
+        assert sum(rows["interventions"]) == figures["interventions"]
+    assert batch["by_episode"]["goal"] == single["by_episode"]["goal"], "the same episodes in the same order"
+    assert batch["by_episode"]["steps"] == pytest.approx(single["by_episode"]["steps"], abs=2)
 
 
 def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeypatch):
@@ -46,6 +53,7 @@ def test_each_episode_counts_once_however_many_robots_drive(data_folder, monkeyp
     ("change", "said"),
     [
         ({"policy": "astar", "backend": "batch"}, "driven by a network"),
+        ({"policy": "agent.py:Agent", "backend": "batch"}, "driven by a network"),
         ({"fleet": 3, "backend": "batch"}, "robots of a fleet"),
         ({"arena": "walkers", "method": "none", "backend": "batch"}, "moving obstacles"),
         ({"arena": "crossing", "method": "secas", "fleet": 2}, "reserves no space"),
