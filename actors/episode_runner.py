@@ -29,7 +29,7 @@ from brakeline.sim.scripted_policies import Policy
 
 StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # the result of an environment's `step`
 EPISODE_STRIDE = 4096  # robots of one run never share a seed: seed = episode * stride + number of the robot
-COPIED = (  # values of `info` that a step records under the same name
+INFO_FIELDS = (  # values of `info` that a step records under the same name
     *("collision", "contact_moving", "contact_standing", "contact_robot"),
     *("speed", "clearance", "closest", "outside", "turned"),
 )
@@ -239,7 +239,7 @@ class EpisodeRunner:
             path=info["subsamples"].ravel().tolist(),
             weights_version=weights_version,
             acceleration_age=self.backup_plan.acceleration_age,
-            **{name: info[name] for name in COPIED},
+            **{name: info[name] for name in INFO_FIELDS},
         )
         step.header.time = info["time"]
         self.step += 1

@@ -12,7 +12,7 @@ from brakeline.errors import Implausible
 from brakeline.logs.arena_view import arena_view
 from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
-from brakeline.logs.episode_view import letter
+from brakeline.logs.episode_view import decision_letter
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
@@ -70,6 +70,7 @@ class RobotPanel:
         }
 
     def begin(self, episode: pb.Episode) -> None:
+        """Show the arena of a new episode, and clear what belonged to the one before."""
         self.reward, self._steps, self._interventions, self._still = 0.0, 0, 0, 0
         self._trail.clear()
         self._anchor = []
@@ -130,7 +131,7 @@ class RobotPanel:
             "first": steps[0].step if steps else 0,
             "path": path,
             "heading": None if robot.heading is None else [state[robot.heading] for state in states],
-            "kinds": "".join(map(letter, steps)),
+            "kinds": "".join(map(decision_letter, steps)),
             "clearance": [step.clearance for step in steps],
         }
 
