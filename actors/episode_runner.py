@@ -1,7 +1,7 @@
 """The loop of every robot: observe, propose, ask the safety service, act, and record the step.
 
 An `EpisodeRunner` holds one robot between its resets. A `RobotGroup` holds the robots whose time passes together: one
-robot, or a fleet in a shared world. `decide` asks one question about all robots of some groups. `run_episode` is the
+robot, or a fleet in a shared world. `decide` sends one query about all robots of some groups. `run_episode` is the
 whole loop without a bus; `brakeline.actors.actor_process` is the same loop with a learner and publishers.
 """
 
@@ -334,7 +334,7 @@ class RobotGroup:
 def decide(
     groups: Sequence[RobotGroup], proposals: Sequence[Sequence[Array]], ask: Ask | None
 ) -> list[list[DecisionOutcome | None]]:
-    """Ask one question about all robots of groups of one kind.
+    """Send one query about all robots of groups of one kind.
 
     Args:
         proposals: the proposal (m,) of each robot of each group.
