@@ -134,7 +134,7 @@ class MavlinkDecoder:
                 self._take(what, place, message)
             self._handle(message)
 
-    def smooth(self, readings: int) -> None:
+    def average_accelerometer(self, readings: int) -> None:
         """Average this many readings of the accelerometer from now on."""
         self._forces = deque(self._forces, readings)
 
