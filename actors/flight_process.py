@@ -323,9 +323,7 @@ def run(
         process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started) | actor.figures())
         process.announce()
         ask = partial(query_service, process.bus, deadline=settings.deadline)
-        if not (
-            actor.join(stop) and takeoff_verified(ask, robot, stages[0], settings.method == "ddpc", stop, age)
-        ):
+        if not (actor.join(stop) and takeoff_verified(ask, robot, stages[0], settings.method == "ddpc", stop, age)):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)
         vehicle = VehicleClient(request, actor.frames.add, process.bus.rejected, stop)

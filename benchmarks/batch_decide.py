@@ -37,10 +37,16 @@ def run() -> Figures:
             for policy in POLICIES:
                 safety_filter, requests = filter_and_requests(name, mode, policy)
                 title = f"{name}, {mode}, {policy}"
-                figures[title] = batch_beside_loop(safety_filter, requests) | decision_differences(safety_filter, requests)
+                figures[title] = batch_beside_loop(safety_filter, requests) | decision_differences(
+                    safety_filter, requests
+                )
                 if mode == ONE_STEP and policy == "trained":
-                    figures |= {f"{title}: batch of {size}": batch_beside_loop(safety_filter, requests[:size]) for size in SIZES}
-                    figures |= {f"{title}: {count} obstacles": row for count, row in by_obstacle_count(safety_filter, requests)}
+                    figures |= {
+                        f"{title}: batch of {size}": batch_beside_loop(safety_filter, requests[:size]) for size in SIZES
+                    }
+                    figures |= {
+                        f"{title}: {count} obstacles": row for count, row in by_obstacle_count(safety_filter, requests)
+                    }
     return figures
 
 
@@ -60,7 +66,9 @@ def batch_beside_loop(safety_filter: Filter, requests: list[Request]) -> dict[st
     times = []
     for _ in range(BLOCKS):
         batch = processor_seconds(lambda: safety_filter.decide_batch(arrays), repeats)
-        times.append((batch, processor_seconds(lambda: [safety_filter.decide(request) for request in requests], repeats)))
+        times.append(
+            (batch, processor_seconds(lambda: [safety_filter.decide(request) for request in requests], repeats))
+        )
     least, ratios = np.min(times, axis=0), np.array([loop / batch for batch, loop in times])
     return {"batch 1/s": len(requests) / least[0], "loop 1/s": len(requests) / least[1], **spread_of(ratios)}
 
@@ -75,7 +83,8 @@ def processor_seconds(call: Callable[[], object], repeats: int) -> float:
 
 def decision_differences(safety_filter: Filter, requests: list[Request]) -> dict[str, float]:
     """Return how the decisions of a batch differ from those of the loop."""
-    answers, single = safety_filter.decide_batch(RequestArrays.of(requests)), [safety_filter.decide(request) for request in requests]
+    answers = safety_filter.decide_batch(RequestArrays.of(requests))
+    single = [safety_filter.decide(request) for request in requests]
     kinds, apart = count_differences(answers, single)
     return {
         "decisions": len(requests),
@@ -104,5 +113,6 @@ def by_obstacle_count(safety_filter: Filter, requests: list[Request]) -> list[tu
             Shapes.of([Obstacle("sphere", tuple(request.state[:d] + way), (0.05,)) for way in own], d)
             for request, own in zip(some, ways, strict=True)
         ]
-        rows.append((count, batch_beside_loop(safety_filter, [replace(r, obstacles=o) for r, o in zip(some, around, strict=True)])))
+        changed = [replace(r, obstacles=o) for r, o in zip(some, around, strict=True)]
+        rows.append((count, batch_beside_loop(safety_filter, changed)))
     return rows

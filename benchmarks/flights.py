@@ -92,8 +92,12 @@ SETUPS = {
     ARDUPILOT_LED: Setup("ardupilot", ARDUPILOT_POSITION_GAINS, ("--lead",)),
     PX4_CAMERAS: Setup("px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True),
     ARDUPILOT_ONCE: Setup("ardupilot", ARDUPILOT_HIGHER_GAINS, outside=0.012),
-    PX4_CAMERAS_ONCE: Setup("px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True, outside=0.005),
-    PX4_CAMERAS_LED: Setup("px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_POSITION_TARGETS}, ("--lead",), cameras=True),
+    PX4_CAMERAS_ONCE: Setup(
+        "px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True, outside=0.005
+    ),
+    PX4_CAMERAS_LED: Setup(
+        "px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_POSITION_TARGETS}, ("--lead",), cameras=True
+    ),
 }
 
 
@@ -236,7 +240,9 @@ class Flights:
             places = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(vehicles)]
             switched = [started_autopilot(self._setup, self._start, place, parameters) for place in places]
             urls, systems = zip(*map(stack.enter_context, switched), strict=True)
-            stack.enter_context(self._in_between(change, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0]))
+            stack.enter_context(
+                self._in_between(change, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0])
+            )
             option = "--system" if vehicles == 1 else "--systems"
             where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
             command = [*words, *self._setup.accepting, *self._setup.words, *where]
@@ -324,4 +330,6 @@ def pair_rows(fly: Callable[[], dict[str, Any]]) -> Words:
     if "failed" in whole:
         return {"two at once": whole}
     both = {name: value for name, value in whole.items() if name not in (*TRUTH_FIGURES, "in time")}
-    return {"two at once": both} | {f"two at once, {actor}": _vehicle_row(flight) for actor, flight in fly()["flights"].items()}
+    return {"two at once": both} | {
+        f"two at once, {actor}": _vehicle_row(flight) for actor, flight in fly()["flights"].items()
+    }

@@ -50,7 +50,9 @@ def run() -> Figures:
         messages = [outcome.request for _, outcome, _ in driven]
         requests = list(situations.requests(safety_filter, messages))
         figures |= _rows(name, "obstacles", by_obstacle_count(safety_filter, requests))
-        figures |= _rows(name, "requests", [(size, batch_beside_loop(safety_filter, requests[:size])) for size in SIZES])
+        figures |= _rows(
+            name, "requests", [(size, batch_beside_loop(safety_filter, requests[:size])) for size in SIZES]
+        )
         figures[f"{name}, robots of a question, the service"] = _together(safety_filter, messages)
         figures[f"{name}, periods of a plan, {SINGLE}"] = {str(n): _of_plans(robot, n) for n in HORIZONS[name]}
     _draw(figures)
@@ -103,7 +105,10 @@ def _of_plans(robot: RobotWithTask, horizon: int) -> float:
     longer, data = replace(robot, **other), part_of(data_for(robot), MINUTES)
     data = replace(data, robot=replace(data.robot, **other))
     safety, _ = certify(data, ModelConfig(mode=DIRECT).of_minutes())
-    safety_filter, drive = Filter(safety), situations.driven_behind(safety, policy_named("trained", robot, 0), 5, longer)
+    safety_filter, drive = (
+        Filter(safety),
+        situations.driven_behind(safety, policy_named("trained", robot, 0), 5, longer),
+    )
     asked = list(situations.requests(safety_filter, [outcome.request for _, outcome, _ in islice(drive, DECISIONS)]))
 
     def work() -> None:

@@ -61,9 +61,7 @@ def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episode
     """
     setting = robot.footprint + value if model.method == SECAS else value
     ask = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    oracle, greedy = (
-        fresh_trial(robot, "default", policy, ask, episodes, SEED_KEY) for policy in (ORACLE, GREEDY)
-    )
+    oracle, greedy = (fresh_trial(robot, "default", policy, ask, episodes, SEED_KEY) for policy in (ORACLE, GREEDY))
     reached, driven = oracle.columns(), greedy.columns()
     return {
         "value": value,

@@ -100,7 +100,9 @@ class StateLimits:
         """
         both = (self.position_weights @ rotation) @ self.position_maps + self.other_maps  # (N, limits, nz + L + 1)
         both = (both if self.start_map is None else np.concatenate([both, self.start_map]))[self.row_periods]
-        bound = self.most - self.position_weights @ start - self.heading_weights * self._nearest(heading) - both[..., -1]
+        bound = (
+            self.most - self.position_weights @ start - self.heading_weights * self._nearest(heading) - both[..., -1]
+        )
         # The chord deviation of every period, and the stopping distance at the last end.
         extra = self.chord_columns[:, None, :] * self.chord_scales[None, :, None]
         gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)

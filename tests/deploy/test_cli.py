@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import re
 import time
 from dataclasses import replace
 from pathlib import Path

@@ -14,7 +14,18 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks import sitl
-from benchmarks.flights import PX4, PX4_CAMERAS, ARDUPILOT_LED, ARDUPILOT, PRACTICE, SETUPS, Flights, ParameterChange, validation_row, flight_row
+from benchmarks.flights import (
+    ARDUPILOT,
+    ARDUPILOT_LED,
+    PRACTICE,
+    PX4,
+    PX4_CAMERAS,
+    SETUPS,
+    Flights,
+    ParameterChange,
+    flight_row,
+    validation_row,
+)
 from benchmarks.timing import Words
 
 BEFORE, AFTER, ADAPTING = 5.0, 3.0, 18.0  # minutes
@@ -28,7 +39,9 @@ LASTING: dict[str, dict[str, ParameterChange]] = {  # by kind of autopilot
     },
     "px4": {"20 % heavier": ParameterChange({"SIH_MASS": 1.2}), "motors at 80 %": ParameterChange({"SIH_T_MAX": 4.0})},
 }
-JUMPS = {"GPS off by 4.4 m for 10 s": ParameterChange({"SIM_GPS_GLITCH_X": JUMP}, 150.0, 160.0, {"SIM_GPS_GLITCH_X": 0.0})}
+JUMPS = {
+    "GPS off by 4.4 m for 10 s": ParameterChange({"SIM_GPS_GLITCH_X": JUMP}, 150.0, 160.0, {"SIM_GPS_GLITCH_X": 0.0})
+}
 PASSING: dict[str, dict[str, ParameterChange]] = {  # by setup
     ARDUPILOT: JUMPS,
     ARDUPILOT_LED: JUMPS,
@@ -50,7 +63,9 @@ def run(folder: Path) -> Words:
     return rows
 
 
-def _changed_flights(flights: Flights, setup: str, lasting: dict[str, ParameterChange], passing: dict[str, ParameterChange]) -> Words:
+def _changed_flights(
+    flights: Flights, setup: str, lasting: dict[str, ParameterChange], passing: dict[str, ParameterChange]
+) -> Words:
     rows: Words = {}
     for what, change in (lasting | passing).items():
         name = what.replace(" ", "-").replace("/", "").replace("%", "").replace(",", "")

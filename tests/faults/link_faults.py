@@ -123,7 +123,10 @@ def _flight(record: Record, start: Path, home: Path, folder: Path, random: Rando
         started_autopilot(record.setup, start, home) as (url, system),
         relayed(url) as relay,
         judged(sitl.beside(record.setup.kind, system, url), system) as judge,
-        _running_flight([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),
+        _running_flight([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (
+            fly,
+            steps,
+        ),
     ):
         _until(lambda: judge.airborne, fly)
         _until(partial(steps.beyond, AGAIN), fly)
