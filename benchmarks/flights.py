@@ -91,7 +91,7 @@ SETUPS = {
     PX4: Setup("px4", PX4_SIH_SENSORS),
     ARDUPILOT_LED: Setup("ardupilot", ARDUPILOT_POSITION_GAINS, ("--lead",)),
     PX4_CAMERAS: Setup("px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True),
-    ARDUPILOT_ONCE: Setup("ardupilot", ARDUPILOT_HIGHER_GAINS, outside=0.012),
+    ARDUPILOT_ONCE: Setup("ardupilot", ARDUPILOT_HIGHER_GAINS, outside=0.005),
     PX4_CAMERAS_ONCE: Setup(
         "px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True, outside=0.005
     ),
