@@ -1,6 +1,6 @@
 """PROCESS: drive one or several robots with the loop of `brakeline.actors.episode_runner`, over the bus.
 
-The process adds to that loop: the learner's permission for each step, one question to the safety service about all
+The process adds to that loop: the learner's permission for each step, one query to the safety service about all
 robots, waiting for a service that does not answer while the robots stand, and publishing.
 """
 
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("brakeline.actor")
 
-RETRY_INTERVAL = 0.05  # s between two questions about robots that stand and got no answer
-MOST_REFUSALS = 200  # questions about standing robots that the service refuses in a row, before the process ends
+RETRY_INTERVAL = 0.05  # s between two queries about robots that stand and got no answer
+MOST_REFUSALS = 200  # queries about standing robots that the service refuses in a row, before the process ends
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ActorSettings:
     robot: str = "ground"
     name: str = "actor-0"
     number: int = 0  # the number of this process's first robot
-    robots: int = 1  # number of robots in this process; one question is about all of them
+    robots: int = 1  # number of robots in this process; one query is about all of them
     fleet: bool = False  # whether the robots share a world
     seed: int = 0
     arena: str = "default"
@@ -203,7 +203,7 @@ class ActorRunner:
     def propose(self) -> Array:
         """Return the proposal (m,): the proposer's, or that of a practised stop.
 
-        A robot that stands and waits keeps its proposal: the number of questions must not advance the generator.
+        A robot that stands and waits keeps its proposal: the number of queries must not advance the generator.
         """
         runner = self.runner
         if not runner.running:
@@ -266,7 +266,7 @@ class ActorGroup(RobotGroup):
     def __init__(self, actors: Sequence[ActorRunner], world: SharedWorld | None = None, reserving: bool = True) -> None:
         super().__init__([actor.runner for actor in actors], world, reserving)
         self.actors = list(actors)
-        self._refusals = 0  # questions in a row that the service refused as a whole, while all robots stood
+        self._refusals = 0  # queries in a row that the service refused as a whole, while all robots stood
 
     def ready(self, stop: Stop) -> bool:
         """Wait for permission to step, and begin an episode if none is running. Return False at the end of the run."""
@@ -285,13 +285,13 @@ class ActorGroup(RobotGroup):
         """Act on the outcomes for one period, or wait if there are none and all robots stand.
 
         Raises:
-            BusError: the service refuses every question about the standing robots, such as one with too many obstacles.
+            BusError: the service refuses every query about the standing robots, such as one with too many obstacles.
         """
         waits = self._wait(outcomes)
         refusals = {outcome.failure for outcome in outcomes if outcome and outcome.failure.startswith(FOR_GOOD)}
         self._refusals = self._refusals + 1 if waits and refusals else 0
         if self._refusals > MOST_REFUSALS:
-            raise BusError(f"the safety service refuses every question about these robots: {refusals.pop()}")
+            raise BusError(f"the safety service refuses every query about these robots: {refusals.pop()}")
         if waits:
             stats.waits += 1
             time.sleep(RETRY_INTERVAL)
@@ -343,7 +343,7 @@ def run(
 
     Raises:
         RefusedByLearner, Unreachable: with what to do.
-        BusError: the safety service refuses every question about the robots.
+        BusError: the safety service refuses every query about the robots.
     """
     stats = ActorStats()
     with Process(settings.bus, settings.name) as process:
@@ -352,9 +352,9 @@ def run(
         process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started))
         process.announce()
         filtered = settings.method != "none"
-        question: Ask | None = partial(query_service, process.bus, deadline=settings.deadline) if filtered else None
+        ask: Ask | None = partial(query_service, process.bus, deadline=settings.deadline) if filtered else None
         if all(actor.join(stop) for group in groups for actor in group.actors):
-            while not stop() and run_period(groups, question, stats, stop):
+            while not stop() and run_period(groups, ask, stats, stop):
                 pass
         log.info("%s: %d steps, %d fallbacks, %d waits", settings.name, stats.steps, stats.fallbacks, stats.waits)
         return not stop()

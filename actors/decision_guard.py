@@ -24,7 +24,7 @@ class DecisionOutcome:
     reply: pb.Reply | None  # None: none arrived
     answer: Answer | None  # None: there is no valid answer
     failure: str  # why there is no answer; empty: there is one
-    round_trip_ms: float  # of the question
+    round_trip_ms: float  # of the query
 
     def exchange(self, time: float) -> pb.Exchange:
         """Return the message for the log; time: s, of the request."""
@@ -36,7 +36,7 @@ class DecisionOutcome:
 
 
 def request_decisions(ask: Ask, requests: Sequence[pb.Request], robot: Robot) -> list[DecisionOutcome]:
-    """Ask one question about several robots, and return the outcome of each request, whatever goes wrong."""
+    """Send one query about several robots, and return the outcome of each request, whatever goes wrong."""
     before = perf_counter_ns()
     replies: Sequence[pb.Reply | None]
     try:

@@ -1,7 +1,7 @@
 """The loop of every robot: observe, propose, ask the safety service, act, and record the step.
 
 An `EpisodeRunner` holds one robot between its resets. A `RobotGroup` holds the robots whose time passes together: one
-robot, or a fleet in a shared world. `decide` asks one question about all robots of some groups. `run_episode` is the
+robot, or a fleet in a shared world. `decide` sends one query about all robots of some groups. `run_episode` is the
 whole loop without a bus; `brakeline.actors.actor_process` is the same loop with a learner and publishers.
 """
 
@@ -29,7 +29,7 @@ from brakeline.sim.scripted_policies import Policy
 
 StepResult = tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]  # the result of an environment's `step`
 EPISODE_STRIDE = 4096  # robots of one run never share a seed: seed = episode * stride + number of the robot
-COPIED = (  # values of `info` that a step records under the same name
+INFO_FIELDS = (  # values of `info` that a step records under the same name
     *("collision", "contact_moving", "contact_standing", "contact_robot"),
     *("speed", "clearance", "closest", "outside", "turned"),
 )
@@ -74,7 +74,7 @@ class ActorIdentity:
         """Return the seed of an episode's arena."""
         return episode * EPISODE_STRIDE + self.number
 
-    def noise(self, episode: int) -> np.random.Generator:
+    def exploration(self, episode: int) -> np.random.Generator:
         """Return the generator of an episode's exploration. It depends on the episode only, so every run can resume.
 
         The key ends with 1 because NumPy ignores zeros at the end: (seed, number, 0) would draw the first arena again.
@@ -83,7 +83,7 @@ class ActorIdentity:
 
 
 class EpisodeRunner:
-    """One robot in its environment, with its committed plan; it knows neither the bus nor the policy.
+    """One robot in its environment, with its backup plan; it knows neither the bus nor the policy.
 
     `observation` and `info` are the latest ones of the environment, `step` is the number of the current period.
     """
@@ -127,7 +127,7 @@ class EpisodeRunner:
             self._memory.reset()
         self._fill_scan()
         self.episode, self.step, self._decided_step, self.running = episode, 0, 0, True
-        self.rng = self.identity.noise(episode)
+        self.rng = self.identity.exploration(episode)
         arena = self.info["arena"]
         message = pb.Episode(
             robot=self.robot.name,
@@ -172,7 +172,7 @@ class EpisodeRunner:
         return self.record(proposal, outcome, action, self.env.step(action), weights_version)
 
     def command(self, proposal: Array, outcome: DecisionOutcome | None) -> Array:
-        """Return the input (m,) of the coming period, and advance the committed plan.
+        """Return the input (m,) of the coming period, and advance the backup plan.
 
         Without an outcome this is the proposal, clipped to bounds; a proposal with NaN or infinity becomes zero.
         """
@@ -190,7 +190,7 @@ class EpisodeRunner:
         return outcome.answer is None and at_rest(self.backup_plan)
 
     def skip(self) -> None:
-        """Account for a period that passed without an observation: the committed plan advanced by one input."""
+        """Account for a period that passed without an observation: the backup plan advanced by one input."""
         self.backup_plan.fallback()
         self._memory.later(self.robot.period)
         self.step += 1
@@ -239,7 +239,7 @@ class EpisodeRunner:
             path=info["subsamples"].ravel().tolist(),
             weights_version=weights_version,
             acceleration_age=self.backup_plan.acceleration_age,
-            **{name: info[name] for name in COPIED},
+            **{name: info[name] for name in INFO_FIELDS},
         )
         step.header.time = info["time"]
         self.step += 1
@@ -334,7 +334,7 @@ class RobotGroup:
 def decide(
     groups: Sequence[RobotGroup], proposals: Sequence[Sequence[Array]], ask: Ask | None
 ) -> list[list[DecisionOutcome | None]]:
-    """Ask one question about all robots of groups of one kind.
+    """Send one query about all robots of groups of one kind.
 
     Args:
         proposals: the proposal (m,) of each robot of each group.

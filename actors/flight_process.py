@@ -56,7 +56,7 @@ from brakeline.sim.vehicle import Period
 log = logging.getLogger("brakeline.flight")
 
 GOALS = 12  # of a flight, which then come again: a policy prepares for each of them before the flight
-RETRY_INTERVAL = 0.2  # s between two questions to a service that does not answer yet
+RETRY_INTERVAL = 0.2  # s between two queries to a service that does not answer yet
 DRAIN_TIMEOUT = 2.0  # s for the last messages of a flight
 
 
@@ -251,7 +251,7 @@ class FlightRunner(ActorRunner):
 
 
 def takeoff_verified(
-    question: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop, acceleration_age: float = 0.0
+    ask: Ask, robot: Robot, stage: Arena, filtered: bool, stop: Stop, acceleration_age: float = 0.0
 ) -> bool:
     """Wait until the safety service decides about hovering at the start. Return False after a stop.
 
@@ -272,7 +272,7 @@ def takeoff_verified(
     while not stop():
         backup_plan = BackupPlan(robot, acceleration_age=acceleration_age)
         request = request_message(backup_plan, state, np.zeros(robot.action_dim), near, known_free=True)
-        outcome = request_decisions(question, [request], robot)[0]
+        outcome = request_decisions(ask, [request], robot)[0]
         if outcome.answer is not None:
             if filtered and outcome.answer.kind not in (ALLOWED, ADJUSTED):
                 raise TakeoffNotVerified(
@@ -322,17 +322,15 @@ def run(
         actor = FlightRunner(process, settings, stages, propose, publisher, conditions or Conditions(), age)
         process.refresh = lambda: process.figures.update(stats.figures(time.monotonic() - started) | actor.figures())
         process.announce()
-        question = partial(query_service, process.bus, deadline=settings.deadline)
-        if not (
-            actor.join(stop) and takeoff_verified(question, robot, stages[0], settings.method == "ddpc", stop, age)
-        ):
+        ask = partial(query_service, process.bus, deadline=settings.deadline)
+        if not (actor.join(stop) and takeoff_verified(ask, robot, stages[0], settings.method == "ddpc", stop, age)):
             return False
         request = FlightRequest(flight, robot, arena.obstacles)
         vehicle = VehicleClient(request, actor.frames.add, process.bus.rejected, stop)
         try:
             actor.take(vehicle)
             group = ActorGroup([actor])
-            while not stop() and run_period([group], question, stats, stop):
+            while not stop() and run_period([group], ask, stats, stop):
                 pass
             done = not stop()
             actor.brake()

@@ -36,7 +36,7 @@ RATE = 5.0  # Hz
 SECONDS = 4.0  # of requests
 DEADLINE = 0.1  # s
 PROCESSES = 2  # that the clients are in, at least
-SESSIONS = 6  # of each process: a service lets eight requests of one session wait
+SESSIONS = 6  # of each process, each with a name of its own: a service lets eight queries of one client wait
 THREADS = 24  # of each process: requests that are under way at once
 
 
@@ -86,6 +86,7 @@ def _ask(settings: BusSettings, payloads: list[bytes], clients: int, out: Connec
 def _row(
     clients: int, cell: tuple[list[str], list[int], list[int]], keys: Path, payloads: list[bytes]
 ) -> dict[str, float]:
+    """Return the figures of so many clients. cell: what `cells` yields."""
     endpoints, services, routers = cell
     number = max(PROCESSES, len(endpoints))
     settings = [BusSettings(connect=(endpoints[i % len(endpoints)],), keys=keys) for i in range(number)]

@@ -35,37 +35,45 @@ def run() -> Figures:
     for name in ("ground", "quadrotor"):
         for mode in (ONE_STEP, DIRECT):
             for policy in POLICIES:
-                ready, requests = asked(name, mode, policy)
+                safety_filter, requests = filter_and_requests(name, mode, policy)
                 title = f"{name}, {mode}, {policy}"
-                figures[title] = beside(ready, requests) | compared(ready, requests)
+                figures[title] = batch_beside_loop(safety_filter, requests) | decision_differences(
+                    safety_filter, requests
+                )
                 if mode == ONE_STEP and policy == "trained":
-                    figures |= {f"{title}: batch of {size}": beside(ready, requests[:size]) for size in SIZES}
-                    figures |= {f"{title}: {count} obstacles": row for count, row in crowded(ready, requests)}
+                    figures |= {
+                        f"{title}: batch of {size}": batch_beside_loop(safety_filter, requests[:size]) for size in SIZES
+                    }
+                    figures |= {
+                        f"{title}: {count} obstacles": row for count, row in by_obstacle_count(safety_filter, requests)
+                    }
     return figures
 
 
-def asked(name: str, mode: str, policy: str) -> tuple[Filter, list[Request]]:
+def filter_and_requests(name: str, mode: str, policy: str) -> tuple[Filter, list[Request]]:
     """Return a filter, and the requests of a policy that drives behind it."""
     robot = robot_with_task(name)
-    ready = Filter(situations.model(mode=mode, robot=robot))
+    safety_filter = Filter(situations.model(mode=mode, robot=robot))
     driven = islice(situations.driven(policy, situations.SEED, robot, mode=mode), ROWS)
-    return ready, list(situations.requests(ready, [outcome.request for _, outcome, _ in driven]))
+    return safety_filter, list(situations.requests(safety_filter, [outcome.request for _, outcome, _ in driven]))
 
 
-def beside(ready: Filter, requests: list[Request]) -> dict[str, float]:
+def batch_beside_loop(safety_filter: Filter, requests: list[Request]) -> dict[str, float]:
     """Return the decisions a second of a batch and of the loop, and their ratio with the interval of all blocks."""
     arrays = RequestArrays.of(requests)
     repeats = max(1, 256 // len(requests))  # of short blocks, whose time is near the clock's resolution
-    ready.decide_batch(arrays)
+    safety_filter.decide_batch(arrays)
     times = []
     for _ in range(BLOCKS):
-        batch = seconds(lambda: ready.decide_batch(arrays), repeats)
-        times.append((batch, seconds(lambda: [ready.decide(request) for request in requests], repeats)))
+        batch = processor_seconds(lambda: safety_filter.decide_batch(arrays), repeats)
+        times.append(
+            (batch, processor_seconds(lambda: [safety_filter.decide(request) for request in requests], repeats))
+        )
     least, ratios = np.min(times, axis=0), np.array([loop / batch for batch, loop in times])
     return {"batch 1/s": len(requests) / least[0], "loop 1/s": len(requests) / least[1], **spread_of(ratios)}
 
 
-def seconds(call: Callable[[], object], repeats: int) -> float:
+def processor_seconds(call: Callable[[], object], repeats: int) -> float:
     """Return the processor time of a call [s]."""
     before = process_time()
     for _ in range(repeats):
@@ -73,10 +81,11 @@ def seconds(call: Callable[[], object], repeats: int) -> float:
     return (process_time() - before) / repeats
 
 
-def compared(ready: Filter, requests: list[Request]) -> dict[str, float]:
+def decision_differences(safety_filter: Filter, requests: list[Request]) -> dict[str, float]:
     """Return how the decisions of a batch differ from those of the loop."""
-    answers, single = ready.decide_batch(RequestArrays.of(requests)), [ready.decide(request) for request in requests]
-    kinds, apart = differences(answers, single)
+    answers = safety_filter.decide_batch(RequestArrays.of(requests))
+    single = [safety_filter.decide(request) for request in requests]
+    kinds, apart = count_differences(answers, single)
     return {
         "decisions": len(requests),
         "singly %": 100.0 * len(answers.singly) / len(requests),
@@ -86,16 +95,16 @@ def compared(ready: Filter, requests: list[Request]) -> dict[str, float]:
     }
 
 
-def differences(answers: DecisionArrays, single: list[Decision]) -> tuple[int, float]:
+def count_differences(answers: DecisionArrays, single: list[Decision]) -> tuple[int, float]:
     """Return the number of decisions of another kind, and the largest difference of an input of the others."""
     same = np.array([KINDS[kind] == one.kind for kind, one in zip(answers.kind, single, strict=True)])
     apart = np.abs(answers.plan - np.array([one.plan for one in single])).max(axis=(1, 2))
     return int((~same).sum()), float(apart[same].max(initial=0.0))
 
 
-def crowded(ready: Filter, requests: list[Request]) -> list[tuple[int, dict[str, float]]]:
+def by_obstacle_count(safety_filter: Filter, requests: list[Request]) -> list[tuple[int, dict[str, float]]]:
     """Return figures for requests with more and more obstacles between half the sight and the sight."""
-    rng, d, sight = np.random.default_rng(0), ready.robot.position_dim, ready.robot.sight
+    rng, d, sight = np.random.default_rng(0), safety_filter.robot.position_dim, safety_filter.robot.sight
     rows, some = [], requests[:512]
     for count in CROWDS:
         ways = rng.normal(size=(len(some), count, d))
@@ -104,5 +113,6 @@ def crowded(ready: Filter, requests: list[Request]) -> list[tuple[int, dict[str,
             Shapes.of([Obstacle("sphere", tuple(request.state[:d] + way), (0.05,)) for way in own], d)
             for request, own in zip(some, ways, strict=True)
         ]
-        rows.append((count, beside(ready, [replace(r, obstacles=o) for r, o in zip(some, around, strict=True)])))
+        changed = [replace(r, obstacles=o) for r, o in zip(some, around, strict=True)]
+        rows.append((count, batch_beside_loop(safety_filter, changed)))
     return rows

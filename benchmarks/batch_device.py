@@ -33,28 +33,28 @@ def run(device: str) -> Figures:
     for name in ("ground", "quadrotor"):
         for mode in (ONE_STEP, DIRECT):
             for policy in ("trained", "random"):
-                ready, requests = batch_decide.asked(name, mode, policy)
-                figures |= measured(f"{name}, {mode}, {policy}", ready, RequestArrays.of(requests), device)
+                safety_filter, requests = batch_decide.filter_and_requests(name, mode, policy)
+                figures |= measured(f"{name}, {mode}, {policy}", safety_filter, RequestArrays.of(requests), device)
     return figures
 
 
-def measured(title: str, ready: Filter, requests: RequestArrays, device: str) -> Figures:
+def measured(title: str, safety_filter: Filter, requests: RequestArrays, device: str) -> Figures:
     """Return a row for each size of a batch that repeats the requests."""
     figures: Figures = {}
     few = [requests.row(row) for row in range(min(LOOP, len(requests)))]
-    ours, theirs = ready.decide_batch(requests), ready.decide_batch(on_device(requests, device))
+    ours, theirs = safety_filter.decide_batch(requests), safety_filter.decide_batch(on_device(requests, device))
     apart = {
         "other kind": int((ours.kind != theirs.kind.cpu().numpy()).sum()),
         "apart": float(np.abs(ours.plan - theirs.plan.cpu().numpy()).max()),
     }
     for size in SIZES:
         arrays = on_device(requests.rows(np.resize(np.arange(len(requests)), size).tolist()), device)
-        answers = ready.decide_batch(arrays)
+        answers = safety_filter.decide_batch(arrays)
         times = []
         for _ in range(BLOCKS):
-            batch = seconds(partial(ready.decide_batch, arrays), device) / size
-            numpy = seconds(partial(ready.decide_batch, requests), "cpu") / len(requests)
-            loop = seconds(lambda: [ready.decide(request) for request in few], "cpu") / len(few)
+            batch = seconds(partial(safety_filter.decide_batch, arrays), device) / size
+            numpy = seconds(partial(safety_filter.decide_batch, requests), "cpu") / len(requests)
+            loop = seconds(lambda: [safety_filter.decide(request) for request in few], "cpu") / len(few)
             times.append((batch, numpy, loop))
         least = np.min(times, axis=0)
         figures[f"{title}: {size} on {device}"] = {

@@ -47,10 +47,10 @@ def run() -> Figures:
 
 
 def _by_kind(name: str, model: ModelSet, asked: list[pb.Request]) -> Figures:
-    ready, times = Filter(model), defaultdict(list)
-    for i, request in enumerate(situations.requests(ready, asked)):
+    safety_filter, times = Filter(model), defaultdict(list)
+    for i, request in enumerate(situations.requests(safety_filter, asked)):
         before = perf_counter()
-        kind = ready.decide(request).kind
+        kind = safety_filter.decide(request).kind
         if i >= WARM_UP:
             times[kind].append(perf_counter() - before)
     return {f"{name}: {kind}": milliseconds(times[kind]) | {"count": len(times[kind])} for kind in sorted(times)}
@@ -65,15 +65,15 @@ def _one_step_beside_direct(name: str) -> Figures:
     robot = robot_with_task(name)
     asked = [m for policy in ("trained", "random") for m in situations.messages(policy, robot=robot, mode=ONE_STEP)]
     filters = {mode: Filter(situations.model(mode=mode, robot=robot)) for mode in (DIRECT, ONE_STEP)}
-    requests = {mode: list(situations.requests(ready, asked)) for mode, ready in filters.items()}
+    requests = {mode: list(situations.requests(safety_filter, asked)) for mode, safety_filter in filters.items()}
     requests[DIRECT] = [replace(request, past=None, widening=1.0) for request in requests[DIRECT]]
     least = {mode: np.full(len(asked), np.inf) for mode in filters}
     kinds = {mode: np.full(len(asked), "", dtype=object) for mode in filters}
     for _ in range(BLOCKS):
-        for mode, ready in filters.items():
+        for mode, safety_filter in filters.items():
             for i, request in enumerate(requests[mode]):
                 before = perf_counter()
-                kinds[mode][i] = ready.decide(request).kind
+                kinds[mode][i] = safety_filter.decide(request).kind
                 least[mode][i] = min(least[mode][i], perf_counter() - before)
     figures = {}
     for mode in filters:

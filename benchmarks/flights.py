@@ -27,13 +27,13 @@ from benchmarks.timing import Words
 from brakeline.deploy.interpreter import PYTHON
 
 POLICIES, ARENAS = ("astar", "trained", "adversary"), ("default", "dense")
-FIRST, SECOND, THIRD = 15.0, 5.0, 10.0  # minutes
+FIRST_MINUTES, SECOND_MINUTES, THIRD_MINUTES = 15.0, 5.0, 10.0  # minutes
 PRACTICE = "0.15"  # share of steps at which it practises the planned stop: a model set needs such steps
-BEYOND = 240.0  # s that a command may take besides its flight: estimator, landing, model set
+OVERHEAD = 240.0  # s that a command may take besides its flight: estimator, landing, model set
 # A few minutes of flight give a loose bound. The benchmark measures flights behind it all the same.
-ACCEPTING = ("--accept-bound", "1")
-ONE_FLIGHT = ("--accept-bound", "0.03")  # of mode one-step
-TRUE = ("true collisions", "true clearance least m", "estimate off truth at most m")
+ACCEPT_ANY = ("--accept-bound", "1")
+ACCEPT_ONE_FLIGHT = ("--accept-bound", "0.03")  # of mode one-step
+TRUTH_FIGURES = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Setup:
         parameters: of the autopilot.
         words: options of `collect` and `fly`.
         cameras: it flies under motion capture.
-        further: its last model set is of a third flight, long enough without `--few`.
+        third_flight: its last model set is of a third flight, long enough without `--few`.
         outside: `--outside` of the only model set, of mode one-step and from the first flight. 0 for linear model sets
             of a second or third flight.
     """
@@ -54,23 +54,23 @@ class Setup:
     parameters: Mapping[str, float]
     words: tuple[str, ...] = ()
     cameras: bool = False
-    further: bool = False
+    third_flight: bool = False
     outside: float = 0.0
 
     @property
     def accepting(self) -> tuple[str, str]:
         """The options that accept the bound of the setup's model sets."""
-        return ONE_FLIGHT if self.outside else ACCEPTING
+        return ACCEPT_ONE_FLIGHT if self.outside else ACCEPT_ANY
 
 
 # ArduCopter 4.0 moves a target position along with the requested velocity, and flies faster than requested to catch up
 # with it. With lower gains it creeps after a stop, with higher ones it overshoots. With position targets (`--lead`) it
 # has nothing to catch up with, so the gains can be high.
-CALM = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 1.0, "PSC_VELZ_P": 8.0}
-STEADY = {**CALM, "PSC_VELXY_P": 3.0, "PSC_VELXY_D": 1.0}
-STIFF = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
+ARDUPILOT_LOW_GAINS = {"PSC_POSXY_P": 0.5, "PSC_VELXY_I": 0.02, "PSC_POSZ_P": 1.0, "PSC_VELZ_P": 8.0}
+ARDUPILOT_HIGHER_GAINS = {**ARDUPILOT_LOW_GAINS, "PSC_VELXY_P": 3.0, "PSC_VELXY_D": 1.0}
+ARDUPILOT_POSITION_GAINS = {"PSC_POSXY_P": 2.0, "PSC_POSZ_P": 1.0}
 # The sensors of PX4's SIH have other noise than its estimator assumes, and its GPS has no delay.
-HEARD = {
+PX4_SIH_SENSORS = {
     "COM_OF_LOSS_T": 0.5,
     "EKF2_GPS_DELAY": 0.0,
     "EKF2_ACC_NOISE": 1.0,
@@ -79,25 +79,29 @@ HEARD = {
     "EKF2_BARO_NOISE": 0.3,
 }
 # A vehicle that flies so fast must hold its place soon when setpoints stop.
-ALERT = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
-OUTDOORS, HEARING = "ardupilot", "px4"
+PX4_QUICK_FAILSAFE = {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5, "MPC_ACC_HOR": 8.0, "MPC_JERK_AUTO": 40.0}
+ARDUPILOT, PX4 = "ardupilot", "px4"
 # With position targets the vehicle is at rest at the last target before it does anything else.
-PATIENT = {**ALERT, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
-LED, INDOORS = "ardupilot, led to places", "px4 with motion capture"
-INDOORS_LED = "px4 with motion capture, led to places"
-OUTDOORS_ONCE, INDOORS_ONCE = "ardupilot, one flight", "px4 with motion capture, one flight"
+PX4_POSITION_TARGETS = {**PX4_QUICK_FAILSAFE, "COM_OF_LOSS_T": 5.0, "MPC_XY_P": 2.0, "MPC_Z_P": 1.5}
+ARDUPILOT_LED, PX4_CAMERAS = "ardupilot, led to places", "px4 with motion capture"
+PX4_CAMERAS_LED = "px4 with motion capture, led to places"
+ARDUPILOT_ONCE, PX4_CAMERAS_ONCE = "ardupilot, one flight", "px4 with motion capture, one flight"
 SETUPS = {
-    OUTDOORS: Setup("ardupilot", CALM, further=True),
-    HEARING: Setup("px4", HEARD),
-    LED: Setup("ardupilot", STIFF, ("--lead",)),
-    INDOORS: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True),
-    OUTDOORS_ONCE: Setup("ardupilot", STEADY, outside=0.005),
-    INDOORS_ONCE: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True, outside=0.005),
-    INDOORS_LED: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **PATIENT}, ("--lead",), cameras=True),
+    ARDUPILOT: Setup("ardupilot", ARDUPILOT_LOW_GAINS, third_flight=True),
+    PX4: Setup("px4", PX4_SIH_SENSORS),
+    ARDUPILOT_LED: Setup("ardupilot", ARDUPILOT_POSITION_GAINS, ("--lead",)),
+    PX4_CAMERAS: Setup("px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True),
+    ARDUPILOT_ONCE: Setup("ardupilot", ARDUPILOT_HIGHER_GAINS, outside=0.005),
+    PX4_CAMERAS_ONCE: Setup(
+        "px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_QUICK_FAILSAFE}, cameras=True, outside=0.005
+    ),
+    PX4_CAMERAS_LED: Setup(
+        "px4", {**PX4_SIH_SENSORS, **motion_capture.PARAMETERS, **PX4_POSITION_TARGETS}, ("--lead",), cameras=True
+    ),
 }
 
 
-class Failed(RuntimeError):
+class NoFigures(RuntimeError):
     """A command ended without figures."""
 
 
@@ -116,32 +120,32 @@ def run(minutes: float, folder: Path) -> Words:
 
 def _rows(flights: Flights, minutes: float) -> Iterator[tuple[str, dict[str, float | str]]]:
     first = flights.first()
-    yield "first flight", _learned(first)
+    yield "first flight", _first_flight_row(first)
     if "model" not in first:
         return
-    if flights.once:
-        yield "certified by it", certified(flights.certify_first())
+    if flights.one_flight:
+        yield "certified by it", validation_row(flights.certify_first())
     else:
-        yield "second flight", flown(flights.second)
-        yield "certified by it", _certified(flights, "second", "--few")
-    if flights.further:
-        yield "third flight", flown(flights.third)
-        yield "certified by that", _certified(flights, "third")
+        yield "second flight", flight_row(flights.second)
+        yield "certified by it", _certify_row(flights, "second", "--few")
+    if flights.third_flight:
+        yield "third flight", flight_row(flights.third)
+        yield "certified by that", _certify_row(flights, "third")
     for arena in ARENAS:
         for policy in POLICIES:
-            yield f"{policy}, {arena}", flown(partial(flights.fly, policy, arena, minutes))
-    yield from two(partial(flights.pair, minutes)).items()
+            yield f"{policy}, {arena}", flight_row(partial(flights.fly, policy, arena, minutes))
+    yield from pair_rows(partial(flights.pair, minutes)).items()
 
 
-def _certified(flights: Flights, name: str, *words: str) -> dict[str, float | str]:
+def _certify_row(flights: Flights, name: str, *words: str) -> dict[str, float | str]:
     try:
-        return certified(flights.certify(name, flights.data, *words))
-    except Failed as error:  # too few windows: the next flights use the model set of before
+        return validation_row(flights.certify(name, flights.data, *words))
+    except NoFigures as error:  # too few windows: the next flights use the model set of before
         return {"failed": str(error)}
 
 
 @dataclass(frozen=True)
-class Upset:
+class ParameterChange:
     """Parameters that differ from those of the setup.
 
     Attributes:
@@ -160,25 +164,25 @@ class Flights:
 
     def __init__(self, setup: str, start: Path, folder: Path) -> None:
         self._name, self._setup, self._start, self._folder = setup, SETUPS[setup], start, folder.absolute()
-        self.data, self.further = self._folder / "data", self._setup.further
-        self.once = self._setup.outside > 0.0  # the first flight is the only one before the policies
+        self.data, self.third_flight = self._folder / "data", self._setup.third_flight
+        self.one_flight = self._setup.outside > 0.0  # the first flight is the only one before the policies
 
     @classmethod
-    def beside(cls, other: Flights, name: str) -> Flights:
+    def with_own_data(cls, other: Flights, name: str) -> Flights:
         """Return flights of the same autopilot with data of their own, in a folder of the other's."""
         return cls(other._name, other._start, other._folder / f"{name}-own")
 
     def first(self) -> dict[str, Any]:
         """Record the first data set and make its model set."""
-        return self._figures("first", FIRST, "collect", "quadrotor", "--minutes", str(FIRST))
+        return self._figures("first", FIRST_MINUTES, "collect", "quadrotor", "--minutes", str(FIRST_MINUTES))
 
     def second(self) -> dict[str, Any]:
         """Fly behind the model set of the first flight, to make a new one."""
-        return self.upset("second", SECOND, Upset(), "--practice", PRACTICE)
+        return self.fly_changed("second", SECOND_MINUTES, ParameterChange(), "--practice", PRACTICE)
 
     def third(self) -> dict[str, Any]:
         """Fly behind the model set of the second flight, long enough to certify without `--few`."""
-        return self.upset("third", THIRD, Upset(), "--practice", PRACTICE)
+        return self.fly_changed("third", THIRD_MINUTES, ParameterChange(), "--practice", PRACTICE)
 
     def certify(self, name: str, data: Path, *words: str) -> dict[str, Any]:
         """Put the model set of a flight's log to use in a data folder. Returns its validation, or {"refused": …}."""
@@ -198,19 +202,19 @@ class Flights:
 
     def _certify(self, source: Path, data: Path, *words: str) -> str:
         command = ["certify", "quadrotor-late", "--data", str(source), *words, "--use", *self._setup.accepting]
-        return printed_figures([*command, "--json"], data, BEYOND)
+        return printed_figures([*command, "--json"], data, OVERHEAD)
 
     def fly(self, policy: str, arena: str, minutes: float) -> dict[str, Any]:
         """Fly a policy in an arena."""
-        return self.upset(f"{policy}-{arena}", minutes, Upset(), "--policy", policy, "--arena", arena)
+        return self.fly_changed(f"{policy}-{arena}", minutes, ParameterChange(), "--policy", policy, "--arena", arena)
 
     def pair(self, minutes: float) -> dict[str, Any]:
         """Fly two vehicles in one run, which share a safety service."""
         return self._figures("pair", minutes, "fly", "--minutes", str(minutes), *self._out("pair"), vehicles=2)
 
-    def upset(self, name: str, minutes: float, upset: Upset, *words: str) -> dict[str, Any]:
+    def fly_changed(self, name: str, minutes: float, change: ParameterChange, *words: str) -> dict[str, Any]:
         """Fly with changed parameters."""
-        return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *self._out(name), upset=upset)
+        return self._figures(name, minutes, "fly", "--minutes", str(minutes), *words, *self._out(name), change=change)
 
     def _out(self, name: str) -> tuple[str, ...]:
         return "--at-start", "--pictures", "0", "--out", str(self.run(name))
@@ -219,53 +223,55 @@ class Flights:
         return self._folder / name
 
     def _figures(
-        self, name: str, minutes: float, *words: str, upset: Upset = Upset(), vehicles: int = 1
+        self, name: str, minutes: float, *words: str, change: ParameterChange = ParameterChange(), vehicles: int = 1
     ) -> dict[str, Any]:
-        """Return the figures of a command, now or of an earlier run. Raises Failed, NoAutopilot."""
+        """Return the figures of a command, now or of an earlier run. Raises NoFigures, NoAutopilot."""
         path = self._folder / f"{name}.json"
         if not path.exists():
             print(f"{self._name}: {name}, {minutes:g} minutes", file=sys.stderr)
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(self._flown(minutes, words, upset, vehicles))
+            path.write_text(self._run_command(minutes, words, change, vehicles))
         figures: dict[str, Any] = json.loads(path.read_text())
         return figures
 
-    def _flown(self, minutes: float, words: tuple[str, ...], upset: Upset, vehicles: int) -> str:
+    def _run_command(self, minutes: float, words: tuple[str, ...], change: ParameterChange, vehicles: int) -> str:
         with ExitStack() as stack:
-            parameters = {} if upset.ends else upset.parameters
+            parameters = {} if change.ends else change.parameters
             places = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in range(vehicles)]
-            switched = [switched_on(self._setup, self._start, place, parameters) for place in places]
+            switched = [started_autopilot(self._setup, self._start, place, parameters) for place in places]
             urls, systems = zip(*map(stack.enter_context, switched), strict=True)
-            stack.enter_context(self._in_between(upset, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0]))
+            stack.enter_context(
+                self._in_between(change, sitl.beside(self._setup.kind, systems[0], urls[0]), systems[0])
+            )
             option = "--system" if vehicles == 1 else "--systems"
             where = ("--url", *urls, option, *map(str, systems), "--raise-limits", "--json")
             command = [*words, *self._setup.accepting, *self._setup.words, *where]
-            return printed_figures(command, self.data, 60.0 * minutes + BEYOND)
+            return printed_figures(command, self.data, 60.0 * minutes + OVERHEAD)
 
     @contextmanager
-    def _in_between(self, upset: Upset, url: str, system: int) -> Iterator[None]:
-        """Change the parameters at the times of the upset, until the end of the block."""
+    def _in_between(self, change: ParameterChange, url: str, system: int) -> Iterator[None]:
+        """Change the parameters at the times of the change, until the end of the block."""
         over = threading.Event()
 
-        def change() -> None:
-            if not over.wait(upset.begins):
-                sitl.configure(url, system, upset.parameters)
-            if not over.wait(upset.ends - upset.begins):
-                sitl.configure(url, system, upset.afterwards)
+        def switch() -> None:
+            if not over.wait(change.begins):
+                sitl.configure(url, system, change.parameters)
+            if not over.wait(change.ends - change.begins):
+                sitl.configure(url, system, change.afterwards)
 
-        thread = threading.Thread(target=change, daemon=True)
-        if upset.ends:
+        thread = threading.Thread(target=switch, daemon=True)
+        if change.ends:
             thread.start()
         try:
             yield
         finally:
             over.set()
-            if upset.ends:
+            if change.ends:
                 thread.join()
 
 
 @contextmanager
-def switched_on(
+def started_autopilot(
     setup: Setup, start: Path, folder: Path, parameters: Mapping[str, float] = MappingProxyType({})
 ) -> Iterator[tuple[str, int]]:
     """Start an autopilot of a setup in a folder, with further parameters. Yields its URL and its system id."""
@@ -278,30 +284,30 @@ def switched_on(
 
 
 def printed_figures(words: list[str], data: Path, seconds: float) -> str:
-    """Return the last line that a command of ours prints; data: its folder of data sets. Raises Failed."""
+    """Return the last line that a command of ours prints; data: its folder of data sets. Raises NoFigures."""
     command, environment = [*PYTHON, "-m", "brakeline.deploy.cli", *words], os.environ | {"BRAKELINE_DATA": str(data)}
     done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment, timeout=seconds)
     if not (lines := done.stdout.splitlines()):
-        raise Failed(f"{' '.join(words)}: no figures, status {done.returncode}")
+        raise NoFigures(f"{' '.join(words)}: no figures, status {done.returncode}")
     return lines[-1]
 
 
-def _learned(first: dict[str, Any]) -> dict[str, float | str]:
+def _first_flight_row(first: dict[str, Any]) -> dict[str, float | str]:
     row: dict[str, float | str] = {name: first[name] for name in ("minutes", "periods", "level")}
-    return row | certified(first) | {"missing": "; ".join(first["missing"])}
+    return row | validation_row(first) | {"missing": "; ".join(first["missing"])}
 
 
-def certified(figures: dict[str, Any]) -> dict[str, float | str]:
+def validation_row(figures: dict[str, Any]) -> dict[str, float | str]:
     """Return the figures of a validation."""
     wanted = ["windows", "violations", "bound_plan", "bound_step", "half_width_rest", "half_width_full", "refused"]
     return {name: figures[name] for name in wanted if name in figures}
 
 
-def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
+def flight_row(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     """Return the outcome of a flight, or that it failed: without room to hover it does not take off."""
     try:
         figures = fly()
-    except Failed as error:
+    except NoFigures as error:
         return {"failed": str(error)}
     flight, contained = figures["flight"], figures["containment"]
     row: dict[str, float | str] = {name: figures[name] for name in ("steps", "episodes", "goals")}
@@ -310,18 +316,20 @@ def flown(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     row |= {"outside": f"{contained['violations']} of {contained['steps']}"}
     if plans := figures.get("plans"):
         row |= {"stops outside": f"{plans['outside']} of {plans['flown']}"}
-    return row | _own(flight)
+    return row | _vehicle_row(flight)
 
 
-def _own(flight: dict[str, Any]) -> dict[str, float | str]:
-    row: dict[str, float | str] = {name: flight[name] for name in TRUE if name in flight}
+def _vehicle_row(flight: dict[str, Any]) -> dict[str, float | str]:
+    row: dict[str, float | str] = {name: flight[name] for name in TRUTH_FIGURES if name in flight}
     return row | {"in time": f"{flight['answers in time share'] or 0.0:.1%}"}
 
 
-def two(fly: Callable[[], dict[str, Any]]) -> Words:
+def pair_rows(fly: Callable[[], dict[str, Any]]) -> Words:
     """Return a row for both vehicles together, and one for each of them."""
-    whole = flown(fly)
+    whole = flight_row(fly)
     if "failed" in whole:
         return {"two at once": whole}
-    both = {name: value for name, value in whole.items() if name not in (*TRUE, "in time")}
-    return {"two at once": both} | {f"two at once, {actor}": _own(flight) for actor, flight in fly()["flights"].items()}
+    both = {name: value for name, value in whole.items() if name not in (*TRUTH_FIGURES, "in time")}
+    return {"two at once": both} | {
+        f"two at once, {actor}": _vehicle_row(flight) for actor, flight in fly()["flights"].items()
+    }

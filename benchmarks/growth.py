@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import situations
-from benchmarks.batch_decide import SIZES, beside, crowded, seconds
+from benchmarks.batch_decide import SIZES, batch_beside_loop, by_obstacle_count, processor_seconds
 from benchmarks.timing import Figures
 from brakeline.deploy.data.certification import certify
 from brakeline.deploy.data.simulated_recording import data_for
@@ -45,13 +45,15 @@ def run() -> Figures:
     figures: Figures = {}
     for name in ROBOTS:
         robot = robot_with_task(name)
-        ready = Filter(situations.model(mode=AUTO, robot=robot))
+        safety_filter = Filter(situations.model(mode=AUTO, robot=robot))
         driven = islice(situations.driven("trained", 5, robot, mode=AUTO), SIZES[-1])
         messages = [outcome.request for _, outcome, _ in driven]
-        requests = list(situations.requests(ready, messages))
-        figures |= _rows(name, "obstacles", crowded(ready, requests))
-        figures |= _rows(name, "requests", [(size, beside(ready, requests[:size])) for size in SIZES])
-        figures[f"{name}, robots of a question, the service"] = _together(ready, messages)
+        requests = list(situations.requests(safety_filter, messages))
+        figures |= _rows(name, "obstacles", by_obstacle_count(safety_filter, requests))
+        figures |= _rows(
+            name, "requests", [(size, batch_beside_loop(safety_filter, requests[:size])) for size in SIZES]
+        )
+        figures[f"{name}, robots of a question, the service"] = _together(safety_filter, messages)
         figures[f"{name}, periods of a plan, {SINGLE}"] = {str(n): _of_plans(robot, n) for n in HORIZONS[name]}
     _draw(figures)
     return figures
@@ -62,10 +64,10 @@ def _rows(name: str, what: str, rows: Sequence[tuple[int, dict[str, float]]]) ->
     return {f"{name}, {what}, {way}": {str(n): 1e6 / row[key] for n, row in rows} for way, key in ways.items()}
 
 
-def _together(ready: Filter, messages: list[pb.Request]) -> dict[str, float]:
+def _together(safety_filter: Filter, messages: list[pb.Request]) -> dict[str, float]:
     """Return the time of a service for each robot of a question, from bytes to bytes [µs]."""
     models = ModelRegistry()
-    models.install(situations.model(mode=AUTO, robot=robot_with_task(ready.robot.name)))
+    models.install(situations.model(mode=AUTO, robot=robot_with_task(safety_filter.robot.name)))
     handler = BatchHandler(models, ServiceCounts())
     row = {}
     for number in TOGETHER:
@@ -77,7 +79,7 @@ def _together(ready: Filter, messages: list[pb.Request]) -> dict[str, float]:
                 handler(payload)
 
         work()
-        row[str(number)] = 1e6 * min(seconds(work, 1) for _ in range(5)) / (4 * MAX_REQUESTS)
+        row[str(number)] = 1e6 * min(processor_seconds(work, 1) for _ in range(5)) / (4 * MAX_REQUESTS)
     return row
 
 
@@ -103,15 +105,18 @@ def _of_plans(robot: RobotWithTask, horizon: int) -> float:
     longer, data = replace(robot, **other), part_of(data_for(robot), MINUTES)
     data = replace(data, robot=replace(data.robot, **other))
     safety, _ = certify(data, ModelConfig(mode=DIRECT).of_minutes())
-    ready, drive = Filter(safety), situations.driven_behind(safety, policy_named("trained", robot, 0), 5, longer)
-    asked = list(situations.requests(ready, [outcome.request for _, outcome, _ in islice(drive, DECISIONS)]))
+    safety_filter, drive = (
+        Filter(safety),
+        situations.driven_behind(safety, policy_named("trained", robot, 0), 5, longer),
+    )
+    asked = list(situations.requests(safety_filter, [outcome.request for _, outcome, _ in islice(drive, DECISIONS)]))
 
     def work() -> None:
         for request in asked:
-            ready.decide(request)
+            safety_filter.decide(request)
 
     work()
-    return 1e6 * min(seconds(work, 1) for _ in range(5)) / len(asked)
+    return 1e6 * min(processor_seconds(work, 1) for _ in range(5)) / len(asked)
 
 
 def _draw(figures: Figures) -> None:

@@ -69,11 +69,11 @@ def messages(
     return [outcome.request for _, outcome, _ in islice(steps, STEPS)]
 
 
-def requests(ready: Filter, asked: list[pb.Request]) -> Iterator[Request]:
+def requests(safety_filter: Filter, asked: list[pb.Request]) -> Iterator[Request]:
     """Yield the requests as the filter takes them, each decoded when it is needed, as in a service.
 
     A plan of another model counts as the plan of a robot that stands.
     """
     for message in asked:
-        message.model = message.model and ready.version
-        yield request_of(message, ready.robot)
+        message.model = message.model and safety_filter.version
+        yield request_of(message, safety_filter.robot)

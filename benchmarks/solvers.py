@@ -38,10 +38,10 @@ def programs(certificate: str, robot: RobotWithTask, conditions: Conditions | No
         seen.append(program)
         return solve(program)
 
-    ready = Filter(situations.model(certificate, robot=robot))
+    safety_filter = Filter(situations.model(certificate, robot=robot))
     with patch.object(plan_search, "solve", note):
-        for request in situations.requests(ready, situations.messages(robot=robot, conditions=conditions)):
-            ready.decide(request)
+        for request in situations.requests(safety_filter, situations.messages(robot=robot, conditions=conditions)):
+            safety_filter.decide(request)
     return seen
 
 

@@ -3,7 +3,7 @@
 with SafetyClient.open("tcp/127.0.0.1:7447", "ground") as safety:      # ask a running service
     answer = safety.decide(state, action, [Obstacle("cylinder", (0.4, 0.0), (0.1,))])
 
-env = SafetyWrapper(env, Filter(ModelSet.load(path)))                  # in process, for any RL library
+env = SafetyWrapper(env, Filter.load("ground"))                         # in process, for any RL library
 
 A name is imported at its first use, so that a client of the service loads no simulator and no solver.
 """

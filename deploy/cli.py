@@ -175,7 +175,7 @@ COMMANDS: dict[str, CommandEntry] = {name: entry for group in GROUPS.values() fo
 def print_overview(console: Console) -> None:
     """Print each command with its example."""
     console.print(
-        "[bold]brakeline[/]: robots learn by trial and error without hitting anything, so far in simulation\n"
+        "[bold]brakeline[/]: robots learn by trial and error and avoid collisions; so far, all robots were simulated\n"
     )
     for title, group in GROUPS.items():
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)

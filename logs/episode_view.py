@@ -44,7 +44,7 @@ def picture(episode: EpisodeRecord, robot: Robot | None, tubes: int = MOST_TUBES
         "footprint": robot.footprint if robot is not None else 0.0,
         "discs": body_discs(robot) if robot is not None else [],
         "period": robot.period if robot is not None else None,
-        "kinds": "".join(map(letter, steps)),
+        "kinds": "".join(map(decision_letter, steps)),
         **_path(steps, robot),
         "heading": _headings(steps, robot),
         "clearance": rounded(step.clearance for step in steps),
@@ -73,7 +73,7 @@ def sketch(episode: EpisodeRecord, robot: Robot | None, points: int) -> Figures:
         **{name: value for name, value in arena.items() if value is not None},
         "obstacles": [{name: value for name, value in o.items() if value} for o in inside],
         "at": at,
-        "kinds": "".join(max(map(letter, part), key=ALARMING.index) for part in parts),
+        "kinds": "".join(max(map(decision_letter, part), key=ALARMING.index) for part in parts),
         **_path(some, robot, SKETCHED),
         "clearance": rounded((step.clearance for step in some), SKETCHED),
     }
@@ -129,8 +129,8 @@ def _closest(steps: Sequence[pb.Step]) -> int:
     return min(range(len(steps)), key=lambda k: closest_of(steps[k]))
 
 
-def letter(step: pb.Step) -> str:
-    """Return the letter of a step's decision."""
+def decision_letter(step: pb.Step) -> str:
+    """Return the letter of a step's decision (`LETTERS`)."""
     return LETTERS.get(kind_of(step), "n")
 
 

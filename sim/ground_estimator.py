@@ -44,7 +44,7 @@ def steady_gain(drift: float, fix: float) -> float:
 
 
 @dataclass(frozen=True)
-class Reading:
+class GroundEstimate:
     """The estimate after one period of sensor samples."""
 
     measured: Array  # (5,): x, y [m], heading [rad], speed [m/s], turn rate [rad/s], at the end of the period
@@ -52,7 +52,7 @@ class Reading:
     turned: float  # rad, dead-reckoned change of heading over the period
 
 
-class Estimator:
+class GroundEstimator:
     """Dead reckoning, corrected once a period by a fixed share of its difference to the pose fix.
 
     The estimates of speed and turn rate are means of the last `RECENT` samples, not of the period.
@@ -87,7 +87,7 @@ class Estimator:
         self._gain = np.array([gain, gain, steady_gain(noise.drift_heading, noise.fix_heading)])
         self.pose = self._fix(pose)  # (3,) estimated x, y [m] and heading [rad]
 
-    def update(self, wheels: Array, turn_rates: Array, pose: Array) -> Reading:
+    def update(self, wheels: Array, turn_rates: Array, pose: Array) -> GroundEstimate:
         """Update the estimate with the samples of one period.
 
         Args:
@@ -102,7 +102,7 @@ class Estimator:
         self._correct(path[-1], turned, pose)
         recent = slice(-self.RECENT, None)
         speed = distances[recent].mean() / self._sample_time
-        return Reading(np.array([*self.pose, speed, rates[recent].mean()]), path, turned)
+        return GroundEstimate(np.array([*self.pose, speed, rates[recent].mean()]), path, turned)
 
     def _count(self, wheels: Array) -> Array:
         """Return the encoder counts of wheel angles (..., 2)."""

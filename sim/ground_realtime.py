@@ -13,7 +13,7 @@ import numpy as np
 from brakeline.messaging.obstacle import Array
 from brakeline.messaging.ray_directions import LidarRays
 from brakeline.sim.arena import Arena
-from brakeline.sim.ground_estimator import Estimator, NoiseLevels, wrap
+from brakeline.sim.ground_estimator import GroundEstimator, NoiseLevels, wrap
 from brakeline.sim.ground_robot import SAMPLE_TIME, SAMPLES, WHEEL_RADIUS, GroundRobot
 from brakeline.sim.lidar import Lidar
 from brakeline.sim.range_sensors import with_faults
@@ -24,8 +24,8 @@ FLAWLESS = SensorFaults()
 TOUCHING = 1e-6  # m, a range that is not 0, which would say that a beam has no information
 
 
-class RealtimeEstimator(Estimator):
-    """`Estimator`, one sample at a time: between two pose fixes it returns its dead reckoning."""
+class RealtimeEstimator(GroundEstimator):
+    """`GroundEstimator`, one sample at a time: between two pose fixes it returns its dead reckoning."""
 
     def __init__(self, noise: NoiseLevels, rng: np.random.Generator, pose: Array, *wheels: Any) -> None:
         super().__init__(noise, rng, pose, *wheels)

@@ -17,7 +17,7 @@ from brakeline.sim.arena import Arena
 from brakeline.sim.delayed_vehicle import check_described
 from brakeline.sim.driving_disturbances import DRAWS_AT_START, DRAWS_OF_SAMPLE, DrivingDisturbances
 from brakeline.sim.floor_physics import FloorPhysics
-from brakeline.sim.ground_estimator import Estimator, NoiseLevels, heading_of
+from brakeline.sim.ground_estimator import GroundEstimator, NoiseLevels, heading_of
 from brakeline.sim.sim_conditions import Conditions, ProcessNoise
 from brakeline.sim.vehicle import MakeVehicle, Period, SimulatedVehicle
 from brakeline.sim.weak_motor import WeakMotor
@@ -113,7 +113,7 @@ class TurtleBot(SimulatedVehicle):
     def start_estimation(self, noise: NoiseLevels | None, rng: np.random.Generator) -> None:
         """Start to measure, once the robot has settled on its wheels."""
         noise = noise or NoiseLevels()
-        self.estimator = Estimator(noise, rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME)
+        self.estimator = GroundEstimator(noise, rng, self._true_pose(), self._wheels(), WHEEL_RADIUS, SAMPLE_TIME)
         self.true = self._true_state()
         self.measured = np.array([*self.estimator.pose, 0.0, 0.0])
         self.input = np.zeros(GROUND.action_dim)

@@ -26,6 +26,7 @@ class TopView:
     """
 
     def __init__(self, robot: Robot, arena: Arena) -> None:
+        """Draw the map once if it is the same at all heights. The longer side of the room has `PIXELS` pixels."""
         self._robot, self._arena = robot, arena
         (left, right), (bottom, top) = arena.bounds[:2]
         pixel = max(right - left, top - bottom) / PIXELS  # m

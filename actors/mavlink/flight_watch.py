@@ -22,7 +22,8 @@ class FlightWatch:
         self._client, self._timing = client, timing
         self._counted: dict[str, int] = {}  # messages by their quantity
         self._received_at: dict[str, float] = {}  # s, arrival of the latest of them
-        self._asked: deque[int] = deque(maxlen=MOST_REQUESTS)  # ns, our clock at our requests for the autopilot's
+        # ns, our clock at our requests for the autopilot's
+        self._clock_requests: deque[int] = deque(maxlen=MOST_REQUESTS)
         self._offsets = ClockOffset()
 
     def note(self, now: float) -> None:
@@ -33,15 +34,15 @@ class FlightWatch:
                 self._counted[what], self._received_at[what] = count, now
                 if what == MOTION:
                     self._offsets.note(now, client.time)
-        for asked, theirs in client.answers:
-            if asked in self._asked:  # other stations ask, too
+        for asked, theirs in client.clock_answers:
+            if asked in self._clock_requests:  # other stations ask, too
                 timing.round_trip = min(timing.round_trip, now - 1e-9 * asked)
                 self._offsets.answer(1e-9 * asked, 1e-9 * theirs, timing.round_trip)
-        client.answers.clear()
+        client.clock_answers.clear()
 
-    def asked(self, nanoseconds: int) -> None:
+    def clock_requested(self, nanoseconds: int) -> None:
         """Note a request for the autopilot's clock at this time of ours [ns]."""
-        self._asked.append(nanoseconds)
+        self._clock_requests.append(nanoseconds)
 
     @property
     def offset(self) -> float:
@@ -50,8 +51,8 @@ class FlightWatch:
         The estimate comes from the messages with the least delay, minus half of the fastest TIMESYNC round trip. The
         part of a round trip that our own polling explains does not count.
         """
-        way = 0.5 * self._timing.round_trip - POLL
-        return self._offsets.value - (way if 0.0 < way < math.inf else 0.0)
+        one_way = 0.5 * self._timing.round_trip - POLL
+        return self._offsets.value - (one_way if 0.0 < one_way < math.inf else 0.0)
 
     def age(self, now: float) -> float:
         """Return the age of the latest position at `now`, s."""
@@ -85,6 +86,6 @@ class FlightWatch:
             return f"the autopilot does not follow our setpoints ({state})"
         if client.estimator is not None and (unknown := unknown_quantities(client.estimator)):
             return f"its estimator does not know {', '.join(unknown)}"
-        if client.outside:
-            return f"the autopilot says that it is outside of its geofence ({client.outside})"
+        if client.breached_side:
+            return f"the autopilot says that it is outside of its geofence ({client.breached_side})"
         return "the autopilot says that it is in an emergency" if client.emergency else ""

@@ -35,20 +35,21 @@ STATION, COMPONENT = 245, int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)  # who we ar
 AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 FULL = 100.0  # %
 ARMED = int(mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-MOST_TEXTS, MOST_PARAMETERS = 50, 4000  # that are kept: ArduPilot has 1,400 parameters
+MOST_TEXTS, MOST_CLOCK_ANSWERS, MOST_PARAMETERS = 50, 50, 4000  # stored ones: ArduPilot has 1,400 parameters
 KINDS = {int(mavlink.MAV_AUTOPILOT_PX4): "px4", int(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA): "ardupilot"}
 RESTARTED = 1.0  # s: a position that is older than the last one by more comes from an autopilot that has restarted
 # m, m/s²: two positions that differ by more from their mean velocity times the time between them are no motion. With an
 # acceleration up to a, the way differs from the one at the mean of the first and the last velocity by up to a t² / 4.
-STEP, STEP_ACCELERATION = 0.5, 10.0
-SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
+JUMP, JUMP_ACCELERATION = 0.5, 10.0
+FENCE_SIDES = {1: "least altitude", 2: "greatest altitude", 3: "boundary"}  # FENCE_BREACH
 OFFBOARD = {"px4": (6, 6 << 16), "ardupilot": (4, 4)}  # DO_SET_MODE's param2, and HEARTBEAT's custom mode
 
 
 class MavlinkDecoder:
     """The latest values from one autopilot's messages.
 
-    Until `choose` has selected a message for a quantity, the decoder uses the best one that arrives.
+    Until `chosen` names a message for a quantity (`AutopilotClient.choose` sets it), the decoder uses the best one that
+    arrives.
     """
 
     def __init__(
@@ -78,10 +79,10 @@ class MavlinkDecoder:
         self.texts: list[str] = []  # the latest ones
         self.estimator: int | None = None  # flags, see telemetry.ESTIMATED
         self.battery: float | None = None  # %; None: unknown
-        self.outside = ""  # the side of its geofence that it has crossed; empty: none
+        self.breached_side = ""  # of its geofence, that it has crossed; empty: none
         # ns, from TIMESYNC: our clock when we asked, the autopilot's then
-        self.answers: deque[tuple[int, int]] = deque(maxlen=MOST_TEXTS)
-        self.chosen: dict[str, str] = {}  # message by key of SOURCES
+        self.clock_answers: deque[tuple[int, int]] = deque(maxlen=MOST_CLOCK_ANSWERS)
+        self.chosen: dict[str, str] = {}  # the message that a quantity is taken from, by key of SOURCES
         self._best: dict[str, int] = {}  # index in SOURCES of the best message so far, until one is chosen
         self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)  # NED from forward-right-down
         self._forces: deque[Vector] = deque([(0.0, 0.0, -telemetry.GRAVITY)], 1)
@@ -133,7 +134,7 @@ class MavlinkDecoder:
                 self._take(what, place, message)
             self._handle(message)
 
-    def smooth(self, readings: int) -> None:
+    def average_accelerometer(self, readings: int) -> None:
         """Average this many readings of the accelerometer from now on."""
         self._forces = deque(self._forces, readings)
 
@@ -191,15 +192,15 @@ class MavlinkDecoder:
             case "SYS_STATUS" if 0 <= message.battery_remaining <= FULL:
                 self.battery = float(message.battery_remaining)
             case "FENCE_STATUS":
-                side = SIDES.get(message.breach_type, "") or "geofence"
-                self.outside = side if message.breach_status else ""
+                side = FENCE_SIDES.get(message.breach_type, "") or "geofence"
+                self.breached_side = side if message.breach_status else ""
             case "PARAM_VALUE":
                 value = message.param_value
                 if self.kind == "px4" and message.param_type == mavlink.MAV_PARAM_TYPE_INT32:  # the integer's bits
                     value = struct.unpack("<i", struct.pack("<f", value))[0]
                 self._note_parameter(message.param_id, float(value), message.param_type)
             case "TIMESYNC" if message.tc1 != 0:  # 0: the autopilot asks for our clock
-                self.answers.append((message.ts1, message.tc1))
+                self.clock_answers.append((message.ts1, message.tc1))
 
     def _check_source(self, source: str) -> None:
         """Remember the autopilot's address. Raises BadMessage: this is another one."""
@@ -231,7 +232,7 @@ class MavlinkDecoder:
             return True
         moved = 0.5 * duration * (self.velocity + sample.velocity)
         step = float(np.linalg.norm(sample.position - self.position - moved))
-        if not step <= STEP + 0.25 * STEP_ACCELERATION * duration**2:
+        if not step <= JUMP + 0.25 * JUMP_ACCELERATION * duration**2:
             self._interrupt(f"its position jumped by {step:.2f} m within {duration:.2f} s")
         return True
 

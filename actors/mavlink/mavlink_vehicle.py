@@ -336,7 +336,7 @@ class MavlinkVehicle(PeriodicVehicle):
             client.truth = None
         if now - self._synced_at >= SYNC_INTERVAL:
             self._synced_at = now
-            self._watch.asked(asked := time.monotonic_ns())
+            self._watch.clock_requested(asked := time.monotonic_ns())
             client.ask_time(asked)
         if self._truth is not None:
             self._truth.poll()

@@ -132,7 +132,7 @@ class Takeoff:
         noise = 2.0 * float(np.std(readings, axis=0).max()) if readings else 0.0
         bound = float(np.min(np.asarray(self._robot.measurement_bound)[-self._robot.position_dim :]))
         count = min(max(1, math.ceil((noise / bound) ** 2)), MOST_READINGS)
-        client.smooth(count)
+        client.average_accelerometer(count)
         if count > 1:
             self.note(f"its accelerometer has {noise:.1f} m/s² of noise: {count} readings are averaged")
 

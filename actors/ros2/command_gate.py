@@ -72,7 +72,7 @@ class CommandGate:
         self.robot, self.backup_plan, self.stats = robot, BackupPlan(robot, turn_aside), GateStats()
         self.input = np.zeros(robot.action_dim)  # in force
         self.kind, self.reason = BLIND, "not begun"  # the decision about this input, and why it is not the command's
-        self.outcome: DecisionOutcome | None = None  # of this period's question
+        self.outcome: DecisionOutcome | None = None  # of this period's query
         self._ask, self._name = ask, name
         self._command: RawCommand | None = None  # the one that the outcome is about
         self._counted = 0  # number of the last command whose delay has been counted
@@ -128,7 +128,7 @@ class CommandGate:
         Args:
             now: by the robot's clock.
             in_time: whether the answer arrived before the period began.
-            why: the reason why there was no question, or why no answer counts; empty: there is none.
+            why: the reason why there was no query, or why no answer counts; empty: there is none.
         """
         stats, outcome, command = self.stats, None if why else self.outcome, self._command
         self.outcome = self._command = None

@@ -34,8 +34,8 @@ class ActorCommand:
     seed: options.Seed = 0
     arena: options.ArenaName = "default"
     penalty: float | None = RunConfig.penalty
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
-    one in the robot's task."""
+    """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range. Defaults to
+    the one in the robot's task."""
     deadline: float = RunConfig.deadline
     """Wait this long for an answer of the safety service [s]. Then the robot brakes along its backup plan."""
     policy: str = ""

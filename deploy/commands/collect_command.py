@@ -22,7 +22,8 @@ class CollectCommand:
 
     robot: options.Robot = "ground"
     trajectories: int | None = None
-    """Record this many trajectories of 300 control periods. Defaults to as many as the plans of the robot need."""
+    """Record this many trajectories of 300 control periods, and half as many of 120. Defaults to as many as the plans
+    of the robot need."""
     seed: options.Seed = SEED
     physics: options.Unprefixed[options.PhysicsOptions] = field(default_factory=options.PhysicsOptions)
     out: Path | None = None

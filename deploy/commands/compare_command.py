@@ -72,7 +72,7 @@ class CompareCommand:
     """
     engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     tune: bool = False
-    """Do not compare: try four values of one setting of each rival, and store the results for the results page."""
+    """Try four values of one setting of each rival instead of comparing, and store the results for the results page."""
     table: bool = False
     """Run nothing: write tables, figures and the results page (README.md) from the stored results."""
     again: bool = False
@@ -80,8 +80,8 @@ class CompareCommand:
     conservatism: bool = True
     """Also make the table of error bounds and modes, with the stored policy."""
     penalty: float | None = None
-    """Subtract this penalty from the learned reward for a correction by the whole range of an input. Defaults to the
-    one of the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
+    """Subtract this penalty from the learner's reward if the filter corrects an input by its whole range. Defaults to
+    the one in the robot's task, for SECAS and SAILR to 1. Give another --results folder if you change it or --td3."""
     task_settings: bool = True
     """Train TD3 behind each filter but SAILR with the learner settings of the robot's task, such as the quadrotor's
     penalty growth and imitation. A --td3 option with another value than its default replaces the task's."""

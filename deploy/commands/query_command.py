@@ -33,7 +33,10 @@ SHOWN = (
     *("verified", "bound", "model", "time_ms"),
 )
 NOTHING = 1e-9  # an input that is smaller counts as zero
-OBSTACLE_FORM = "an obstacle is: cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW"
+OBSTACLE_FORMS = {  # by number of position coordinates
+    2: "cylinder X Y RADIUS | box X Y LENGTH WIDTH [YAW] | wall X Y YAW",
+    3: "cylinder X Y Z RADIUS HEIGHT | sphere X Y Z RADIUS | box X Y Z LENGTH WIDTH HEIGHT [YAW] | wall X Y Z YAW",
+}
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,8 @@ class QueryCommand:
     inputs."""
     obstacle: str = ""
     """Describe the obstacles [m, rad], separated by commas: "cylinder X Y RADIUS, box X Y LENGTH WIDTH YAW, wall X Y
-    YAW"."""
+    YAW". In space, Z follows Y, a cylinder and a box end with their HEIGHT before the YAW, and there is "sphere X Y Z
+    RADIUS"."""
     scan: Path | None = None
     """Read a scan from this JSON file, {"ranges": [...], "angles": [...], "pose": [0, 0, 0], ...}: the fields of Scan,
     or in the air of RangeImage (see docs/perception.md). Space that the scan does not show to be free counts as
@@ -128,16 +132,16 @@ def parse_obstacle(words: tuple[str, ...], dim: int) -> Obstacle:
     """
     if not dim:
         raise ValueError("a robot without a position has no obstacles, only limits: leave out --obstacle")
-    kind = words[0] if words else ""
+    kind, form = words[0] if words else "", f"an obstacle is: {OBSTACLE_FORMS[dim]}"
     if kind not in KINDS:
-        raise ValueError(f"{kind!r}: {OBSTACLE_FORM}")
+        raise ValueError(f"{kind!r}: {form}")
     sizes = {"box": dim, "cylinder": dim - 1, "sphere": 1, "wall": 0}[kind]
     try:
         values = [float(number) for number in words[1:]]
     except ValueError:
         values = []
     if len(values) not in (dim + sizes, dim + sizes + 1):
-        raise ValueError(f"{' '.join(words)}: {OBSTACLE_FORM}")
+        raise ValueError(f"{' '.join(words)}: {form}")
     yaw = values[dim + sizes] if len(values) > dim + sizes else 0.0
     return Obstacle(kind, tuple(values[:dim]), tuple(values[dim : dim + sizes]), yaw)
 

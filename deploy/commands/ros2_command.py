@@ -89,7 +89,7 @@ class Ros2Command:
     fresh: options.Unprefixed[AgeLimits] = field(default_factory=AgeLimits)
     filtering: options.Unprefixed[options.ServiceOptions] = field(default_factory=options.ServiceOptions)
     connect: tuple[str, ...] = ()
-    """Query the safety service on the bus at these endpoints. Without one the filter runs in this process."""
+    """Query the safety service on the bus at these endpoints. Without an endpoint, the filter runs in this process."""
     keys: Path | None = None
     """With --connect, use the keys of --client in this folder. Defaults to $BRAKELINE_KEYS, else to no keys."""
     client: str = "client"

@@ -59,14 +59,15 @@ def gap_free_recordings(
         if any(len(time) < 2 for time, _ in states) or not all(len(time) for time, _ in inputs):
             continue
         cuts = [_gaps(time, robot.period, name) for (time, _), name in zip(states, names, strict=True)]
-        torn = _jumps(robot, states)
-        same, apart = _same_stamps(robot, [places[name] for name in names], run)
-        _refuse_several_robots(sum(map(len, torn.values())) + apart, sum(len(states[i][0]) for i in torn))
-        shared += same
+        jump_rows = _jumps(robot, states)
+        moving, unreachable = _same_stamps(robot, [places[name] for name in names], run)
+        jumping = sum(map(len, jump_rows.values())) + unreachable
+        _refuse_several_robots(jumping, sum(len(states[i][0]) for i in jump_rows))
+        shared += moving
         gaps += len(cuts[0])
-        jumps += len({float(states[i][0][j]) for i, indices in torn.items() for j in indices})
+        jumps += len({float(states[i][0][j]) for i, indices in jump_rows.items() for j in indices})
         spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
-        spans += [_uncut(states[i][0], indices) for i, indices in torn.items()]
+        spans += [_uncut(states[i][0], indices) for i, indices in jump_rows.items()]
         spans += [_uncut(time, np.flatnonzero(np.diff(time) > hold), hold) for time, _ in inputs]
         if robot.heading is not None:
             time, heading = states[robot.heading]
@@ -113,15 +114,15 @@ def _moved(robot: Robot, i: int, values: Array) -> Array:
 
 def _jumps(robot: Robot, states: list[Series]) -> dict[int, Indices]:
     """Return for each coordinate of the pose the indices of the samples before a motion faster than the robot's."""
-    fastest, torn = _fastest(robot), {}
+    fastest, jump_rows = _fastest(robot), {}
     for i in _pose(robot):
         time, values = states[i]
         apart, moved = np.diff(time), _moved(robot, i, values)
         usual = float(np.quantile(moved / apart, 0.99))
         if known := fastest["rad/s" if i == robot.heading else "m/s"]:
             usual = max(known, min(usual, MOST_USUAL * known))
-        torn[i] = np.flatnonzero(moved > JUMP * usual * apart + 4.0 * robot.measurement_bound[i])
-    return torn
+        jump_rows[i] = np.flatnonzero(moved > JUMP * usual * apart + 4.0 * robot.measurement_bound[i])
+    return jump_rows
 
 
 def _same_stamps(robot: Robot, places: Sequence[tuple[Table, str]], run: int) -> tuple[int, int]:
@@ -130,17 +131,17 @@ def _same_stamps(robot: Robot, places: Sequence[tuple[Table, str]], run: int) ->
     Returns:
         The number of those with another pose, and of those with one that the robot cannot reach within a period.
     """
-    fastest, other, apart = _fastest(robot), 0, 0
+    fastest, moving, unreachable = _fastest(robot), 0, 0
     for i in _pose(robot):
         table, column = places[i]
         values = table.columns[column]
         rows = np.isfinite(table.time) & np.isfinite(values) & ((table.run == run) if len(table.run) else True)
         moved = _moved(robot, i, values[rows])[np.diff(table.time[rows]) == 0.0]
         within = JUMP * MOST_USUAL * fastest["rad/s" if i == robot.heading else "m/s"] * robot.period
-        other = max(other, int(np.count_nonzero(moved)))
+        moving = max(moving, int(np.count_nonzero(moved)))
         if within:
-            apart += int(np.count_nonzero(moved > within + 4.0 * robot.measurement_bound[i]))
-    return other, apart
+            unreachable += int(np.count_nonzero(moved > within + 4.0 * robot.measurement_bound[i]))
+    return moving, unreachable
 
 
 def _refuse_several_robots(jumps: int, rows: int) -> None:

@@ -1,4 +1,4 @@
-"""State where a simulated recording comes from, and tell recordings of an older simulator."""
+"""State where a simulated recording comes from, and recognise a recording of an older simulator."""
 
 from __future__ import annotations
 

@@ -95,9 +95,9 @@ def prepare_evaluation(
     """
     policy = policy_named(evaluation.policy, robot, evaluation.seed + POLICY_SEEDS * first)
     env = environment(robot, evaluation.arena, FRESH + evaluation.seed, evaluation.conditions)
-    question = _question(robot, evaluation)
-    driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, evaluation.seed), filtered=question is not None)
-    return driver, policy, question
+    ask = _ask_for(robot, evaluation)
+    driver = EpisodeRunner(robot, env, ActorIdentity("evaluate", 0, evaluation.seed), filtered=ask is not None)
+    return driver, policy, ask
 
 
 def prepare_fleet(
@@ -117,15 +117,15 @@ def prepare_fleet(
         policy_named(evaluation.policy, robot, evaluation.seed + POLICY_SEEDS * first + i)
         for i in range(evaluation.fleet)
     ]
-    question = _question(robot, evaluation)
+    ask = _ask_for(robot, evaluation)
     drivers = [
-        EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, evaluation.seed), filtered=question is not None)
+        EpisodeRunner(robot, member, ActorIdentity(f"evaluate.{i}", i, evaluation.seed), filtered=ask is not None)
         for i, member in enumerate(world.members)
     ]
-    return RobotGroup(drivers, world, question is not None), world, policies, question
+    return RobotGroup(drivers, world, ask is not None), world, policies, ask
 
 
-def _question(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
+def _ask_for(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
     """Return the function that asks the filter, or None for the method `none`."""
     if evaluation.method == "none":
         return None
@@ -192,14 +192,14 @@ class EvaluationPart:
         if evaluation.backend == "batch":
             return self._drive_batch(after_episode)
         if evaluation.fleet:
-            group, world, policies, question = prepare_fleet(robot, evaluation, self.first)
+            group, world, policies, ask = prepare_fleet(robot, evaluation, self.first)
         else:
-            driver, policy, question = prepare_evaluation(robot, evaluation, self.first)
+            driver, policy, ask = prepare_evaluation(robot, evaluation, self.first)
             group, policies = RobotGroup([driver]), [policy]
         stats, table = {runner.identity.actor: EpisodeStats() for runner in group.runners}, EpisodeTable(ROWS)
         periods = 0
         for number in range(self.first, self.first + self.rounds):
-            for steps in run_episode(group, policies, question, number):
+            for steps in run_episode(group, policies, ask, number):
                 periods += 1
                 for step in steps:
                     stats[step.actor].step(step)

@@ -87,7 +87,7 @@ class TrialLog:
 
 
 def take_step(
-    driver: EpisodeRunner, policy: Policy, question: Ask | None, version: int = 0, requests: TrialLog | None = None
+    driver: EpisodeRunner, policy: Policy, ask: Ask | None, version: int = 0, requests: TrialLog | None = None
 ) -> pb.Step:
     """Take one step: propose an action, request a decision, execute it.
 
@@ -100,7 +100,7 @@ def take_step(
     before = time.perf_counter_ns()
     proposal = driver.slow_down.proposal(np.asarray(policy(driver.observation, driver.info), dtype=float))
     spent_ms = (time.perf_counter_ns() - before) * 1e-6
-    outcome = driver.decide(proposal, question)
+    outcome = driver.decide(proposal, ask)
     if outcome is not None and outcome.answer is None:
         raise RuntimeError(f"no decision: {outcome.failure}")
     if requests is not None and outcome is not None:
@@ -111,7 +111,7 @@ def take_step(
 
 
 def run_trial(
-    driver: EpisodeRunner, policy: Policy, question: Ask | None, episodes: int, log: TrialLog | None = None
+    driver: EpisodeRunner, policy: Policy, ask: Ask | None, episodes: int, log: TrialLog | None = None
 ) -> EpisodeTable:
     """Run the policy without exploration through episodes 0 to `episodes` − 1 of the environment."""
     table = EpisodeTable()
@@ -120,7 +120,7 @@ def run_trial(
         if log is not None:
             log.put(EPISODE, message)
         while driver.running:
-            step = take_step(driver, policy, question)
+            step = take_step(driver, policy, ask)
             table.step(step)
             if log is not None:
                 log.put_step(step)
@@ -128,16 +128,16 @@ def run_trial(
 
 
 def fresh_trial(
-    robot: RobotWithTask, arena: str, policy: str, question: Ask | None, episodes: int, seed_key: int = FRESH
+    robot: RobotWithTask, arena: str, policy: str, ask: Ask | None, episodes: int, seed_key: int = FRESH
 ) -> EpisodeTable:
     """Run a policy by its name through fresh episodes, which no training has."""
     driver = EpisodeRunner(robot, environment(robot, arena, seed_key), ActorIdentity("trial", 0, 0))
-    return run_trial(driver, policy_named(policy, robot, 0), question, episodes)
+    return run_trial(driver, policy_named(policy, robot, 0), ask, episodes)
 
 
 def train_in_lockstep(
     driver: EpisodeRunner,
-    question: Ask | None,
+    ask: Ask | None,
     learner: Learner,
     take: Callable[[pb.Step], object],
     begin: Callable[[pb.Episode], object],
@@ -148,7 +148,7 @@ def train_in_lockstep(
 
     Args:
         driver: runs the episodes.
-        question: asks the filter; None for no filter.
+        ask: sends the requests to the filter; None for no filter.
         learner: learns from the steps, and ends the training.
         take: called with each step.
         begin: called with the description of each episode.
@@ -164,7 +164,7 @@ def train_in_lockstep(
         if not driver.running:
             begin(driver.begin(episode))
             episode, random = episode + 1, scripted("random", robot, driver.rng)
-        step = take_step(driver, explore, question, policy.version)
+        step = take_step(driver, explore, ask, policy.version)
         learner.insert(step)
         learner.work(1 << 30)
         if learner.weights_due():

@@ -60,10 +60,8 @@ def try_threshold(model: Pretrained, robot: RobotWithTask, value: float, episode
     value: of SECAS, its margin to the footprint. The interventions are a share of the steps.
     """
     setting = robot.footprint + value if model.method == SECAS else value
-    question = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
-    oracle, greedy = (
-        fresh_trial(robot, "default", policy, question, episodes, SEED_KEY) for policy in (ORACLE, GREEDY)
-    )
+    ask = in_process(replace(model, settings=dict(model.settings) | {SETTING[model.method]: setting}))
+    oracle, greedy = (fresh_trial(robot, "default", policy, ask, episodes, SEED_KEY) for policy in (ORACLE, GREEDY))
     reached, driven = oracle.columns(), greedy.columns()
     return {
         "value": value,

@@ -1,4 +1,4 @@
-"""Train from many simulated robots in one process: environment, filter and learner in turn, without questions by bus.
+"""Train from many simulated robots in one process: environment, filter and learner in turn, without queries on the bus.
 
 A period: the policy proposes for all robots, the batch filter decides, MuJoCo simulates in a thread while the learner
 makes the updates that are due, and then the learner takes the steps. Nothing depends on time, so the same seed gives

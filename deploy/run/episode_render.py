@@ -81,14 +81,14 @@ class Film:
     end: str
 
 
-def record(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Film:
+def record(driver: EpisodeRunner, policy: Policy, ask: Ask | None, number: int) -> Film:
     """Run episode `number` and return its frames."""
     driver.begin(number)
     robot, frames, step = driver.robot, list[Frame](), pb.Step()
     while driver.running:
         proposal = np.asarray(policy(driver.observation, driver.info), dtype=float)
         exchange = pb.Exchange(request=driver.request(proposal))
-        outcome = driver.decide(proposal, question)
+        outcome = driver.decide(proposal, ask)
         if outcome is not None and outcome.answer is not None and outcome.reply is not None:
             exchange.reply.CopyFrom(outcome.reply)
         before = np.asarray(driver.info["true_state"])

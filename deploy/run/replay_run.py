@@ -228,12 +228,12 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
         if _from_before_known_free(request, logged):
             request.known_free = True
         advance()
-        questions = _joint_requests(waiting, request, logged)
-        if any(reply.WhichOneof("result") is None for _, reply in questions):
-            result.requests += len(questions)
-            result.unanswered += len(questions)
+        joint = _joint_requests(waiting, request, logged)
+        if any(reply.WhichOneof("result") is None for _, reply in joint):
+            result.requests += len(joint)
+            result.unanswered += len(joint)
             continue
-        for request, logged in questions:
+        for request, logged in joint:
             if instead is not None:
                 robot = log.robots.named(request.robot)
                 if robot is None:
@@ -243,8 +243,8 @@ def replay(paths: Paths, instead: Replacement | None = None, advance: Callable[[
                     request.model = models.filters[request.robot].version
             elif logged.decision.model:  # without a model the reply is an error, and the registry stays
                 _put_to_use(models, request, archive.method(request.robot, logged.decision.model))
-        replies = ask([request for request, _ in questions]) if questions else []
-        for (request, logged), reply in zip(questions, replies, strict=True):
+        replies = ask([request for request, _ in joint]) if joint else []
+        for (request, logged), reply in zip(joint, replies, strict=True):
             result.add(request, logged, reply, () if instead is None else ("model",))
     result.damage = log.damage
     return result

@@ -53,7 +53,7 @@ class RunConfig:
     model_config: Internal[ModelConfig] = field(default_factory=lambda: ModelConfig(mode=AUTO))
     accept_bound: Internal[float | None] = None  # largest accepted stated bound; None: the limit of each description
     arena: str = "default"
-    """Drive in arenas of this name."""
+    """Drive in arenas of this name. `brakeline robot check ROBOT` lists those of a robot."""
     backend: Literal["processes", "batch"] = "processes"
     """Simulate in actor processes, or all robots at once (batch: many more steps a second)."""
     actors: int = 2

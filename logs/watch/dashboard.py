@@ -12,7 +12,7 @@ from brakeline.errors import Implausible
 from brakeline.logs.arena_view import arena_view
 from brakeline.logs.decision_view import body_discs, decision_view, reservations_json
 from brakeline.logs.episode_stats import INTERVENTIONS, KINDS, kind_of
-from brakeline.logs.episode_view import letter
+from brakeline.logs.episode_view import decision_letter
 from brakeline.logs.metrics import SILENT, Metrics
 from brakeline.logs.recorded_robots import RecordedRobots
 from brakeline.logs.tube_stats import stated
@@ -23,9 +23,9 @@ from brakeline.messaging.rejected_messages import headline
 from brakeline.messaging.robot import Robot
 from brakeline.safety.perception.displayed_map import reserved_boxes
 
-LINES = 8  # warnings
+MOST_WARNINGS = 8
 TRAIL = 600  # latest steps of the running episode; with many robots, fewer of each
-MANY = 4  # robots that get their whole trail
+WHOLE_TRAILS = 4  # robots that get their whole trail
 STUCK = 50  # steps within one footprint of the same place after which a robot counts as stuck
 FIGURES_EVERY = 1.0  # s
 MOST_PANELS = 200
@@ -70,6 +70,7 @@ class RobotPanel:
         }
 
     def begin(self, episode: pb.Episode) -> None:
+        """Show the arena of a new episode, and clear what belonged to the one before."""
         self.reward, self._steps, self._interventions, self._still = 0.0, 0, 0, 0
         self._trail.clear()
         self._anchor = []
@@ -130,7 +131,7 @@ class RobotPanel:
             "first": steps[0].step if steps else 0,
             "path": path,
             "heading": None if robot.heading is None else [state[robot.heading] for state in states],
-            "kinds": "".join(map(letter, steps)),
+            "kinds": "".join(map(decision_letter, steps)),
             "clearance": [step.clearance for step in steps],
         }
 
@@ -142,7 +143,7 @@ class Dashboard:
         self._robots = RecordedRobots()
         self.metrics = Metrics(robots=self._robots)
         self._panels: dict[str, RobotPanel] = {}
-        self._lines: deque[str] = deque(maxlen=LINES)
+        self._warnings: deque[str] = deque(maxlen=MOST_WARNINGS)
         self._history = RunHistory()  # of what was watched
         self._started = self._last_message = time.monotonic()
         self._figures: dict[str, Any] = {}
@@ -162,7 +163,7 @@ class Dashboard:
                 return
             if isinstance(message, pb.LogLine):
                 if message.level in ("WARNING", "ERROR"):
-                    self._lines.append(f"{message.process}: {headline(message.text)}")
+                    self._warnings.append(f"{message.process}: {headline(message.text)}")
             elif isinstance(message, pb.Episode | pb.Step):
                 self._robot(message)
             elif isinstance(message, pb.Exchange):
@@ -191,7 +192,7 @@ class Dashboard:
             now = time.monotonic()
             if now - self._figures_at > FIGURES_EVERY:
                 self._figures, self._figures_at = self._counts(), now
-            most = TRAIL // max(1, len(self._panels) // MANY)
+            most = TRAIL // max(1, len(self._panels) // WHOLE_TRAILS)
             panels = []
             for name, panel in sorted(self._panels.items()):
                 others = [self._panels[actor] for actor in panel.fleet if actor != name and actor in self._panels]
@@ -223,7 +224,7 @@ class Dashboard:
             "learners": learners,
             "processes": {name: self._state(name) for name in sorted(figures["processes"])},
             "history": (history or self._history.rows) if counted else {},
-            "lines": list(self._lines),
+            "lines": list(self._warnings),
         }
 
     def _run(self) -> dict[str, str]:

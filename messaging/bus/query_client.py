@@ -60,8 +60,7 @@ class QueryClient:
         late, begun = False, time.monotonic()
         with as_bus_error(f"cannot ask {key}"):
             querier = self._querier(at, timeout)
-            source = zenoh.SourceInfo(querier.id, 0)  # for the server's fair queue
-            for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}", source_info=source):
+            for reply in querier.get(payload=payload, attachment=f"{timeout:.6g}"):
                 if reply.ok is not None:
                     if at == key and reply.replier_id is not None:
                         self._choose(key, own_key(key, reply.replier_id.zid))

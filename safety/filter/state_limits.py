@@ -32,6 +32,17 @@ class StateLimits:
     In joint space, every limit holds within the periods and after the stop: the chord deviation of a period is how far
     a limit's value exceeds its values at both ends of the period, in units of `Robot.limit_scales`. There the first
     period has a row for its start, too. The order of the rows is: ends, stop, starts; each for all limits.
+
+    Attributes:
+        most (limits,): the largest values, less the measurement errors.
+        position_weights (limits, d), heading_weights (limits,): a and b.
+        arc_middle (limits,): the middle of the arc of headings [rad].
+        other_weights, other_coordinates: the weights of the remaining coordinates, and their numbers in `Tube.more`.
+        chord_scales (limits,): how much a limit's value changes with each unit of chord deviation.
+        chord_columns (rows per limit, N + 1): the chord deviation of each row; the last column: the stopping distance.
+        row_periods (rows per limit,): the period of each row; N: the start of the first period.
+        position_maps, other_maps: the maps of the tube (`Tube`): columns for z, for the generators, for the constant.
+        start_map: the map of the first period's start, in joint space.
     """
 
     def __init__(self, robot: Robot, tube: Tube) -> None:
@@ -39,30 +50,34 @@ class StateLimits:
         self.count, self.heading = len(robot.limits), robot.heading
         weights = robot.limit_weights
         self.most = np.array([limit.most for limit in robot.limits]) - np.abs(weights) @ robot.measurement_bound
-        self.place, self.turn = weights[:, :d], np.zeros(self.count)
+        self.position_weights, self.heading_weights = weights[:, :d], np.zeros(self.count)
         if robot.heading is not None:
-            self.turn = weights[:, robot.heading]
-        self.middle = np.array([_middle_of_arc(robot, i) for i in range(self.count)])
+            self.heading_weights = weights[:, robot.heading]
+        self.arc_middle = np.array([_middle_of_arc(robot, i) for i in range(self.count)])
         further = [i for i in extra_coordinates(robot) if i < n]
-        self.other, self.which = weights[:, further], [extra_coordinates(robot).index(i) for i in further]
-        self.nz, self.extra, self.ends = tube.position.shape[2], np.eye(N + 1), np.append(np.arange(N), N - 1)
-        self.way = np.linalg.norm(self.place, axis=1) if d else robot.limit_scales
-        self.now: Array | None = None  # the map of the first period's start, in joint space
+        self.other_weights = weights[:, further]
+        self.other_coordinates = [extra_coordinates(robot).index(i) for i in further]
+        self.nz, self.chord_columns = tube.position.shape[2], np.eye(N + 1)
+        self.row_periods = np.append(np.arange(N), N - 1)
+        self.chord_scales = np.linalg.norm(self.position_weights, axis=1) if d else robot.limit_scales
+        self.start_map: Array | None = None  # the map of the first period's start, in joint space
         if not d:
-            self.now = np.zeros((1, self.count, self.nz + tube.generators + 1))
-            self.now[0, :, : len(robot.regressor)] = weights[:, list(robot.regressor)]
-            starts = np.append(N, np.arange(N - 1))  # row N of the maps is the one of now
-            self.ends, self.extra = np.append(self.ends, starts), np.vstack([self.extra, self.extra[:N]])
-        elif self.place.any():
-            self.ends, self.extra = np.append(self.ends, np.arange(N - 1)), np.vstack([self.extra, self.extra[1:N]])
+            self.start_map = np.zeros((1, self.count, self.nz + tube.generators + 1))
+            self.start_map[0, :, : len(robot.regressor)] = weights[:, list(robot.regressor)]
+            self.row_periods = np.append(self.row_periods, np.append(N, np.arange(N - 1)))
+            self.chord_columns = np.vstack([self.chord_columns, self.chord_columns[:N]])
+        elif self.position_weights.any():
+            self.row_periods = np.append(self.row_periods, np.arange(N - 1))
+            self.chord_columns = np.vstack([self.chord_columns, self.chord_columns[1:N]])
         self._around(tube)
 
     def _around(self, tube: Tube) -> None:
         """Gather the maps of a tube: columns for z, for the generators, and for the constant."""
         N = tube.horizon
-        maps = np.concatenate([tube.more, tube.more_directions, tube.more_offset[..., None]], axis=2)[:, self.which]
-        self.rest = np.einsum("cr,nrz->ncz", self.other, maps).reshape(N, self.count, maps.shape[2])
-        self.path = np.concatenate([tube.position, tube.directions, tube.offset[..., None]], axis=2)
+        maps = np.concatenate([tube.more, tube.more_directions, tube.more_offset[..., None]], axis=2)
+        maps = maps[:, self.other_coordinates]
+        self.other_maps = np.einsum("cr,nrz->ncz", self.other_weights, maps).reshape(N, self.count, maps.shape[2])
+        self.position_maps = np.concatenate([tube.position, tube.directions, tube.offset[..., None]], axis=2)
 
     def around(self, tube: Tube) -> StateLimits:
         """Return the limits of the same robot around another tube."""
@@ -71,23 +86,25 @@ class StateLimits:
         return other
 
     def __len__(self) -> int:
-        return self.count * len(self.ends)
+        return self.count * len(self.row_periods)
 
     def _nearest(self, heading: float) -> Array:
         """Return a heading [rad] for each limit, by whole turns as near as possible to the middle of its arc."""
-        off = heading - self.middle
-        return self.middle + off - math.tau * np.rint(off / math.tau)
+        off = heading - self.arc_middle
+        return self.arc_middle + off - math.tau * np.rint(off / math.tau)
 
-    def rows(self, start: Array, heading: float, turn: Array, widening: float) -> ConstraintRows:
-        """Return the rows for a robot at `start` (d,); turn (d, d): rotation from its frame to the world.
+    def rows(self, start: Array, heading: float, rotation: Array, widening: float) -> ConstraintRows:
+        """Return the rows for a robot at `start` (d,) [m] with a heading [rad].
 
-        widening: factor on the sets.
+        rotation (d, d): from the frame of the robot to the world; widening: factor on the sets.
         """
-        both = (self.place @ turn) @ self.path + self.rest  # (N, limits, nz + L + 1)
-        both = (both if self.now is None else np.concatenate([both, self.now]))[self.ends]
-        bound = self.most - self.place @ start - self.turn * self._nearest(heading) - both[..., -1]
+        both = (self.position_weights @ rotation) @ self.position_maps + self.other_maps  # (N, limits, nz + L + 1)
+        both = (both if self.start_map is None else np.concatenate([both, self.start_map]))[self.row_periods]
+        bound = (
+            self.most - self.position_weights @ start - self.heading_weights * self._nearest(heading) - both[..., -1]
+        )
         # The chord deviation of every period, and the stopping distance at the last end.
-        extra = self.extra[:, None, :] * self.way[None, :, None]
+        extra = self.chord_columns[:, None, :] * self.chord_scales[None, :, None]
         gradient = np.ascontiguousarray(both[..., : self.nz]).reshape(-1, self.nz)
         spread = widening * np.concatenate([np.abs(both[..., self.nz : -1]), extra], axis=2)
         count = len(gradient)

@@ -172,7 +172,7 @@ class ServiceCounts:
 
 @dataclass(frozen=True)
 class Receipt:
-    """Who asked, and when the question arrived (perf_counter_ns)."""
+    """Who asked, and when the query arrived (perf_counter_ns)."""
 
     asker: str
     time: int

@@ -1,4 +1,4 @@
-"""State estimation of many ground robots: `Estimator` for each row of arrays, with the same errors."""
+"""State estimation of many ground robots: `GroundEstimator` for each row of arrays, with the same errors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from brakeline.messaging.obstacle import Array
 from brakeline.sim.batch.normal_streams import NormalStreams, Rows
-from brakeline.sim.ground_estimator import Estimator, steady_gain, wrap
+from brakeline.sim.ground_estimator import GroundEstimator, steady_gain, wrap
 from brakeline.sim.sim_conditions import NoiseLevels
 
 
@@ -36,7 +36,7 @@ class GroundEstimatorBatch:
         self.pose[rows] = self._fix(rows, pose)
 
     def update(self, rows: Rows, wheels: Array, turn_rates: Array, pose: Array) -> tuple[Array, Array, Array]:
-        """Update the estimates with the samples of one period; see `Estimator.update`.
+        """Update the estimates with the samples of one period; see `GroundEstimator.update`.
 
         Args:
             wheels (rows, S, 2), turn_rates (rows, S), pose (rows, 3): true values.
@@ -44,7 +44,7 @@ class GroundEstimatorBatch:
         Returns:
             The measured states (rows, 5), the paths (rows, S, 2) and the angles turned (rows,).
         """
-        noise, recent = self._noise, Estimator.RECENT
+        noise, recent = self._noise, GroundEstimator.RECENT
         distances = self._wheel_distances(rows, wheels)
         gyro = self._streams.cut_normal(rows, noise.scale * noise.gyro, turn_rates.shape[1])
         rates = turn_rates + self._bias[rows, None] + gyro

@@ -356,7 +356,7 @@ def test_an_actor_whose_questions_are_refused_for_good_ends_with_the_reason(buse
     service.failing, service.failure = True, BadRequest("obstacles", "1200 obstacles; at most 1000")
     scripted.flow.limit.update({"actor-0": STEPS})
     settings = ActorSettings(BusSettings(connect=buses[0].settings.listen), deadline=2.0)
-    with pytest.raises(BusError, match=r"refuses every question about these robots: .*1200 obstacles"):
+    with pytest.raises(BusError, match=r"refuses every query about these robots: .*1200 obstacles"):
         run(settings, environment)
 
 

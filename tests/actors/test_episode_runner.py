@@ -242,7 +242,7 @@ def test_exploration_has_another_stream_than_the_arena_of_any_episode(number, ep
     """NumPy ignores zeros at the end of a key: the noise of each robot's first episode had the stream of its arena."""
     identity = ActorIdentity("actor-0", number, 3)
     arenas = {np.random.default_rng((3, identity.episode_seed(e))).random() for e in range(20)}
-    assert identity.noise(episode).random() not in arenas
+    assert identity.exploration(episode).random() not in arenas
 
 
 def test_a_step_has_the_number_of_its_request_even_if_periods_are_skipped(ask, monkeypatch):

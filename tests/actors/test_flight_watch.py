@@ -59,7 +59,7 @@ class WatchedFlight:
             self.client.feed(heartbeat() + position(theirs) + bytes(attitude) + bytes(force))
             if k % 25 == 0 and self.answers:
                 asked = round(1e9 * (self.now - 2.0 * self.delay))
-                self.watch.asked(asked)
+                self.watch.clock_requested(asked)
                 self.client.feed(bytes(mavlink.MAVLink_timesync_message(round(1e9 * theirs), asked).pack(MAV)))
             self.watch.note(self.now)
         return self.watch.lost(self.now)

@@ -195,9 +195,9 @@ def test_one_missing_quantity_is_lost_telemetry(flying: Flying) -> None:
 @of_one_autopilot
 def test_a_period_outside_of_the_geofence_is_lost(flying: Flying) -> None:
     vehicle, _, _ = flying
-    vehicle._client.outside = "boundary"
+    vehicle._client.breached_side = "boundary"
     assert "outside of its geofence (boundary)" in vehicle.wait(vehicle.current_period.number + 2).lost
-    vehicle._client.outside = ""
+    vehicle._client.breached_side = ""
     assert recovers(vehicle)
 
 

@@ -163,7 +163,7 @@ def test_a_breach_of_the_geofence_is_decoded() -> None:
     for breach, side in ((1, 2), (1, 3), (1, 0), (0, 3)):
         client.feed(mavlink.MAVLink_fence_status_message(breach, 1, side, 1000).pack(mav))
         expected = {2: "greatest altitude", 3: "boundary", 0: "geofence"}[side] if breach else ""
-        assert client.outside == expected
+        assert client.breached_side == expected
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,9 @@ from tests.robots import GROUND
 Change = Callable[[pb.Exchange], None]
 
 
-def episode(driver: EpisodeRunner, policy: Policy, question: Ask | None, number: int) -> Iterator[pb.Step]:
+def episode(driver: EpisodeRunner, policy: Policy, ask: Ask | None, number: int) -> Iterator[pb.Step]:
     """Yield the steps of one episode of a robot that is alone."""
-    for (step,) in run_episode(RobotGroup([driver]), [policy], question, number):
+    for (step,) in run_episode(RobotGroup([driver]), [policy], ask, number):
         yield step
 
 

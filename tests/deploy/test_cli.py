@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from brakeline.deploy.cli import COMMANDS, command_class, main, reason
 from brakeline.deploy.commands.certify_command import unrecorded, validation_table
 from brakeline.deploy.commands.common_options import Method
 from brakeline.deploy.commands.pretrain_command import PretrainCommand
-from brakeline.deploy.commands.query_command import load_scan, parse_obstacle, plan_table, proposal
+from brakeline.deploy.commands.query_command import OBSTACLE_FORMS, load_scan, parse_obstacle, plan_table, proposal
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.errors import BadScan
 from brakeline.logs.figure_tables import analyse
@@ -71,6 +72,7 @@ STATED = {
         ("certify --data {folder}/none.mcap", "no log at"),
         ("certify --data nothere.safetensors", "no data set at nothere.safetensors"),  # it is not recorded anew
         ("query ground --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y RADIUS"),
+        ("query quadrotor --connect tcp/127.0.0.1:1 --obstacle ball", "an obstacle is: cylinder X Y Z RADIUS HEIGHT"),
         ("query ground --connect tcp/127.0.0.1:1 --scan {folder}/none", "none"),
         ("status", "no run at runs/latest: give --connect tls/HOST:PORT"),
         ("query ground --known-free", "no run at runs/latest"),
@@ -163,6 +165,15 @@ def test_an_obstacle_is_parsed_from_words():
     for wrong in ((), ("pond", "1", "2"), ("cylinder", "1", "2"), ("box", "1", "2", "x", "4")):
         with pytest.raises(ValueError, match="an obstacle is"):
             parse_obstacle(wrong, 2)
+
+
+@pytest.mark.parametrize("dim", OBSTACLE_FORMS)
+def test_an_obstacle_is_parsed_in_each_form_that_the_error_names(dim):
+    for form in OBSTACLE_FORMS[dim].split(" | "):
+        kind, *names = form.replace("[YAW]", "YAW").split()
+        assert parse_obstacle((kind, *["0.5"] * len(names)), dim).kind == kind
+        with pytest.raises(ValueError, match=re.escape(OBSTACLE_FORMS[dim])):
+            parse_obstacle((kind, "0.5"), dim)
 
 
 def test_collect_is_reproducible_by_its_seed(figures, tmp_path):

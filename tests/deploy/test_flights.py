@@ -40,8 +40,8 @@ def test_a_policy_that_accounts_for_the_delay_reaches_every_goal() -> None:
 
 
 def test_without_answers_the_robot_brakes_along_its_backup_plan() -> None:
-    driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
-    assert question is not None
+    driver, policy, ask = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    assert ask is not None
     driver.begin(0)
 
     def nobody(requests):
@@ -49,7 +49,7 @@ def test_without_answers_the_robot_brakes_along_its_backup_plan() -> None:
 
     for step in range(14 + ROBOT.horizon):
         proposal = np.asarray(policy(driver.observation, driver.info))
-        outcome = driver.decide(proposal, question if step < 14 else nobody)
+        outcome = driver.decide(proposal, ask if step < 14 else nobody)
         expected = driver.backup_plan.plan[1].copy()
         taken = driver.execute(proposal, outcome)
         if step >= 14:
@@ -61,11 +61,11 @@ def test_without_answers_the_robot_brakes_along_its_backup_plan() -> None:
 
 
 def test_a_continuous_flight_keeps_its_plan_from_goal_to_goal() -> None:
-    driver, _, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
-    assert question is not None
+    driver, _, ask = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    assert ask is not None
     flying = EpisodeRunner(ROBOT, driver.env, ActorIdentity("a", 0, 0), continuous=True)
     flying.begin(0)
-    outcome = flying.decide(np.array([1.0, 0.0, 0.0]), question)
+    outcome = flying.decide(np.array([1.0, 0.0, 0.0]), ask)
     flying.execute(np.array([1.0, 0.0, 0.0]), outcome)
     plan = flying.backup_plan.plan.copy()
     assert plan.any()
@@ -74,9 +74,9 @@ def test_a_continuous_flight_keeps_its_plan_from_goal_to_goal() -> None:
 
 
 def test_a_log_has_the_inputs_in_force() -> None:
-    driver, policy, question = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
+    driver, policy, ask = prepare_evaluation(ROBOT, Evaluation("greedy", accept_bound=BOUND))
     steps, in_force = [], []
-    for step in episode(driver, policy, question, 0):
+    for step in episode(driver, policy, ask, 0):
         steps.append(step)
         in_force.append(np.array(driver.info["input_in_force"]))  # from the state after this step on
     (trajectory,) = trajectories_of(steps, ROBOT)
@@ -102,8 +102,8 @@ def test_a_request_has_kilobytes_with_a_scan_and_hundreds_of_bytes_with_a_map(da
 def test_a_flight_by_range_images_alone_does_not_collide(policy, faults):
     conditions = Conditions(perception=Perception("scan", FAULTS[faults]))
     what = Evaluation(policy, conditions=conditions, accept_bound=BOUND)
-    driver, choose, question = prepare_evaluation(QUADROTOR, what)
-    weighed = perception_cost.Weighed(question)
+    driver, choose, ask = prepare_evaluation(QUADROTOR, what)
+    weighed = perception_cost.Weighed(ask)
     steps = list(islice(episode(driver, choose, weighed, 0), 40))
     assert len(steps) > 10 and not any(step.collision for step in steps)
     kinds = Counter(KINDS[step.decision] for step in steps)

@@ -26,7 +26,7 @@ import numpy as np
 import psutil
 
 from benchmarks import sitl
-from benchmarks.flights import SETUPS, switched_on
+from benchmarks.flights import SETUPS, started_autopilot
 from benchmarks.timing import Words, repeated
 from brakeline.actors.mavlink.autopilot_commands import AutopilotClient
 from brakeline.actors.mavlink.ground_truth import MavlinkGroundTruth
@@ -120,10 +120,13 @@ class Record:
 def _flight(record: Record, start: Path, home: Path, folder: Path, random: Random) -> None:
     """Fly from the start of the autopilot to the last fault, or to a crash."""
     with (
-        switched_on(record.setup, start, home) as (url, system),
+        started_autopilot(record.setup, start, home) as (url, system),
         relayed(url) as relay,
         judged(sitl.beside(record.setup.kind, system, url), system) as judge,
-        _flown([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (fly, steps),
+        _running_flight([*record.setup.words, "--url", relay.url, "--system", str(system)], home, folder) as (
+            fly,
+            steps,
+        ),
     ):
         _until(lambda: judge.airborne, fly)
         _until(partial(steps.beyond, AGAIN), fly)
@@ -150,7 +153,7 @@ def _flight(record: Record, start: Path, home: Path, folder: Path, random: Rando
 
 
 @contextmanager
-def _flown(where: list[str], home: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Steps]]:
+def _running_flight(where: list[str], home: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], Steps]]:
     words = [*where, "--policy", POLICY, "--arena", ARENA, "--at-start", "--minutes", "600", "--pictures", "0"]
     fly = subprocess.Popen(
         [*PYTHON, "-m", "brakeline.deploy.cli", "fly", *words, "--raise-limits", "--json", "--out", str(home / "run")],

@@ -48,8 +48,8 @@ def excess(positions: Array, center: Array, half: Array) -> Array:
 class Loss:
     """Flights that end with the actor's death, behind an autopilot with one timeout."""
 
-    def __init__(self, question: Ask, timeout: float) -> None:
-        self._question, self._timeout = question, timeout
+    def __init__(self, ask: Ask, timeout: float) -> None:
+        self._ask_for, self._timeout = ask, timeout
         self._env = NavigationEnv(ROBOT, "default", self._vehicle, seed_key=77)
         self.collisions = 0
 
@@ -59,7 +59,7 @@ class Loss:
         propose, driver = scripted(policy, ROBOT, rng), EpisodeRunner(ROBOT, self._env, ActorIdentity("actor", 0, 0))
         driver.begin(number)
         for _ in range(int(rng.integers(3, LONGEST))):
-            outcome = driver.decide(propose(driver.observation, driver.info), self._question)
+            outcome = driver.decide(propose(driver.observation, driver.info), self._ask_for)
             driver.execute(driver.backup_plan.plan[0], outcome)
             if not driver.running:
                 break
@@ -91,10 +91,10 @@ class Loss:
 
 
 def run() -> Figures:
-    question = in_process(model_for(ROBOT, ModelConfig()))
+    ask = in_process(model_for(ROBOT, ModelConfig()))
     figures: Figures = {}
     for timeout in TIMEOUTS:
-        loss = Loss(question, timeout)
+        loss = Loss(ask, timeout)
         outside = np.array([loss.outside(policy, number) for policy in POLICIES for number in range(FLIGHTS)])
         figures[f"setpoint timeout {timeout} s"] = {
             "flights": len(outside),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from benchmarks.flights import Failed, flown
+from benchmarks.flights import NoFigures, flight_row
 from brakeline.messaging.byte_links import Tcp, Udp, open_link
 from brakeline.messaging.free_ports import free_udp_port
 from tests.faults.link_faults import Outcomes, Relay, Steps
@@ -62,6 +62,6 @@ def test_of_cut_links_the_longest_way_is_told() -> None:
 
 def test_a_flight_that_did_not_take_off_is_a_row() -> None:
     def fly() -> dict[str, object]:
-        raise Failed("fly: no figures, status 1")
+        raise NoFigures("fly: no figures, status 1")
 
-    assert flown(fly) == {"failed": "fly: no figures, status 1"}
+    assert flight_row(fly) == {"failed": "fly: no figures, status 1"}

@@ -12,7 +12,7 @@ import grimp
 # The parts that a part may import, from top to bottom. `part.module` allows that module alone, and what is below it.
 PARTS: dict[str, tuple[str, ...]] = {
     "deploy": ("actors", "learner", "logs", "safety", "sim", "messaging", "errors", "extras", "robots", "policies"),
-    # An actor knows how to ask the safety service, and what to keep between two questions. The ROS 2 node also turns
+    # An actor knows how to ask the safety service, and what to keep between two queries. The ROS 2 node also turns
     # what a scan does not show to be free into obstacles.
     "actors": (
         *(

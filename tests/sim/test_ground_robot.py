@@ -11,7 +11,7 @@ from brakeline.errors import BadInput
 from brakeline.messaging.obstacle import CYLINDER, Array, Obstacle
 from brakeline.sim.arena import Arena
 from brakeline.sim.floor_physics import FloorPhysics
-from brakeline.sim.ground_estimator import CUT, Estimator, cut_normal, steady_gain, wrap
+from brakeline.sim.ground_estimator import CUT, GroundEstimator, cut_normal, steady_gain, wrap
 from brakeline.sim.ground_realtime import RealtimeGroundRobot
 from brakeline.sim.ground_robot import MODEL, SAMPLE_TIME, WHEEL_RADIUS, GroundRobot, NoiseLevels
 from brakeline.sim.scripted_policies import scripted
@@ -199,8 +199,8 @@ def test_samples_without_a_look_at_contacts_have_the_same_motion_to_the_bit() ->
 SAMPLE, RADIUS, SAMPLES = 0.02, 0.033, 10
 
 
-def estimator(noise: NoiseLevels, seed: int = 0) -> Estimator:
-    return Estimator(noise, np.random.default_rng(seed), np.zeros(3), np.zeros(2), RADIUS, SAMPLE)
+def estimator(noise: NoiseLevels, seed: int = 0) -> GroundEstimator:
+    return GroundEstimator(noise, np.random.default_rng(seed), np.zeros(3), np.zeros(2), RADIUS, SAMPLE)
 
 
 def test_noise_is_cut_off_and_otherwise_normal() -> None:
@@ -260,7 +260,7 @@ def test_fusion_is_better_than_a_fix_and_within_its_bound() -> None:
 
 def test_the_heading_wraps() -> None:
     assert wrap(3.0 * math.pi) == pytest.approx(-math.pi)
-    sensors = Estimator(
+    sensors = GroundEstimator(
         NoiseLevels(scale=0.0), np.random.default_rng(0), np.array([0, 0, 3.1]), np.zeros(2), RADIUS, SAMPLE
     )
     reading = sensors.update(np.zeros((SAMPLES, 2)), np.full(SAMPLES, 0.5), np.array([0.0, 0.0, wrap(3.2)]))

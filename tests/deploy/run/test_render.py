@@ -12,8 +12,8 @@ from tests.robots import GROUND
 
 @pytest.fixture(scope="module")
 def film(data_folder) -> Film:
-    driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", episodes=1))
-    whole = record(driver, policy, question, 0)
+    driver, policy, ask = prepare_evaluation(GROUND, Evaluation(policy="greedy", episodes=1))
+    whole = record(driver, policy, ask, 0)
     return Film(whole.robot, whole.arena, whole.frames[:12], whole.frames[12].position, "cut")
 
 
@@ -26,8 +26,8 @@ def test_the_frames_are_what_was_decided(film):
 
 
 def test_without_a_filter_there_is_no_tube(data_folder):
-    driver, policy, question = prepare_evaluation(GROUND, Evaluation(policy="greedy", method="none"))
-    recorded = record(driver, policy, question, 1)
+    driver, policy, ask = prepare_evaluation(GROUND, Evaluation(policy="greedy", method="none"))
+    recorded = record(driver, policy, ask, 1)
     assert recorded.frames[0].kind == "no filter" and len(recorded.frames[0].view.centers) == 0
     assert recorded.end in ("goal", "collision", "out of time")
 
