@@ -54,7 +54,7 @@ def check_numbers(
     if not all(0.0 <= value <= FARTHEST for value in bounds):
         raise BadScan(f"a {name}'s errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
     if not 0.0 <= far <= MAX_FAR:
-        raise BadScan(f"a {name}'s `far` is from 0 to {MAX_FAR:g} m, not {far:g}: give it in m")
+        raise BadScan(f"a {name}'s `far` is finite, and from 0 to {MAX_FAR:g} m, not {far:g}: give it in m")
     if not (math.isfinite(least_width) and least_width > 0.0):
         raise BadScan(f"a {name}'s least width must be positive")
 

@@ -359,7 +359,7 @@ def main(settings: SafetySettings) -> None:
                 signed = SignedModel(message.file, message.claim, message.signature)
                 models.install(trust.open(signed, message.robot), signed, trust.number(signed))
             except (BadModel, BusError) as error:
-                log.error("a model was refused: %s", error)
+                log.error("a model at %s was refused: %s", sample.key[:200], error)
 
         before = perf_counter_ns() * 1e-9, 0.0  # time of the last figures, and the busy time until then [s]
 
