@@ -91,7 +91,7 @@ SETUPS = {
     HEARING: Setup("px4", HEARD),
     LED: Setup("ardupilot", STIFF, ("--lead",)),
     INDOORS: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True),
-    OUTDOORS_ONCE: Setup("ardupilot", STEADY, outside=0.012),
+    OUTDOORS_ONCE: Setup("ardupilot", STEADY, outside=0.005),
     INDOORS_ONCE: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **ALERT}, cameras=True, outside=0.005),
     INDOORS_LED: Setup("px4", {**HEARD, **motion_capture.PARAMETERS, **PATIENT}, ("--lead",), cameras=True),
 }

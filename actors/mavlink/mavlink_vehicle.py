@@ -121,6 +121,12 @@ class MavlinkVehicle(PeriodicVehicle):
         self._pump = threading.Thread(target=self._run, name="mavlink", daemon=True)
         self._pump.start()
 
+    @property
+    def autopilot(self) -> str:
+        """The kind of autopilot, as its heartbeat says: "ardupilot" or "px4"."""
+        assert self._client.kind is not None, "it has taken off"
+        return self._client.kind
+
     def commit(self, plan: Array, number: int) -> bool:
         """Carry out a plan (K, 3) [m/s], clipped to bounds and slew, from period `number` on, and then zero.
 

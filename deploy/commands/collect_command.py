@@ -67,7 +67,7 @@ class CollectCommand:
         if self.url and (self.trajectories is not None or self.physics != options.PhysicsOptions()):
             raise ValueError("--url ignores --trajectories and what changes the simulator: leave these options out")
         age = self.first.acceleration_age
-        if not 0.0 <= age <= OLDEST:
+        if age is not None and not 0.0 <= age <= OLDEST:
             raise ValueError(f"--acceleration-age is a number of seconds from 0 to {OLDEST:g}, not {age:g}")
         if not self.url and (self.first != FirstFlightSettings() or self.accept_bound is not None):
             raise ValueError("the options of a first flight, such as --minutes and --accept-bound, need --url")

@@ -45,10 +45,10 @@ class FirstFlightSettings:
     """Send position targets instead of velocities. If setpoints stop, the vehicle then stays at the last target.
     Without this option, an ArduCopter without GUID_TIMEOUT flies on for 3 s. The option changes how the vehicle flies,
     so use it with both `collect` and `fly`."""
-    acceleration_age: float = 0.0
-    """Record the horizontal acceleration of this long ago instead of the present one [s], at most 1. Behind an
-    autopilot that plans its acceleration ahead, a control period (0.2) can make the sets narrower. `fly` then reports
-    the same one."""
+    acceleration_age: float | None = None
+    """Record the horizontal acceleration of this long ago instead of the present one [s], at most 1. By default a
+    control period (0.2) behind ArduPilot, which plans its acceleration ahead, and 0 behind other autopilots. `fly`
+    then reports the same one."""
 
 
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: Path) -> FirstFlightResult:
@@ -79,15 +79,18 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
         height=settings.height,
         raise_limits=settings.raise_limits,
         lead=settings.lead,
-        acceleration_age=settings.acceleration_age,
     )
     # A second signal must not leave the vehicle in the air. No actor of this machine may take the vehicle.
     with stop_on_signals(threading.Event(), patient=True) as stop, listening(url, settings.system):
         vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set, from_ground=True)
+        age = settings.acceleration_age
+        if age is None:
+            age = robot.period if vehicle.autopilot == "ardupilot" else 0.0
+        vehicle.acceleration_age = age
         try:
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
-            metadata = {"autopilot": "; ".join(vehicle.notes), "url": url} | about_age([settings.acceleration_age])
+            metadata = {"autopilot": "; ".join(vehicle.notes), "url": url} | about_age([age])
             flight = FirstFlight(vehicle, robot, box, seed, stop.is_set)
             try:
                 flight.fly(settings.minutes)
