@@ -91,8 +91,8 @@ class RangeImage:
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
         if (len(self.at), len(self.attitude), len(self.mount)) != (3, 4, 3):
             raise BadScan("a range image's place and mount have 3 coordinates, its attitude 4")
-        bounds = (self.far, self.range_error, self.position_error, self.angle_error, self.speed, self.age)
-        check_numbers("range image", (*self.at, *self.attitude, *self.mount), bounds, self.least_width)
+        bounds = (self.range_error, self.position_error, self.angle_error, self.speed, self.age)
+        check_numbers("range image", (*self.at, *self.attitude, *self.mount), self.far, bounds, self.least_width)
         if abs(math.hypot(*self.attitude) - 1.0) > 1e-3:
             raise BadScan("a range image's attitude is a unit quaternion")
         if self.angle_error > MAX_ANGLE_ERROR:

@@ -19,6 +19,8 @@ from brakeline.messaging.obstacle import FARTHEST, Array
 from brakeline.messaging.value_equality import same_values
 
 MAX_BEAMS = 1000
+MAX_FAR = 1000.0  # largest range of a sensor [m]: a larger one is in mm
+BEYOND_FAR = 10.0  # times `far`; a larger range is in mm
 MAX_SCAN_AGE = 2.0  # age from which a scan or range image shows no free space any more [s]
 MAX_TRACK_VALUE = 1e4  # largest speed [m/s], error [m/s] and acceleration [m/s²] of a track
 
@@ -33,11 +35,14 @@ def check_unit(ranges: object) -> None:
         raise BadScan(f"ranges are in m: an array of {ranges.dtype} may be in mm; divide, or give `.astype(float)`")
 
 
-def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[float], least_width: float) -> None:
+def check_numbers(
+    name: str, coordinates: Iterable[float], far: float, bounds: Iterable[float], least_width: float
+) -> None:
     """Check the numbers that scans and range images have in common.
 
     Args:
         name: "scan" or "range image".
+        far: largest range [m].
         coordinates: of the pose and the mount.
         bounds: errors, speeds, times and other values that are not negative.
 
@@ -48,6 +53,8 @@ def check_numbers(name: str, coordinates: Iterable[float], bounds: Iterable[floa
         raise BadScan(f"a {name}'s pose, attitude and mount must be finite, and within {FARTHEST:g}")
     if not all(0.0 <= value <= FARTHEST for value in bounds):
         raise BadScan(f"a {name}'s errors, speed and age must be finite, not negative, and {FARTHEST:g} at most")
+    if not 0.0 <= far <= MAX_FAR:
+        raise BadScan(f"a {name}'s `far` is finite, and from 0 to {MAX_FAR:g} m, not {far:g}: give it in m")
     if not (math.isfinite(least_width) and least_width > 0.0):
         raise BadScan(f"a {name}'s least width must be positive")
 
@@ -151,9 +158,12 @@ class Scan:
             raise BadScan("a scan's ranges are 0 or more")
         if len(self.pose) != 3 or len(self.mount) != 2:
             raise BadScan("a scan's pose has 3 coordinates, its mount 2")
-        bounds = (self.far, self.range_error, self.position_error, self.heading_error, self.speed, self.age)
+        bounds = (self.range_error, self.position_error, self.heading_error, self.speed, self.age)
         more = (self.doubt, self.acceleration, self.least_radius)
-        check_numbers("scan", (*self.pose, *self.mount), (*bounds, *more), self.least_width)
+        check_numbers("scan", (*self.pose, *self.mount), self.far, (*bounds, *more), self.least_width)
+        if (largest := float(np.nan_to_num(self.ranges).max(initial=0.0))) > BEYOND_FAR * self.far:
+            # Beyond `far` a beam hits nothing: in mm, all ranges would say that space is free.
+            raise BadScan(f"a range of {largest:g} m with `far` {self.far:g} m: give both in m, and `far` for no hit")
         if self.doubt != int(self.doubt):
             raise BadScan("a scan's doubt is a whole number of beams")
         object.__setattr__(self, "doubt", int(self.doubt))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.markup import escape
@@ -106,10 +107,7 @@ class RobotCommand:
     def _show(self) -> int:
         robot = robot_named(self.file)
         values = summary(robot)
-        rows = [
-            (escape(f"input {label}"), f"{one['low']:g} to {one['high']:g}, stop: {one['stop']}")
-            for label, one in values["inputs"].items()
-        ]
+        rows = [(escape(f"input {label}"), _input_text(one)) for label, one in values["inputs"].items()]
         for name, value in values.items():
             if name != "inputs":
                 text = "\n".join(value) if isinstance(value, list) else value
@@ -117,6 +115,11 @@ class RobotCommand:
                 rows.append((escape(_label(name)), escape(text)))
         print_result(self.json, values, plain_table((), rows))
         return 0
+
+
+def _input_text(one: dict[str, Any]) -> str:
+    slew = f"slew: {one['slew']:g}, " if math.isfinite(one["slew"]) else ""
+    return f"{one['low']:g} to {one['high']:g}, {slew}stop: {one['stop']}"
 
 
 def _label(name: str) -> str:

@@ -62,7 +62,7 @@ def remarks(robot: Robot) -> list[str]:
 
 def summary(robot: Robot) -> dict[str, Any]:
     """Return the main figures of a description, as JSON values."""
-    rules = zip(robot.action, robot.action_low, robot.action_high, robot.stop, strict=True)
+    rules = zip(robot.action, robot.action_low, robot.action_high, robot.action_slew, robot.stop, strict=True)
     distance = nominal_stopping_distance(robot)
     position = {"way_to_a_stop_m": distance, "footprint_m": robot.footprint, "discs": len(robot.body)}
     return {
@@ -70,9 +70,10 @@ def summary(robot: Robot) -> dict[str, Any]:
         "period_s": robot.period,
         "state": list(robot.state),
         "inputs": {
-            label: {"low": low, "high": high, "stop": list(rule) if isinstance(rule, tuple) else rule}
-            for label, low, high, rule in rules
+            label: {"low": low, "high": high, "slew": slew, "stop": list(rule) if isinstance(rule, tuple) else rule}
+            for label, low, high, slew, rule in rules
         },
+        "horizon": robot.horizon,
         "plan_s": robot.horizon * robot.period,
         "braking_s": robot.brake_steps * robot.period,
         **(position if robot.position_dim else {}),

@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-from brakeline.errors import Busy, Expired, Malformed
+from brakeline.errors import Busy, Expired, Malformed, NoModel, UnknownRobot
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.bus.fair_queue import FairQueue
 from brakeline.messaging.bus.identity import identity_of
@@ -21,6 +21,7 @@ from brakeline.messaging.message_checks import NAME
 from brakeline.messaging.rejected_messages import RejectedMessages
 
 MOST_AT_ONCE = 256  # queries that a thread takes over from Zenoh before it looks after the queue
+ONE_NAME = "a query names one asker in its key, with up to 100 letters, digits, '_', '.' and '-'"
 LONGEST = 10.0  # longest time that a query waits; the default for one without a deadline [s]
 
 
@@ -105,15 +106,17 @@ class QueryServer(ReceiverThreads):
                 return
             try:
                 if not NAME.fullmatch(pending.asker):
-                    raise Malformed(f"{pending.asker[:100]!r} cannot ask: a query names one asker in its key")
+                    raise Malformed(f"{pending.asker[:100]!r} cannot ask: {ONE_NAME}")
                 answer = self._handler(query.payload.to_bytes() if query.payload else b"", pending.asker)
                 query.reply(query.key_expr, answer, express=True)
+            except (NoModel, UnknownRobot) as error:  # another service on the bus may have the model
+                self._pass_over(query, error)
             except Exception as error:
                 _refuse(query, error)
                 raise
 
-    def _pass_over(self, query: zenoh.Query, reason: Busy | Expired) -> None:
-        """Refuse a query that the machine is too slow for; the log has a warning, not an error."""
+    def _pass_over(self, query: zenoh.Query, reason: Exception) -> None:
+        """Refuse a query that the machine is too slow for, or that is for another service; the log has a warning."""
         _refuse(query, reason)
         self._rejected.reject(self._name, reason, logging.WARNING)
 

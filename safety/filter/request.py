@@ -34,6 +34,8 @@ IMPOSSIBLE = (
     "an obstacle has a negative size, axes that are not orthonormal, a rounding that is not 0 or 1, or a number that "
     "is infinite or too large"
 )
+SEND_LAST = "send the prediction of the last decision as it is, or none"
+EXECUTED = "state inputs as the robot executes them, in the units of its description"
 STOPPED = 0.9e-9  # an input below it surely belongs to a stop (`Robot.is_stop_input`)
 
 Named: TypeAlias = dict[str, tuple[NDArray[np.floating[Any]], tuple[int, ...]]]  # arrays, and the shapes they must have
@@ -189,13 +191,13 @@ def check_for_filter(robot: Robot, request: Request) -> None:
     check_motion(robot, request, further)
     _within_bounds(robot, "plan", request.plan)
     if not robot.is_stop_input(request.plan[-1]):
-        raise BadRequest("plan", "the committed plan does not end in a stop")
+        raise BadRequest("plan", "the backup plan does not end in a stop: append one to its rest in each period")
     check_surroundings(robot, request)
     if predicted is not None:
         if min(predicted.half_width.tolist()) < 0.0:
-            raise BadRequest("predicted_half_width", "a predicted set has a negative half-width")
+            raise BadRequest("predicted_half_width", f"a predicted set has a negative half-width: {SEND_LAST}")
         if not math.isfinite(predicted.heading):
-            raise BadRequest("predicted_heading", "predicted_heading is NaN or infinite")
+            raise BadRequest("predicted_heading", f"predicted_heading is NaN or infinite: {SEND_LAST}")
 
 
 def check_surroundings(robot: Robot, request: Request) -> None:
@@ -210,7 +212,8 @@ def check_surroundings(robot: Robot, request: Request) -> None:
     elif not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
         raise BadRequest("obstacles", NOTHING_KNOWN)
     if not 1.0 <= request.widening < math.inf:  # a smaller factor would make sets smaller than stated
-        raise BadRequest("widening", f"a widening is a finite factor of at least 1, not {request.widening:g}")
+        why = "send the factor of the last scores, or none"
+        raise BadRequest("widening", f"a widening is finite and at least 1, not {request.widening:g}: {why}")
     if request.past is not None:
         _check_past(robot, request.past)
     if not robot.position_dim:
@@ -247,11 +250,12 @@ def _check_no_space(robot: Robot, request: Request) -> None:
 def _check_past(robot: Robot, past: PastWindow) -> None:
     sizes = (robot.horizon, robot.state_dim), (robot.horizon + 1, robot.action_dim)
     if (past.states.shape, past.inputs.shape) != sizes:
-        raise BadRequest("past", f"past has {sizes[0][0]} states and {sizes[1][0]} inputs of {robot.name}")
+        why = f"past has {sizes[0][0]} states and {sizes[1][0]} inputs of {robot.name}: send a whole window, or none"
+        raise BadRequest("past", why)
     # The product is NaN or infinite if a value is, or if a value is very large.
     finite = all(math.isfinite(np.vdot(part, part)) for part in (past.states, past.inputs))
     if not finite and not (np.isfinite(past.states).all() and np.isfinite(past.inputs).all()):
-        raise BadRequest("past", "past holds NaN or infinity")
+        raise BadRequest("past", "past holds NaN or infinity: begin a new window after a period without a state")
 
 
 class FastRequestCheck:
@@ -316,8 +320,12 @@ def check_motion(robot: Robot, request: Request, further: Named) -> None:
 
 def _within_bounds(robot: Robot, name: str, inputs: Array) -> None:
     low, high = robot.bounds
-    if not ((inputs >= low) & (inputs <= high)).all():
-        raise BadRequest(name, f"{name}: an input is out of the robot's bounds")
+    outside = ~((inputs >= low) & (inputs <= high))  # NaN, too
+    if outside.any():
+        at = np.unravel_index(outside.argmax(), inputs.shape)
+        label, least, most = robot.action[at[-1]], robot.action_low[at[-1]], robot.action_high[at[-1]]
+        bounds = f"its bounds are {least:g} and {most:g}"
+        raise BadRequest(name, f"{name}: {label} is {inputs[at]:g}, and {bounds}: {EXECUTED}")
 
 
 def _sized(robot: Robot, name: str, value: NDArray[np.floating[Any]], shape: tuple[int, ...]) -> None:
@@ -332,4 +340,5 @@ def _finite(robot: Robot, named: Named) -> None:
         _sized(robot, name, value, shape)
         few = value.size <= FEW  # faster in a loop
         if not (all(map(math.isfinite, value.ravel().tolist())) if few else np.isfinite(value).all()):
-            raise BadRequest(name, f"{name} holds NaN or infinity")
+            why = "follow the backup plan until you have finite numbers"
+            raise BadRequest(name, f"{name} holds NaN or infinity: {why}")

@@ -108,9 +108,12 @@ class ModelRegistry:
         """
         method = self.filters.get(request.robot)
         if method is None:
-            if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
-                raise UnknownRobot(f"no robot is called {request.robot!r:.80} here")
             have = ", ".join(self.filters) or "none"
+            if request.robot.removesuffix(REAL_TIME_SUFFIX) not in shipped_robots():
+                raise UnknownRobot(
+                    f"no robot is called {request.robot!r:.80} here (loaded: {have}): start another service with its "
+                    "description (`brakeline safety FILE.toml`), or ask about these"
+                )
             start = f"start another service (`brakeline safety {request.robot}`)"
             raise NoModel(
                 "robot", f"no model of {request.robot} is loaded (loaded: {have}): {start}, or ask about these"
@@ -123,7 +126,8 @@ class ModelRegistry:
             )
         known = request.model in ("", UNVERIFIED) or request.model in self.known
         if not known and not self._archived(request.robot, request.model):
-            raise StaleModel("model", f"the plan was verified by model {request.model}, which was never in use here")
+            why = f"the plan was verified by model {request.model}, which was never in use here"
+            raise StaleModel("model", f"{why}: follow it until the robot stands, and then send an empty `model`")
         return method
 
     def _archived(self, robot: str, version: str) -> bool:
@@ -199,13 +203,21 @@ class BatchHandler:
     authenticator: PlanAuthenticator | None = None
 
     def __call__(self, payload: bytes, asker: str = "") -> bytes:
-        """Return the replies to a batch. Raises BadRequest if the bytes are not a batch.
+        """Return the replies to a batch.
 
         Args:
             asker: name of the process that asks; empty within one process.
+
+        Raises:
+            BadRequest: the bytes are not a batch.
+            UnknownRobot, NoModel: no request is about a robot of this service. A client takes the first answer that is
+                no error, so another service on the bus may answer.
         """
         received = perf_counter_ns()
         batch = batch_of(payload)
+        if all(message.robot not in self.models.filters for message in batch.requests):
+            self.counts.errors += len(batch.requests)
+            self.models.method_for(batch.requests[0])  # raises
         replies: list[pb.Reply] = [pb.Reply()] * len(batch.requests)
         for world in group_by_fleet(batch.requests):
             messages = [batch.requests[i] for i in world]
@@ -347,7 +359,7 @@ def main(settings: SafetySettings) -> None:
                 signed = SignedModel(message.file, message.claim, message.signature)
                 models.install(trust.open(signed, message.robot), signed, trust.number(signed))
             except (BadModel, BusError) as error:
-                log.error("a model was refused: %s", error)
+                log.error("a model at %s was refused: %s", sample.key[:200], error)
 
         before = perf_counter_ns() * 1e-9, 0.0  # time of the last figures, and the busy time until then [s]
 

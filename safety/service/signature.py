@@ -46,6 +46,7 @@ log = logging.getLogger("brakeline.safety")
 CONTEXT = b"brakeline model 1\n"  # signed with each claim, so that a signature is valid for nothing else
 KEY, LAST, SIGNERS = "signer.key", "signer.last", "signers"
 MOST = 2**63  # numbers of signatures are below
+SIGN = "sign it with `brakeline keys FOLDER --sign FILE`, by a key in `signers/` of the service's keys"
 ANY = "*"  # in a signer's list of robots: it may sign models of all
 
 
@@ -163,7 +164,7 @@ class TrustedSigners:
         robots = self._robots_of_signer(signed)
         claim = _claim(signed)
         if hashlib.sha256(signed.file).hexdigest() != claim["sha256"]:
-            raise Untrusted("the model's file is not the one that was signed")
+            raise Untrusted(f"the model's file is not the one that was signed: {SIGN}")
         if ANY not in robots and claim["robot"] not in robots:
             raise Untrusted(f"the signer may not sign models of {claim['robot']}")
         if robot is not None and claim["robot"] != robot:
@@ -202,7 +203,7 @@ class TrustedSigners:
             except InvalidSignature:
                 continue
             return robots
-        raise Untrusted("no trusted signer signed the model")
+        raise Untrusted(f"no trusted signer signed the model: {SIGN}")
 
 
 def write_signer(folder: Path, robots: tuple[str, ...] = (ANY,)) -> None:

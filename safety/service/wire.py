@@ -153,7 +153,8 @@ def _past_of(message: pb.Request, robot: Robot) -> PastWindow | None:
         return None
     states, inputs, N = array_of(message.past_states), array_of(message.past_inputs), robot.horizon
     if (states.size, inputs.size) != (N * robot.state_dim, (N + 1) * robot.action_dim):
-        raise BadRequest("past", f"past holds {N} states and {N + 1} inputs of {robot.name}")
+        why = f"past has {N} states and {N + 1} inputs of {robot.name}: send a whole window, or none"
+        raise BadRequest("past", why)
     return PastWindow(states.reshape(N, -1), inputs.reshape(N + 1, -1), message.past_from_start)
 
 
@@ -193,7 +194,7 @@ def measurement_of(message: pb.Request) -> RangeMeasurement | None:
     try:
         return measurement_in(message)
     except BadScan as error:
-        raise BadRequest("scan", str(error)) from error
+        raise BadRequest("scan" if message.HasField("scan") else "image", str(error)) from error
 
 
 def reservation_of(m: pb.Reservation, robot: Robot) -> Reservation:

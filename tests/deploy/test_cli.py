@@ -364,6 +364,8 @@ def test_a_new_description_has_no_mistake_and_check_lists_every_one(command, fig
 def test_show_prints_a_description(command, figures, robot):
     shown = figures("robot", "show", robot)
     assert shown["name"] == robot and shown["footprint_m"] in (0.105, 0.3)
+    assert {one["slew"] for one in shown["inputs"].values()} == {{"ground": None, "quadrotor": 0.8}[robot]}
+    assert shown["horizon"] == {"ground": 3, "quadrotor": 12}[robot]
     out = command("robot", "show", robot)[1]
     assert "[m/s]" in out and "layout" in out
 

@@ -100,9 +100,10 @@ GROUND_SCAN, SPACE_IMAGE = Scan(np.ones(360), FAN, (0.0,) * 3), RangeImage(np.on
         (GROUND, GROUND_SCAN, lambda m: m.scan.ranges.__setitem__(5, -1.0), "scan"),
         (QUADROTOR, GROUND_SCAN, lambda m: None, "scan"),
         (GROUND, SPACE_IMAGE, lambda m: None, "image"),
+        (QUADROTOR, SPACE_IMAGE, lambda m: m.image.attitude.pop(), "image"),
         (GROUND, GROUND_SCAN, lambda m: m.image.CopyFrom(asked(QUADROTOR, SPACE_IMAGE).image), "scan"),
     ],
-    ids=["negative range", "scan in space", "image in the plane", "both"],
+    ids=["negative range", "scan in space", "image in the plane", "malformed image", "both"],
 )
 def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robot, sensed, change, field):
     message = asked(robot, sensed)
@@ -111,6 +112,24 @@ def test_a_measurement_that_is_malformed_or_of_another_dimension_is_refused(robo
         check_for_filter(robot, request_of(message, robot))
     assert error.value.field == field
     check_for_filter(QUADROTOR, request_of(asked(QUADROTOR, SPACE_IMAGE), QUADROTOR))  # in space, an image is sound
+
+
+@pytest.mark.parametrize(
+    ("robot", "sensed", "change"),
+    [
+        (GROUND, GROUND_SCAN, lambda m: m.scan.ranges.__setitem__(slice(None), [230.0] * 360)),
+        (GROUND, GROUND_SCAN, lambda m: setattr(m.scan, "far", 3500.0)),
+        (QUADROTOR, SPACE_IMAGE, lambda m: setattr(m.image, "far", 20_000.0)),
+    ],
+    ids=["ranges in mm", "far in mm", "far of an image in mm"],
+)
+def test_ranges_in_millimetres_do_not_show_free_space(robot, sensed, change):
+    """A range beyond `far` hits nothing: a wall 0.23 m ahead would leave all space free."""
+    message = asked(robot, sensed)
+    request_of(message, robot)
+    change(message)
+    with pytest.raises(BadRequest, match="in m"):
+        request_of(message, robot)
 
 
 def test_a_batch_may_hold_24_images_but_not_48():

@@ -1,13 +1,15 @@
 """The service checks each request, and the client each reply."""
 
 import logging
+import re
+import time
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from brakeline.errors import BadRequest, NoReply, Refused, SafetyError
+from brakeline.errors import BadRequest, NoModel, NoReply, Refused, SafetyError, UnknownRobot
 from brakeline.messaging import brakeline_pb2 as pb
 from brakeline.messaging.obstacle import Obstacle
 from brakeline.messaging.robot import Disc
@@ -89,8 +91,6 @@ def verified(service, message=None):
         ("plan", bad(plan=[0.0] * 5)),
         ("plan", bad(plan=[0.0] * 600)),
         ("predicted_half_width", bad(predicted_center=[0.0] * 5)),
-        ("robot", bad(robot="submarine")),
-        ("robot", bad(robot="")),
         ("obstacles", bad(obstacles=[])),
         ("model", bad(model="../../etc/passwd")),
         ("obstacles[1].size", with_obstacle(size=[-0.1])),
@@ -139,6 +139,35 @@ def test_the_service_refuses_bytes_that_are_not_a_batch_and_goes_on(service):
         verified(service)
 
 
+@pytest.mark.parametrize("robot", ["submarine", "", "quadrotor"])
+def test_a_batch_about_other_robots_is_refused_as_a_whole(service, robot):
+    """So another service on the bus may answer: a client takes the first answer that is no error."""
+    advice = r"loaded: ground\): start another service .*`brakeline safety "
+    with pytest.raises((UnknownRobot, NoModel), match=advice) as caught:
+        service.answer(pb.RequestBatch(requests=[bad(robot=robot)] * 2).SerializeToString())
+    assert caught.value.field == "robot" and service.counts.errors == 2
+    mixed = service.replies(bad(robot=robot), good())
+    assert [reply.WhichOneof("result") for reply in mixed] == ["error", "decision"]
+    assert mixed[0].error.field == "robot"
+
+
+@pytest.mark.parametrize(
+    ("message", "advice"),
+    [
+        (bad(plan=[3.0, 0, 0, 0, 0, 0]), r"plan: speed \[m/s\] is 3, and its bounds are 0 and 0.25: state inputs as"),
+        (bad(input_in_force=[0.0, 28.6]), r"turn rate \[rad/s\] is 28.6, and its bounds are -0.5 and 0.5: .* units"),
+        (bad(plan=[0, 0, 0, 0, 0.1, 0]), "does not end in a stop: append one"),
+        (bad(state=[0, 0, NAN, 0, 0]), "state holds NaN or infinity: follow the backup plan"),
+        (bad(widening=0.5), "at least 1, not 0.5: send the factor"),
+        (bad(past_states=[0.0] * 5), "past has 3 states and 4 inputs of ground: send a whole window, or none"),
+        (bad(past_states=[NAN] * 15, past_inputs=[0.0] * 8), "past holds NaN or infinity: begin a new window"),
+        (bad(predicted_center=[0.0] * 5, predicted_half_width=[-0.1] * 5), "negative half-width: send the prediction"),
+    ],
+)
+def test_a_refusal_says_what_to_send(service, message, advice):
+    assert re.search(advice, service.error(message).message)
+
+
 def test_random_damage_never_gets_an_unchecked_decision(service):
     """A changed byte may make another valid request. The reply is an error or a plan within bounds."""
     rng = np.random.default_rng(1)
@@ -148,7 +177,7 @@ def test_random_damage_never_gets_an_unchecked_decision(service):
         damaged[rng.integers(len(damaged))] = rng.integers(256)
         try:
             replies = pb.ReplyBatch.FromString(service.answer(bytes(damaged))).replies
-        except BadRequest:
+        except (BadRequest, UnknownRobot):
             continue
         for reply in replies:
             if reply.WhichOneof("result") == "decision":
@@ -158,8 +187,9 @@ def test_random_damage_never_gets_an_unchecked_decision(service):
 
 
 def test_without_a_model_and_after_an_unexpected_failure_the_reply_is_an_error(service, monkeypatch, caplog):
-    error = Service().error(good())
-    assert (error.type, error.field) == ("NoModel", "robot")
+    with pytest.raises(NoModel) as caught:
+        Service().error(good())
+    assert caught.value.field == "robot"
 
     def broken(request):
         raise ArithmeticError("boom")
@@ -310,3 +340,25 @@ def test_a_client_over_the_bus(join, endpoint, service):  # noqa: F811
         with pytest.raises(Refused):
             client.bus.ask(DECIDE, b"\xff" * 20, 5.0, robot="ground")
         assert client.decide(answer.predicted.center, [0.0, 0.1], [AHEAD]).verified
+
+
+def test_a_service_of_other_robots_takes_no_client_from_the_one_that_can_answer(join, endpoint, service):  # noqa: F811
+    """Its refusal comes first, since it decides nothing."""
+
+    def slowly(payload, asker):
+        time.sleep(0.2)
+        return service.answer(payload, asker)
+
+    with_another_robot = Service()
+    join("safety", listen=True).serve(DECIDE, with_another_robot.answer)
+    join("safety-1").serve(DECIDE, slowly)
+    with SafetyClient.open(endpoint, "ground", deadline=5.0) as client:
+        for _ in range(100):
+            with suppress(Refused, NoReply):  # the second service is not yet known to the first
+                client.decide(np.zeros(5), [0.25, 0.05], [AHEAD])
+                break
+            time.sleep(0.02)
+        for _ in range(3):
+            client.reset()
+            assert client.decide(np.zeros(5), [0.25, 0.05], [AHEAD]).verified
+        assert with_another_robot.counts.errors, "it was asked, too"
