@@ -108,7 +108,7 @@ class AutopilotClient(MavlinkDecoder):
         return False
 
     def ask_time(self, now: int) -> None:
-        """Request the autopilot's clock by TIMESYNC; now: our clock, ns. The reply goes to `answers`."""
+        """Request the autopilot's clock by TIMESYNC; now: our clock, ns. The reply goes to `clock_answers`."""
         self._mav.timesync_send(0, now)
 
     def heartbeat(self) -> None:

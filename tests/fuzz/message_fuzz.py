@@ -31,7 +31,7 @@ from brakeline.deploy.run.display import line
 from brakeline.deploy.run.launcher import Launcher
 from brakeline.deploy.run.log_contents import derive_entries
 from brakeline.deploy.run.run_config import RunConfig
-from brakeline.errors import BadModel, BadRequest, BusError
+from brakeline.errors import BadModel, BadRequest, BusError, UnknownRobot
 from brakeline.learner.learner import Learner
 from brakeline.learner.learner_config import LearnerConfig
 from brakeline.learner.learner_process import LearnerLoop, LearnerSettings
@@ -195,7 +195,7 @@ def safety() -> Party:
             else:
                 with rejected.skip_on_error(sample.key):
                     models.install(decode(sample.message().file))
-        except (BadRequest, BadModel):
+        except (BadRequest, UnknownRobot, BadModel):
             return
 
     return Party((DECIDE, MODEL), take, lambda: models.filters, rejected)

@@ -112,7 +112,8 @@ def test_a_talkative_autopilot_fills_no_memory() -> None:
         ):
             decoder.feed(message.pack(sender))
     assert decoder.texts[-1] == f"text {MOST_PARAMETERS + 199}" and len(decoder.texts) == MOST_TEXTS
-    assert len(decoder._parameters) == len(decoder._types) == MOST_PARAMETERS and len(decoder.answers) <= MOST_TEXTS
+    assert len(decoder._parameters) == len(decoder._types) == MOST_PARAMETERS
+    assert len(decoder.clock_answers) <= MOST_TEXTS
     assert decoder._parameters[f"P{MOST_PARAMETERS + 199}"] == MOST_PARAMETERS + 199 and "P0" not in decoder._parameters
 
 

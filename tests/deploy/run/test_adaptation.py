@@ -30,6 +30,7 @@ from brakeline.safety.model.calibration_samples import samples_of
 from brakeline.safety.model.dataset import Dataset
 from brakeline.safety.model.error_bounds import ErrorBound
 from brakeline.safety.model.model_set import DIRECT, ONE_STEP, RECURSION, ModelConfig, ModelSet
+from brakeline.safety.model.one_step_fitting import window_scores
 from brakeline.safety.model.set_shape import plans_from
 from brakeline.safety.model.validation import most_violations
 from brakeline.safety.model.windows import FREE, plan_regressor_map, windows
@@ -270,7 +271,8 @@ def test_an_update_whose_rollouts_diverge_leaves_every_set():
     )
     correction = SimpleNamespace(gram=range(int(s.fold.max()) + 1), fit=lambda *choice, without: without_end)
     widths = np.ones((*s.after.shape[:2], s.after.shape[2] + 1))
-    assert np.isinf(one_step_update._scores(ROBOT, s, correction, (1.0, False), widths)[0]).all()
+    used = one_step_update._shares_used(ROBOT, s, correction, (1.0, False), widths)
+    assert np.isinf(window_scores(ROBOT, used)[0].max(0)).all()
 
 
 def share_outside(model, data):
