@@ -270,7 +270,7 @@ def _growth(robot: Robot, s: Samples, regression: Regression, candidate: Candida
 def _shares_used(robot: Robot, s: Samples, regression: Regression, choice: Choice, progress: Progress) -> Array:
     """Return how much of its sets each window used (T, N, n' + 1), from the folds that it is not in.
 
-    The last coordinate are the chord deviations.
+    The last coordinate is the chord deviation.
     """
     used = np.zeros((*s.after.shape[:2], s.after.shape[2] + 1))
     for i in regression.folds:

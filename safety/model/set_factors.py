@@ -34,8 +34,8 @@ class SetFactors:
         """Return factors that leave at most a share `outside` of the windows of every kind outside.
 
         Over all windows, one factor holds for all coordinates: of a share `outside`, any coordinate may leave. A kind
-        of driving with few windows may need much larger sets for a few events, such as the loss of height in fast
-        turns. Then only the coordinates that leave get larger factors.
+        of driving with few windows may need much larger sets for a few events, such as errors of the height in fast
+        flight. Then only the coordinates that leave get larger factors.
 
         Inputs that jump in most periods excite motion that no state shows, such as a quadrotor's attitude. For all
         driving, `plan` would have to be several times as large. No plan of the filter jumps like this, so only `first`
