@@ -125,7 +125,7 @@ def update_one_step(in_use: ModelSet, data: Dataset, outside: float) -> tuple[Mo
         raise ErrorBoundError("only a model set of mode one-step can be updated")
     s = samples_of(data.joined())
     correction, kinds = Correction.of(robot, before, s), driving_kinds(robot, s.z, s.start)
-    kinds[JUMPING] = np.zeros(len(s.z), dtype=bool)  # the shape was fitted without them, and the robot drives like that
+    kinds[JUMPING] = np.zeros(len(s.z), dtype=bool)  # none is left out: the robot may go on to drive like that
     chords = in_use.chord_deviations.half_widths(s.z)[..., None]
     widths = np.concatenate([np.stack([step.half_widths(s.z) for step in in_use.steps], 1), chords], axis=2)
     choices = product(OLD_WEIGHTS, (False, True))
