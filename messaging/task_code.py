@@ -42,9 +42,10 @@ def load_code(place: str, folder: Path) -> Any:
     """
     module, _, name = FORMER_PLACES.get(place, place).partition(":")
     try:
-        if module.endswith(".py"):
-            return getattr(_module_in(folder / module), name)
-        return getattr(importlib.import_module(module), name)
+        loaded = _module_in(folder / module) if module.endswith(".py") else importlib.import_module(module)
+        if not hasattr(loaded, name):
+            raise AttributeError(f"{module} has no {name!r}")
+        return getattr(loaded, name)
     except (ImportError, AttributeError, OSError) as error:
         if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
             raise missing from error

@@ -60,7 +60,7 @@ def test_a_class_in_a_file_of_your_own_is_a_policy(tmp_path, monkeypatch):
     [
         ("agent.py:Alone", r"cannot be called with \(robot, generator\)"),
         ("agent.py:Silent", "define __call__"),
-        ("agent.py:Nobody", "no code that can be loaded"),
+        ("agent.py:Nobody", "agent.py has no 'Nobody'"),
         ("gone.py:Agent", "no code that can be loaded"),
     ],
 )
