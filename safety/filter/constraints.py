@@ -13,6 +13,7 @@ from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, ConstraintSources, Planes, worst
+from brakeline.safety.filter.clearance_margin import ClearanceMargin
 from brakeline.safety.filter.halfspaces import half_spaces, half_spaces_leading_out
 from brakeline.safety.filter.kernels import halfspace_kernels, qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap, local_map
@@ -96,7 +97,8 @@ class TubeConstraints:
     Attributes:
         measured (d,): half-widths of the position's measurement error [m].
         measurement_error: their norm [m]; in joint space, the largest error of a limit's value.
-        clearance_margin, reach [m]: see `Filter`. widest [m]: no tube, with the body, goes farther.
+        clearance: the clearance margin that the QP keeps. reach [m]: see `Filter`.
+        widest [m]: no tube, with the body, goes farther.
         far: a tube may leave the sensor's range, so every candidate is checked against it.
         stays: a robot that stands stays where it stands (it does not drift).
         stands: number of periods after which a plan has brought the robot to a stand.
@@ -109,7 +111,7 @@ class TubeConstraints:
         tube: Tube,
         outer: Tube,
         domain: Array,
-        clearance_margin: float,
+        clearance: ClearanceMargin,
         reach: float | None = None,
     ) -> None:
         """Prepare a tube.
@@ -117,7 +119,7 @@ class TubeConstraints:
         Args:
             tube: the exact tube. outer: an outer tube with fewer rows in W.
             domain (2, r): range of the recorded [x_0; input in force].
-            clearance_margin [m]: distance from obstacles that the QP keeps.
+            clearance: the clearance margin that the QP keeps.
             reach [m]: radius of the local maps. By default as much as this tube needs.
         """
         robot = model.robot
@@ -136,15 +138,15 @@ class TubeConstraints:
             self.measurement_error = float((np.abs(robot.limit_weights) @ robot.measurement_bound).max())
         self._unturned, self._unmoved = np.eye(robot.position_dim), np.zeros(n)
         self.body = robot.footprint + float(np.linalg.norm(self.measured))  # m
-        self.clearance_margin = clearance_margin
+        self.clearance = clearance
         self.discs = _discs(robot, tube)
         self.limits = StateLimits(robot, tube) if robot.limits else None
         farthest = max((float(np.linalg.norm(disc.at)) for disc in self.discs), default=0.0)
-        self._beside = self.measured + self.clearance_margin + ASIDE + farthest
+        self._beside = self.measured + clearance.largest + ASIDE + farthest
         self.stays = stays(robot, tube)
         if robot.position_dim:
             self.widest = widest_extent(robot, tube, outer, domain, self.body)
-            wanted = self.widest + self.clearance_margin
+            wanted = self.widest + clearance.largest
             self.reach = min(wanted, robot.sight) if reach is None else reach
             self.far = wanted > robot.sight or isinstance(tube, RolloutTube)  # interval arithmetic bounds no rollout
         else:  # nothing is near or far: the reach only bounds margins
@@ -345,23 +347,32 @@ class TubeConstraints:
             parts.append(limits.rows(local_map.start, local_map.heading, local_map.turn, self.widening))
         return parts
 
-    def kept_off(self, rows: int) -> Array:
-        """Return the clearance margin (rows,) [m] by which each row is tightened: none for limits, the last rows."""
-        kept_off = np.full(rows, self.clearance_margin)
+    def kept_off(self, planes: list[Planes], rows: int) -> Array:
+        """Return the clearance margin (rows,) [m] by which each row is tightened.
+
+        It is the largest one for reservations, and none for limits, the last rows.
+        """
+        of_obstacles = self.clearance.of_rows(planes)
+        if len(of_obstacles) == rows:
+            return of_obstacles
+        kept_off = np.full(rows, self.clearance.largest)
+        kept_off[: len(of_obstacles)] = of_obstacles
         if self.limits is not None:
             kept_off[rows - len(self.limits) :] = 0.0
         return kept_off
 
     def worst_of(
-        self, local_map: LocalMap, z: Array, slack: Array, planes: list[Planes], kept_off: Array
+        self, local_map: LocalMap, z: Array, slack: Array, planes: list[Planes], with_clearance: bool
     ) -> BlockingConstraint:
-        """Return the constraint that blocks the proposal with regressors z most. kept_off (rows,) [m]: margin of a row.
+        """Return the constraint that blocks the proposal with regressors z most: with the clearance margin, or without.
 
-        The end of the sensor's range has the largest of these margins.
+        The end of the sensor's range has the largest margin.
         """
         beyond = self.reach - self.extent(z) if self.far else np.inf
-        short = slack - kept_off
-        if not len(slack) or beyond - kept_off.max(initial=0.0) < short.min():
+        short, beyond_by = slack, beyond
+        if with_clearance:
+            short, beyond_by = slack - self.kept_off(planes, len(slack)), beyond - self.clearance.largest
+        if not len(slack) or beyond_by < short.min():
             return BlockingConstraint.nowhere(SIGHT, beyond, self.robot.period * self.robot.horizon)
         row = int(np.argmin(short))
         around = ConstraintSources(local_map.near, local_map.moving, local_map.unseen, local_map.other_reservations)

@@ -26,6 +26,7 @@ from brakeline.errors import BadRequest
 from brakeline.messaging.range_image import RangeImage
 from brakeline.messaging.robot import Array
 from brakeline.messaging.scan import MAX_SCAN_AGE
+from brakeline.safety.filter.clearance_margin import ClearanceMargin
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
@@ -45,7 +46,6 @@ from brakeline.safety.filter.request import (
     check_surroundings,
 )
 from brakeline.safety.filter.reservation import Reservation
-from brakeline.safety.filter.tube_extent import turning_extent
 from brakeline.safety.filter.turning_aside import find_plan
 from brakeline.safety.filter.window_score import WindowScore
 from brakeline.safety.model.model_set import ModelSet, extra_coordinates
@@ -75,7 +75,7 @@ class Filter:
         translating (nz,): the regressors that are free inputs and move it.
         domain (2, known): recorded range of [x_0; input in force; inputs that are decided], with room for rounding.
         inputs: the plans that the filter may verify, of recorded inputs. executable: all that the robot may follow.
-        clearance_margin: distance to obstacles that the QP keeps [m].
+        clearance_margin: distance to obstacles that the QP keeps, in the direction in which it is largest [m].
         reach: an obstacle farther away than this cannot change a decision [m].
         bound: the share of plans outside their tubes that the model set states.
         outside_share: see `Decision`.
@@ -86,7 +86,7 @@ class Filter:
     observed = 0  # the filter reads no observation
 
     def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
-        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs.
+        """Prepare a model set. clearance_margin [m] is by default as much as standing or turning in place needs.
 
         Raises:
             TypeError: `model` is no model set.
@@ -108,7 +108,9 @@ class Filter:
         self.domain = np.hstack([recorded, np.tile(of_inputs, robot.committed_steps)])
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
-        margin = turning_extent(robot, in_place) if clearance_margin is None else clearance_margin
+        margin = ClearanceMargin.of_standing(robot, in_place)
+        if clearance_margin is not None:
+            margin = ClearanceMargin.constant(robot, clearance_margin)
         self.constraints = TubeConstraints(model, self.tube, outer, recorded, margin)
         self.in_place: tuple[Array, TubeConstraints] | None = None
         if turning is not None and model.in_place is not None:
@@ -125,7 +127,7 @@ class Filter:
         self.outside_share = 0.0 if model.one_step is None else model.model_config.outside
         self.acceleration_age = model.acceleration_age
         self.start = 1.0 if model.one_step is None else model.one_step.start
-        self.clearance_margin, self.reach = self.constraints.clearance_margin, self.constraints.reach  # m
+        self.clearance_margin, self.reach = margin.largest, self.constraints.reach  # m
 
     @classmethod
     def load(cls, source: Path | str, *, accept_bound: float | None = None) -> Filter:

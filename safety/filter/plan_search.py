@@ -85,7 +85,7 @@ class Linearized:
         self, constraints: TubeConstraints, local_map: LocalMap, z: Array, planes: list[Planes], slack: Array
     ) -> None:
         self.constraints, self.planes, self.slack, self._local_map, self._z = constraints, planes, slack, local_map, z
-        self.kept_off = constraints.kept_off(len(slack))
+        self.kept_off = constraints.kept_off(planes, len(slack))
         self.tightened: ConstraintRows | None = None
 
     @cached_property
@@ -126,7 +126,7 @@ class PlanSearch:
         # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
         if margin >= (0.0 if in_place else enough):
             return allowed
-        kept_off = constraints.kept_off(len(slack))
+        kept_off = constraints.kept_off(planes, len(slack))
         if constraints.least(slack - kept_off, z, safety.clearance_margin) >= 0.0:
             return allowed
         general = safety.constraints.at(z, local_map.widening) if in_place else constraints
@@ -135,8 +135,7 @@ class PlanSearch:
             return allowed
         edge = "m of the free space's edge" if safety.robot.position_dim else "(in its own unit) of a limit"
         record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
-        blocking = kept_off if margin >= 0.0 else np.zeros(len(slack))
-        record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, blocking)
+        record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, margin >= 0.0)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.
         adjusted = None

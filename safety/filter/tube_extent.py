@@ -1,4 +1,4 @@
-"""How far tubes reach: the clearance margin, the reach of local maps, and whether a standing robot drifts."""
+"""How far tubes reach: the reach of local maps, and whether a standing robot drifts."""
 
 from __future__ import annotations
 
@@ -9,26 +9,6 @@ from brakeline.safety.filter.reachable_tube import RolloutTube, Tube
 
 ROOM_FOR_STRETCH = 1.2  # of the reach of a rollout, whose sets grow with the leverage of a plan
 EXTREMES = 4096  # plans with extreme regressors, for the reach of a rollout
-
-
-def turning_extent(robot: Robot, tube: Tube) -> float:
-    """Return the default clearance margin [m]: the extent of the tube of turning in place at the highest turn rate.
-
-    Without this margin a robot may stop so close to an obstacle that no motion can be verified from there.
-    """
-    if not robot.position_dim:
-        return 0.0
-    in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
-    state = robot.state_at_inputs(in_place)
-    z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
-    tube = tube.at(z)
-    sizes = tube.magnitudes(z)
-    L, d = tube.generators, robot.position_dim
-    directions = np.random.default_rng(0).normal(size=(64, d))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    width = np.abs(directions[:, None, None, :] @ tube.directions)[:, :, 0] @ sizes[:L]
-    drift = np.abs(directions @ tube.centers(z).T)
-    return float((width + drift).max() + sizes[L:].max())
 
 
 def stays(robot: Robot, tube: Tube) -> bool:

@@ -52,7 +52,8 @@ class ConstraintBatch:
         self.tube = TubeBatch(tube, robot.state_dim, constant, xp)
         self.measured = constraints.measured.tolist()
         self.body, self.sight, self.widest = constraints.body, robot.sight, constraints.widest
-        self.base_far = constraints.far
+        self.base_far, self.clearance = constraints.far, constraints.clearance
+        self._margin_half, self._margin_extra = constant(self.clearance.half), constant(self.clearance.extra)
         self.discs = []
         for disc in constraints.discs:
             at = disc.at.tolist() if disc.aside else None
@@ -91,6 +92,19 @@ class ConstraintBatch:
             part = ends.slack(plane, positions, path.stretch, sizes)
             parts.append(self._xp.reshape(part, (-1, part.shape[-1])))
         return parts[0] if len(parts) == 1 else self._xp.concat(parts)
+
+    def kept_off(self, planes: list[PlaneBatch]) -> Array | float:
+        """Return the clearance margin [m] of the same rows (R, B), or one number: `ClearanceMargin.of_rows`."""
+        if self.clearance.whole_plan or not planes:
+            return self.clearance.largest
+        xp, parts = self._xp, []
+        for plane in planes:
+            last = [abs(part[-1])[None] for part in plane.normals]  # (1, K, B)
+            per_box = sum(self._margin_half[:, i, None, None] * last[i] for i in range(self.d))
+            margin = xp.max(per_box + self._margin_extra[:, None, None], axis=0)
+            before = xp.zeros((2 * self.N * margin.shape[0], margin.shape[1]), dtype=margin.dtype, device=margin.device)
+            parts += [before, margin]
+        return xp.concat(parts)
 
     def extent(self, scene: SceneBatch, path: PathBatch, sizes: Array) -> Array:
         """Return bounds (B,) [m] on the distance of every point of the body from the start."""

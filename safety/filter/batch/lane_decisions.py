@@ -340,7 +340,8 @@ class LaneDecisions:
         """Return the arrays of a `BlockingArrays` for proposals: `TubeConstraints.worst_of`."""
         xp, c = self._xp, self._constraints
         count, (K, B) = rows_per_obstacle(c.N), scene.near.rho.shape
-        blocking = xp.where(margin >= 0.0, self._clearance, 0.0)
+        for_clearance = margin >= 0.0
+        blocking = xp.where(for_clearance, self._clearance, 0.0)
         beyond = xp.where(scene.far, scene.reach - plan.extent, xp.inf)
         nowhere = xp.full((c.d, B), xp.nan, dtype=margin.dtype, device=self._device)
         period = xp.full_like(margin, self._robot.period * c.N)
@@ -349,11 +350,14 @@ class LaneDecisions:
             places = xp.permute_dims(nowhere, (1, 0))
             return {"obstacle": alone, "room": beyond, "after": period, "normal": places, "at": places}
         # In the order of the single path's rows: disc, obstacle, end.
-        slack = xp.reshape(plan.slack, (len(c.discs), count, K, B))
-        slack = xp.reshape(xp.permute_dims(slack, (0, 2, 1, 3)), (-1, B))
-        row = xp.argmin(slack, axis=0)
-        least = xp.take_along_axis(slack, row[None], axis=0)[0]
-        sight = beyond - blocking < least - blocking
+        short = xp.where(for_clearance, plan.slack - c.kept_off(plan.planes), plan.slack)
+        slack, short = (
+            xp.reshape(xp.permute_dims(xp.reshape(part, (len(c.discs), count, K, B)), (0, 2, 1, 3)), (-1, B))
+            for part in (plan.slack, short)
+        )
+        row = xp.argmin(short, axis=0)
+        least, shortest = (xp.take_along_axis(part, row[None], axis=0)[0] for part in (slack, short))
+        sight = beyond - blocking < shortest
         sight = sight | ~scene.near.used[0]
         disc, which, end = row // (count * K), row // count % K, row % count
         when = xp.where(end < c.N, end, xp.minimum(end - c.N + 1, xp.full_like(end, c.N)))

@@ -113,7 +113,8 @@ class SearchBatch:
         plan = self.constraints.around(scene, self.regressors(lanes.z_0, lanes.proposal))
         margin = least(scene, plan.slack, plan.extent)
         empty = scene.near.none(xp, margin)
-        with_clearance = least(scene, plan.slack - self._clearance, plan.extent, self._clearance)
+        kept_off = self.constraints.kept_off(plan.planes)
+        with_clearance = least(scene, plan.slack - kept_off, plan.extent, self._clearance)
         room = xp.maximum(margin - max(self._clearance, 0.0), with_clearance)
         allowed = (empty & ~scene.far) | (room >= ROUNDING)
         return ProposalBatch(plan, margin, allowed, ~allowed & ((room > -ROUNDING) | (xp.abs(margin) < ROUNDING)))
@@ -187,7 +188,7 @@ class SearchBatch:
     def _too_near(self, lanes: LaneBatch, plan: PlanBatch, stay: Array) -> tuple[Array, Array]:
         """Return the rows (R, B) for which turning in place would not keep the clearance margin; and unsure lanes."""
         path, sizes = self.constraints.tube.path(stay), self.constraints.tube.sizes(stay, lanes.scene.widening)
-        left = self.constraints.slack(plan.planes, path, sizes) - self._clearance
+        left = self.constraints.slack(plan.planes, path, sizes) - self.constraints.kept_off(plan.planes)
         return left < 0.0, self._xp.any(self._xp.abs(left) < ROUNDING, axis=0)
 
     def _tightened(
@@ -199,7 +200,7 @@ class SearchBatch:
         """
         xp = self._xp
         inside, unsure = self._too_near(lanes, plan, stay)
-        bound = xp.where(inside, rows.bound, rows.bound - self._clearance)
+        bound = xp.where(inside, rows.bound, rows.bound - self.constraints.kept_off(plan.planes))
         which = xp.nonzero(xp.any(inside, axis=1))[0]
         if not which.shape[0]:
             return RowBatch(rows.gradient, rows.spread, bound), inside, unsure
@@ -213,7 +214,7 @@ class SearchBatch:
     def _keeps(self, lanes: LaneBatch, plan: PlanBatch, tight: RowBatch, inside: Array) -> Array:
         """Return the least slack (B,) of plans in the rows with the clearance margin."""
         xp, count = self._xp, plan.slack.shape[0]
-        left = xp.where(inside, plan.slack, plan.slack - self._clearance)
+        left = xp.where(inside, plan.slack, plan.slack - self.constraints.kept_off(plan.planes))
         closer = tight.bound[count:]
         for j in range(self._free):
             closer = closer - tight.gradient[j, count:] * plan.z[self.known + j]
@@ -258,7 +259,7 @@ class SearchBatch:
                 least = self._keeps(lanes, plan, tight, inside)
             elif with_clearance:
                 inside, close = self._too_near(lanes, plan, stay)
-                left = xp.where(inside, plan.slack, plan.slack - self._clearance)
+                left = xp.where(inside, plan.slack, plan.slack - c.kept_off(plan.planes))
                 least = xp.minimum(margin, c.least(lanes.scene, left, plan.extent))
             good = (least >= ROUNDING) & ~close
             to = index[good]
