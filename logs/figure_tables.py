@@ -104,9 +104,10 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
+    dim = episode["dim"]  # of the position; 0 in joint space
     columns = (
         "step",
-        "x, y [m]",
+        f"{', '.join('xyz'[:dim])} [m]" if dim else "state",
         "proposed",
         "executed",
         "decision",
@@ -125,7 +126,7 @@ def show_episode(episode: Figures) -> RenderableType:
             f"{row['clearance']:.3f}",
             row["said"] or row["reason"] or "",
         )
-        for row in (row | {"state": row["state"][:2]} for row in episode["rows"])
+        for row in (row | {"state": row["state"][: dim or None]} for row in episode["rows"])
     ]
     return Group(Text(title, "bold"), plain_table(columns, rows))
 
