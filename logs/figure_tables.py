@@ -135,7 +135,7 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
     """Yield a name and a value of each figure of one run."""
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
-    setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
+    setup = [f"{name} {figures[name]}" for name in (*SETUP, "model") if figures.get(name) is not None]
     if setup:
         yield "configuration", ", ".join(setup)
     yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))
