@@ -43,6 +43,7 @@ def picture(episode: EpisodeRecord, robot: Robot | None, tubes: int = MOST_TUBES
         **_arena(episode.about, exchanges, robot),
         "footprint": robot.footprint if robot is not None else 0.0,
         "discs": body_discs(robot) if robot is not None else [],
+        "dim": _dim(robot),
         "period": robot.period if robot is not None else None,
         "kinds": "".join(map(decision_letter, steps)),
         **_path(steps, robot),

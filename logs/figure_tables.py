@@ -104,9 +104,10 @@ def show_episode(episode: Figures) -> RenderableType:
         f"{episode['actor']}, episode {episode['episode']} ({episode['arena'] or 'arena not in the log'}): "
         f"{episode['outcome']} after {episode['steps']} steps, reward {episode['reward']:.2f}{closest}"
     )
+    dim = episode["dim"]  # of the position; 0 in joint space
     columns = (
         "step",
-        "x, y [m]",
+        f"{', '.join('xyz'[:dim])} [m]" if dim else "state",
         "proposed",
         "executed",
         "decision",
@@ -125,7 +126,7 @@ def show_episode(episode: Figures) -> RenderableType:
             f"{row['clearance']:.3f}",
             row["said"] or row["reason"] or "",
         )
-        for row in (row | {"state": row["state"][:2]} for row in episode["rows"])
+        for row in (row | {"state": row["state"][: dim or None]} for row in episode["rows"])
     ]
     return Group(Text(title, "bold"), plain_table(columns, rows))
 
@@ -134,7 +135,7 @@ def _summary(figures: Figures) -> Iterator[tuple[str, str]]:
     """Yield a name and a value of each figure of one run."""
     episodes, steps = figures["episodes"], figures["steps"]
     within = figures.get("intervals") or {}
-    setup = [f"{name} {figures[name]}" for name in SETUP if figures.get(name) is not None]
+    setup = [f"{name} {figures[name]}" for name in (*SETUP, "model") if figures.get(name) is not None]
     if setup:
         yield "configuration", ", ".join(setup)
     yield "steps", f"{steps}" + known(", {:.1f}/s", figures.get("steps_per_s"))

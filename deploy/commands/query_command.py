@@ -87,7 +87,7 @@ class QueryCommand:
         print_result(
             self.json,
             figures,
-            Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}"),
+            Text.from_markup(f"[bold]{answer.kind}[/]{clearance} {escape(answer.reason)}".rstrip()),
             proposal(robot.action, action, given=bool(self.action)),
             "execute " + ", ".join(map(quantity, robot.action, answer.action)),
             describe_verification(answer.verified, answer.bound),

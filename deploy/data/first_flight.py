@@ -122,10 +122,28 @@ class FirstFlight:
     """Flies one vehicle, which hovers in the middle of the box at first."""
 
     def __init__(
-        self, vehicle: MavlinkVehicle, robot: Robot, box: Box, seed: int, stop: Callable[[], bool] = lambda: False
+        self,
+        vehicle: MavlinkVehicle,
+        robot: Robot,
+        box: Box,
+        seed: int,
+        about: dict[str, str],
+        stop: Callable[[], bool] = lambda: False,
+        keep: Callable[[Callable[[], Dataset]], None] = lambda data: None,
     ) -> None:
-        """Prepare the flight. `robot` must be in real time; `stop` is polled every period."""
+        """Prepare the flight.
+
+        Args:
+            vehicle: hovers in the middle of the box.
+            robot: in real time.
+            box: the region of the flight.
+            seed: of the flight's random inputs.
+            about: entries of the data set.
+            stop: is polled every period.
+            keep: called after each piece of the flight, with a function that returns the data until then.
+        """
         self._vehicle, self._robot, self._box, self._stop = vehicle, robot, box, stop
+        self._about, self._keep = about | {"origin": ORIGIN}, keep
         self._rng, self._periods = np.random.default_rng(seed), 0
         self._flown: list[Trajectory] = []
         self._built: TrajectoryBuilder | None = None
@@ -148,7 +166,7 @@ class FirstFlight:
             self._missing.append(f"the flight ended with an error: {type(error).__name__}: {error}")
         self._cut()
 
-    def result(self, about: dict[str, str], store: Callable[[Dataset], object]) -> FirstFlightResult:
+    def result(self, store: Callable[[Dataset], object]) -> FirstFlightResult:
         """Return the data, and the model set if the data support one.
 
         store: called with the data before the fit of the model set, which may be interrupted.
@@ -158,7 +176,7 @@ class FirstFlight:
         missing, reached = list(self._missing), self._reached
         if not self._flown:
             raise BadData(f"nothing was recorded: {'; '.join(missing)}")
-        data = self._dataset(about)
+        data = self._dataset()
         store(data)
         model, report = self._model(data, missing)
         if (drift := self._drift()) > MAX_DRIFT:
@@ -226,10 +244,11 @@ class FirstFlight:
         """End the trajectory, so that no later sample follows its last one."""
         if self._built is not None and len(self._built) > 2:
             self._flown.append(self._built.trajectory())
+            self._keep(self._dataset)
         self._built = None
 
-    def _dataset(self, about: dict[str, str]) -> Dataset:
-        data = Dataset(self._robot.in_lockstep(), tuple(self._flown), about | {"origin": ORIGIN})
+    def _dataset(self) -> Dataset:
+        data = Dataset(self._robot.in_lockstep(), tuple(self._flown), self._about)
         data.check()
         return data
 
@@ -243,7 +262,7 @@ class FirstFlight:
     def _prediction_error(self) -> float:
         """Return the 95 % quantile in m of the errors of a linear fit on held-out data, `AHEAD` periods ahead."""
         try:
-            fitted, held_out = (windows(part, AHEAD, FREE) for part in self._dataset({}).split((0.5, 0.5)))
+            fitted, held_out = (windows(part, AHEAD, FREE) for part in self._dataset().split((0.5, 0.5)))
         except BadData:
             return math.inf
         if min(len(fitted), len(held_out)) < fitted.z.shape[1]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from brakeline.deploy.data.build_lock import folder_lock
 from brakeline.deploy.data.data_paths import record_path
+from brakeline.deploy.data.partial_save import partial_path
 from brakeline.deploy.data.patient_save import save_patiently
 from brakeline.deploy.data.recording_origin import ORIGIN, origin, outdated
 from brakeline.deploy.progress import console, under_way
@@ -65,7 +66,7 @@ def _usable(path: Path, robot: Robot) -> bool:
 def _record(robot: RobotWithTask, path: Path, trajectories: int, seed: int, conditions: Conditions) -> Dataset:
     from brakeline.deploy.data import collect  # brings the simulators
 
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    part = partial_path(path)
     restless = math.ceil(RESTLESS_SHARE * trajectories)
     total = trajectories + restless
     driven = _load_partial(part, robot, origin(robot, seed, conditions, restless))

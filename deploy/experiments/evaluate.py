@@ -127,11 +127,14 @@ def prepare_fleet(
 
 def _ask_for(robot: RobotWithTask, evaluation: Evaluation) -> Ask | None:
     """Return the function that asks the filter, or None for the method `none`."""
+    model = _model_for(robot, evaluation)
+    return None if model is None else in_process(model, evaluation.accept_bound)
+
+
+def _model_for(robot: RobotWithTask, evaluation: Evaluation) -> Model | None:
     if evaluation.method == "none":
         return None
-    return in_process(
-        method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound), evaluation.accept_bound
-    )
+    return method_for(robot, evaluation.method, evaluation.model_config, evaluation.accept_bound)
 
 
 @dataclass(frozen=True)
@@ -288,9 +291,10 @@ def _figures(robot: RobotWithTask, evaluation: Evaluation, parts: Sequence[Drive
         }
     else:
         figures["by_episode"] = {name: [value for part in parts for value in part.rows[name]] for name in ROWS}
-    filtered = evaluation.method == DDPC
+    filtered, model = evaluation.method == DDPC, _model_for(robot, evaluation)
     return figures | {
         "method": evaluation.method,
+        "model": None if model is None else model.version,
         "certificate": evaluation.model_config.certificate if filtered else None,
         "mode": evaluation.model_config.mode if filtered else None,
         "policy": evaluation.policy,

@@ -54,7 +54,8 @@ class FirstFlightSettings:
 def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: Path) -> FirstFlightResult:
     """Take off, fly, land, store the recorded data, and return them with their model set.
 
-    SIGINT or SIGTERM land the vehicle at once, and so does any error; the data until then count.
+    SIGINT or SIGTERM land the vehicle at once, and so does any error; the data until then count. During the flight,
+    the data until then are in a partial data set beside `path`, which only a killed process leaves behind.
 
     Args:
         robot: the description in real time.
@@ -70,6 +71,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
     from brakeline.actors.mavlink.vehicle_socket import listening
     from brakeline.deploy.data.build_lock import folder_lock
     from brakeline.deploy.data.first_flight import Box, FirstFlight
+    from brakeline.deploy.data.partial_save import PartialSave, partial_path
     from brakeline.deploy.data.patient_save import save_patiently
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
@@ -91,20 +93,23 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
             metadata = {"autopilot": "; ".join(vehicle.notes), "url": url} | about_age([age])
-            flight = FirstFlight(vehicle, robot, box, seed, stop.is_set)
+            partial = PartialSave(partial_path(path))
+            flight = FirstFlight(vehicle, robot, box, seed, metadata, stop.is_set, partial.offer)
             try:
                 flight.fly(settings.minutes)
             finally:
                 land(vehicle, robot.horizon)
+                partial.finish()
         finally:
             vehicle.close()
 
     def store(data: Dataset) -> None:
         with folder_lock(path.parent):
             save_patiently(data, path)
+        partial.remove()
         log.info("the flight is stored in %s", path)
 
-    return flight.result(metadata, store)
+    return flight.result(store)
 
 
 def land(vehicle: MavlinkVehicle, periods: int) -> None:

@@ -200,7 +200,11 @@ def test_the_table_of_an_episode_has_the_recorded_values(
         if step.step in asked and not step.fallback:
             assert row["decide_ms"] == asked[step.step].reply.decision.time_ms
     assert detail["closest"] == min(map(least_clearance, steps)) and detail["start"] == [0.0, 0.0]
-    assert "actor-1, episode 3" in printed(show_episode(detail), 200)
+    table = printed(show_episode(detail), 200)
+    assert "actor-1, episode 3" in table and "x, y [m]" in table
+    (drone,) = (detail for detail in figures["episode_detail"] if detail["robot"] == "quadrotor")
+    assert "x, y, z [m]" in printed(show_episode(drone), 200)
+    assert " ".join(f"{value:.2f}" for value in drone["rows"][0]["state"][:3]) in printed(show_episode(drone), 200)
 
 
 def test_the_nearest_misses_are_the_nearest(analysis: LogAnalysis, messages: Messages) -> None:

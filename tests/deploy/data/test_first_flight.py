@@ -76,9 +76,9 @@ class Sluggish:
 
 
 def flown(vehicle: Sluggish, minutes: float, about: dict[str, str] | None = None, seed: int = 0) -> FirstFlightResult:
-    flight = FirstFlight(vehicle, LATE, BOX, seed)
+    flight = FirstFlight(vehicle, LATE, BOX, seed, about or {})
     flight.fly(minutes)
-    return flight.result(about or {}, lambda data: None)
+    return flight.result(lambda data: None)
 
 
 def test_an_obedient_vehicle_is_flown_at_every_level_and_stays_inside(tmp_path: Path) -> None:
@@ -125,11 +125,11 @@ def test_an_error_of_the_program_ends_a_flight_and_what_was_recorded_is_stored(m
         raise np.linalg.LinAlgError("SVD did not converge")
 
     stored = list[Dataset]()
-    flight = FirstFlight(Sluggish(), LATE, BOX, 0)
+    flight = FirstFlight(Sluggish(), LATE, BOX, 0, {})
     with monkeypatch.context() as patch:
         patch.setattr(np.linalg, "lstsq", diverge)
         flight.fly(2.0)
-    missing = flight.result({}, stored.append).missing
+    missing = flight.result(stored.append).missing
     assert stored[0].periods > 50 and "the flight ended with an error: LinAlgError: SVD did not converge" in missing
 
 

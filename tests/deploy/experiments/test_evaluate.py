@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from brakeline.deploy.data.model_store import model_for
 from brakeline.deploy.experiments import batch_evaluation
 from brakeline.deploy.experiments.evaluate import Evaluation, evaluate, parts_of
 from brakeline.deploy.run.replay_run import _joint_requests
@@ -27,7 +28,9 @@ def test_the_figures_are_those_of_one_robot_after_the_other(data_folder, method)
     assert batch["closest_approach"] == pytest.approx(single["closest_approach"], abs=1e-3)
     assert (batch["collisions"] > 0) == (method == "none"), "what the filter prevents"
     assert batch["containment"]["steps"] == (batch["steps"] if method == "ddpc" else 0)
+    version = model_for(GROUND, what.model_config).version
     for figures in (single, batch):
+        assert figures["model"] == (version if method == "ddpc" else None)
         rows = figures["by_episode"]
         assert {len(column) for column in rows.values()} == {6}
         assert sum(rows["goal"]) == figures["goals"] and sum(rows["steps"]) == figures["steps"]

@@ -6,11 +6,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
+from brakeline.deploy.data import first_flight, partial_save
 from brakeline.deploy.data.first_flight import FirstFlight
+from brakeline.deploy.data.partial_save import PartialSave, partial_path
+from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
 from brakeline.deploy.run import first_flight_run
 from brakeline.deploy.run.first_flight_run import FirstFlightSettings
 from brakeline.errors import BadData, FlightEnded, MavlinkError
@@ -72,6 +76,40 @@ def test_a_flight_whose_model_set_is_interrupted_is_stored(
     assert data.periods > 10
 
 
+def test_a_flight_that_is_killed_leaves_what_it_recorded(
+    standing: tuple[str, Autopilot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    path, kept = tmp_path / "flown.safetensors", list[Dataset]()
+    part = partial_path(path)
+    monkeypatch.setattr(partial_save, "EVERY", 0.0)
+    monkeypatch.setattr(first_flight, "PIECE", 10)
+    part.write_bytes(b"of an earlier flight")
+
+    def land_late(vehicle: MavlinkVehicle, periods: int) -> None:
+        until(part.exists, "a part is stored")
+        kept.append(Dataset.load(part))
+        land(vehicle, periods)
+
+    land = first_flight_run.land
+    monkeypatch.setattr(first_flight_run, "land", land_late)
+    monkeypatch.setattr(FirstFlight, "_model", lambda self, data, missing: (None, None))
+    first_flight_run.fly(LATE, standing[0], 0, replace(SETTINGS, minutes=0.1), path)
+    whole = Dataset.load(path)
+    assert kept[0].periods >= 10 and kept[0].about == whole.about and kept[0].periods <= whole.periods
+    assert not part.exists() and (tmp_path / "flown.part.earlier.safetensors").exists()
+    assert "cut off" in caplog.text
+
+
+def test_a_flight_goes_on_if_its_part_cannot_be_saved(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    partial = PartialSave(tmp_path / "no folder" / "flown.part.safetensors")
+    (tmp_path / "no folder").write_text("a file")
+    built = TrajectoryBuilder(np.zeros(9))
+    built.add(np.zeros(3), np.zeros(9), np.zeros((4, 3)))
+    partial.offer(lambda: Dataset(QUADROTOR, (built.trajectory(),)))
+    partial.finish()
+    assert "in memory only" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("autopilot", "asked", "age"),
     [("ardupilot", None, 0.2), ("px4", None, 0.0), ("px4", 0.4, 0.4), ("ardupilot", 0.0, 0.0)],
@@ -86,7 +124,7 @@ def test_a_first_flight_records_the_acceleration_of_some_time_ago_and_says_so(
         raise FlightEnded("that is enough")
 
     monkeypatch.setattr(FirstFlight, "_record", record)
-    monkeypatch.setattr(FirstFlight, "result", lambda self, about, store: about)
+    monkeypatch.setattr(FirstFlight, "result", lambda self, store: self._about)
     with served(Autopilot(quadrotor(floor=0.02), autopilot)) as url:
         about = first_flight_run.fly(LATE, url, 0, replace(SETTINGS, acceleration_age=asked), path)
     assert about.get(ENTRY, "0") == f"{age:g}" and ages == [age]
