@@ -271,9 +271,10 @@ class Adaptation:
         if narrower := covered.name if covered.narrower else in_use.about.get(NARROWER):  # an update inherits it
             data = replace(data, about=data.about | {NARROWER: narrower})
         most = _largest_half_width(in_use, widening, data)
+        room = Filter(in_use).constraints.plan_widening(widening) * room_to_stand(in_use)
         updatable = in_use.model_config.mode == ONE_STEP and not covered.narrower
         ways = (_fitted, _updated) if updatable else (_fitted,)
-        tried = [self._tried(way, in_use, data, most) for way in ways]
+        tried = [self._tried(way, in_use, data, most, room) for way in ways]
         if all(result.model is None for _, result in tried):
             return Recertification(f"none {why}: {'; '.join(result.text for _, result in tried)}")
         _, best = min(tried, key=lambda pair: pair[0])
@@ -281,10 +282,12 @@ class Adaptation:
         keeps = f"; {covered.name} stays within {covered.share:.0%} of its range" if covered.narrower else ""
         return replace(best, text=f"{best.model.version} {why}, {best.text}{keeps}", replaces=version)
 
-    def _tried(self, way: Way, in_use: ModelSet, data: Dataset, most: float) -> tuple[float, Recertification]:
+    def _tried(
+        self, way: Way, in_use: ModelSet, data: Dataset, most: float, room: float
+    ) -> tuple[float, Recertification]:
         """Return the mean half-width of a new model set [m], infinite if it may not be used, and the set or the reason.
 
-        most: the largest mean half-width that may replace the set in use [m].
+        most: the largest mean half-width that may replace the set in use [m]. room: the most for a standing robot [m].
         """
         try:
             model, report = way(in_use, data, self._outside(in_use, data))
@@ -294,6 +297,8 @@ class Adaptation:
         refused = refusal(self.robot, model.about, self.accept_bound)
         if not refused and not width <= most:  # NaN too
             refused = f"its sets are {TIGHTER * width / most:.2g} times as wide as those in use, as widened"
+        if not refused and not (stands := room_to_stand(model)) <= room:
+            refused = f"a standing robot needs {stands:.2f} m around it, with the set in use, as widened, {room:.2f} m"
         if refused:
             return math.inf, Recertification(f"{NAMES[way]}: {refused}")
         stated = (
@@ -373,6 +378,15 @@ NAMES: dict[Way, str] = {_fitted: "a fit to this driving", _updated: "an update 
 def _largest_half_width(in_use: ModelSet, widening: float, data: Dataset) -> float:
     """Return the largest mean half-width that may replace a set in use that the robots widen [m]."""
     return TIGHTER * Filter(in_use).constraints.plan_widening(widening) * mean_half_width(in_use, data)
+
+
+def room_to_stand(model: ModelSet) -> float:
+    """Return how far the sets of a robot that stands, or turns in place, reach [m].
+
+    The recent driving may hold little standing, and then the sets of a fit are wide there. An autopilot with a weak
+    motor got such sets: its hover could no longer be verified where it was, and it hardly moved any more.
+    """
+    return Filter(model).clearance_margin
 
 
 def mean_half_width(model: ModelSet, data: Dataset) -> float:

@@ -230,6 +230,14 @@ def test_a_looser_or_an_unproven_set_is_refused_with_the_reason(kind, why, widen
     assert attempt.model is None and attempt.data is None and why in attempt.text
 
 
+def test_a_set_with_which_a_robot_could_no_longer_stand_is_refused(kind, monkeypatch):
+    monkeypatch.setattr(adaptation, "room_to_stand", lambda model: 0.1 if model is in_use() else 0.81)
+    (attempt,) = drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
+    room = 0.1 * Filter(in_use()).constraints.plan_widening(8.0)
+    assert room == 0.8 and attempt.model is None
+    assert attempt.text.count("a standing robot needs 0.81 m around it, with the set in use, as widened, 0.80 m") == 2
+
+
 def test_driving_that_is_too_narrow_makes_no_set(kind):
     (attempt,) = drive(kind, driven(2, 7, slip=-0.15, share=0.4), widening=8.0)
     assert attempt.model is None and re.search(r"of the range of \w+ .*\[.+\] in the set in use, not 50%", attempt.text)
