@@ -61,7 +61,7 @@ class CampaignCommand:
 
     def run(self) -> int:
         """Drive what is missing and write the tables. Returns the exit status: 3 if a filtered robot hit something."""
-        self._check()
+        self.check_options()
         tables = {robot: self._campaign(robot) for robot in self.robots}
         if self.json:
             print_json(tables)
@@ -69,7 +69,7 @@ class CampaignCommand:
         searches = [one for table in tables.values() for one in table["searches"] if one["model_set"] != "none"]
         return COLLIDED if any(one["collisions"] for one in (*filtered, *searches)) else 0
 
-    def _check(self) -> None:
+    def check_options(self) -> None:
         """Raise ValueError for numbers that make no sense, and for lists without a name: a table would become empty."""
         for option in ("robots", "arenas", "policies", "model_sets", "perturbations"):
             if not getattr(self, option):

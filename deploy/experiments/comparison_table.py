@@ -197,15 +197,22 @@ def plain(value: Any) -> Any:
 
 
 PERCENT = ("goal rate", "collision rate", "interventions", CUT, *TOUCHED, *THIRDS)
-DIGITS = {"mean speed [m/s]": ".3g", "max speed [m/s]": ".3g", "decision [ms]": ".2f", "its std [ms]": ".2f"}
+RARE = ("collision rate", *TOUCHED)  # shares near 0: with one decimal, an upper end of 0.15 % would read 0.1 %
+DIGITS = {
+    "collisions": ".1f",
+    "mean speed [m/s]": ".3g",
+    "max speed [m/s]": ".3g",
+    "decision [ms]": ".2f",
+    "its std [ms]": ".2f",
+}
 
 
 def written(name: str, value: Any) -> str:
     """Format a figure for the table, with its interval in brackets."""
     if value is None:
         return "–"
-    percent = name in PERCENT
-    digits, factor, unit = (".1f", 100.0, " %") if percent else (DIGITS.get(name, ".0f"), 1.0, "")
+    factor, unit = (100.0, " %") if name in PERCENT else (1.0, "")
+    digits = ".2f" if name in RARE else ".1f" if name in PERCENT else DIGITS.get(name, ".0f")
     if isinstance(value, MeanEstimate):
         middle, low, high = (f"{factor * v:{digits}}" for v in (value.value, value.low, value.high))
         return f"{middle}{unit} [{low}, {high}]"
@@ -213,8 +220,8 @@ def written(name: str, value: Any) -> str:
 
 
 PAPER_ROWS: dict[str, Callable[[dict[str, Any], str], str]] = {
-    "goal rate": lambda paper, row: written(row, paper["goal"] * 0.01),
-    "collision rate": lambda paper, row: written(row, paper["collision"] * 0.01),
+    "goal rate": lambda paper, row: f"{paper['goal']:g} %",
+    "collision rate": lambda paper, row: f"{paper['collision']:g} %",
     "mean speed [m/s]": lambda paper, row: written(row, paper["mean_speed"]),
     "max speed [m/s]": lambda paper, row: written(row, paper["max_speed"]),
     "mean reward": lambda paper, row: written(row, paper["reward"]),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brakeline.deploy.experiments.compared_methods import METHODS, NONE
+from brakeline.deploy.experiments.compared_methods import METHODS, NONE, SAC_LEARNER, ComparedMethod
 from brakeline.deploy.experiments.comparison_table import cells_by_version, markdown_table, steps_to_learn, version_note
 from brakeline.deploy.experiments.experiment_jobs import stored_result
 from brakeline.deploy.experiments.stored_cells import stored_cells
@@ -133,32 +133,42 @@ def _setup(robot: RobotWithTask, robot_results: RobotResults) -> str:
             f"{study['steps']:,} steps in `{first}`, "
             + (f"{study['robots']} robots at once" if batch else "one robot"),
         ),
-        ("learner", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
-        *_correction_settings(robot_results),
+        ("all learners", ", ".join(f"{name} {td3[name]}" for name in LEARNER if name in td3)),
+        *_own_settings(robot, robot_results),
         *([("versions", note)] if note else []),
         ("evaluation", f"{study['episodes']} fresh episodes for each run and arena, the same for all methods"),
     ]
     return "\n".join([*markdown_table(["", ""], rows), ""])
 
 
-def _correction_settings(robot_results: RobotResults) -> list[tuple[str, str]]:
-    """Return what a correction costs the learners of the methods with a filter, a row for each setting."""
+def _own_settings(robot: RobotWithTask, robot_results: RobotResults) -> list[tuple[str, str]]:
+    """Return the settings in which the learners of the methods may differ, a row for each set of them."""
     methods: dict[str, list[str]] = {}
     for name, cells in robot_results.cells.items():
-        if METHODS[name].filter != NONE:
-            study = cells[0]["study"]
-            text = f"penalty for corrections {study.get('penalty', 1.0):g}"
-            for setting in OF_CORRECTIONS:
-                default = getattr(DEFAULTS, setting)
-                if (value := study["td3"].get(setting, default)) != default:
-                    text += f", {setting} {value:g}"
-            methods.setdefault(text, []).append(METHODS[name].label)
-    return [(f"learner of {', '.join(labels)}", text) for text, labels in methods.items()]
+        text = ", ".join(_settings_of(METHODS[name], cells[0]["study"], robot.task.symmetry != "none"))
+        methods.setdefault(text, []).append(METHODS[name].label)
+    return [(f"learner of {'; '.join(labels)}", text) for text, labels in methods.items()]
+
+
+def _settings_of(method: ComparedMethod, study: dict[str, Any], symmetric: bool) -> list[str]:
+    """Return what the learner of a method has of its own; `symmetric`: the task has mirrored steps."""
+    td3, sac = study["td3"], method.learner == SAC_LEARNER
+    names = ("actor_rate",) if sac else RATES
+    settings = [f"{'learning rate' if sac else name} {td3[name]}" for name in names if name in td3]
+    if symmetric:
+        settings.append("learns from mirrored steps" if td3.get("symmetric") and not sac else "no mirrored steps")
+    settings += [f"{name} {td3[name]:g}" for name in method.td3 if name in td3 and name not in RATES]
+    if method.filter != NONE:
+        settings.append(f"penalty for corrections {study.get('penalty', 1.0):g}")
+        changed = {name: td3.get(name, getattr(DEFAULTS, name)) for name in OF_CORRECTIONS}
+        settings += [f"{name} {value:g}" for name, value in changed.items() if value != getattr(DEFAULTS, name)]
+    return settings
 
 
 DEFAULTS = TD3Config()
 OF_CORRECTIONS = ("penalty_growth", "imitation")
-LEARNER = ("hidden", "batch", "gamma", "n_step", "tau", "actor_rate", "critic_rate", "updates_per_step", "warmup")
+RATES = ("actor_rate", "critic_rate")
+LEARNER = ("hidden", "batch", "gamma", "n_step", "tau", "updates_per_step", "warmup")
 
 
 def _arena(kind: Any) -> str:
@@ -291,29 +301,35 @@ the cell was stored.
 """
 MAIN = """\
 After {steps} training steps; {episodes} fresh episodes for each run and arena. n: number of runs, each from a seed of
-its own. Goals: interquartile mean over runs, with the 95 % interval of the bootstrap, which resamples runs (the same
-in each arena). Of few runs it is close to their mean; over all arenas it drops the worst and the best of the runs in
-any of them.
+its own. Goals and steps to 90 %: interquartile mean, with the 95 % interval of the bootstrap, which resamples runs (the
+same in each arena). The interquartile mean drops the lowest and the highest quarter of the values, rounded down: one
+run at each end of five, two values at each end of the ten of five runs in two arenas. The tables in `docs/` and
+`table.md` have means instead, and their bootstrap resamples the episodes, too.
 Interventions: their share of all steps of all runs; `table.md` has the mean of the runs' shares.
 Collisions: episodes of all runs, with the exact 95 % interval of Clopper and Pearson, which takes episodes as
 independent, although all runs drive the same {episodes}. Steps to 90 %: the training steps until 45 of some 50
 episodes, begun one after the other, had reached the goal; a run that never got there counts with all its steps.
-Episodes that an intervention cut (SAILR) do not count. Decision: mean time of a single decision of policy and
-filter, on a machine that other work shared.
+Recorded periods (see *Methods*) do not count as training steps. Episodes that an intervention cut (SAILR) do not count.
+Decision: mean time of a single decision of policy and filter, on a machine that other work shared; differences
+between methods include those of the load.
 """
 IMPROVEMENT = """\
 The probability that a run of ours reaches more goals than a run of the other method, over all arenas; ties count half
-(Agarwal et al. 2021). 0.5: no difference.
+(Agarwal et al. 2021). 0.5: no difference. [1.00, 1.00] means that each run of ours reached more goals than each run of
+the other method. It does not mean that this is certain: if two methods were equal, five runs against five would part
+like this in 1 of 126 comparisons.
 """
 TUNING = """\
-Every rival tries as many values of one setting, with as many episodes, which evaluate nothing else. A filter: 120
-with A*, 120 with a greedy policy. Of the values that cost A* no goal, the best has the fewest collisions of the greedy
-policy, then the most of its goals, then the fewest interventions on A*. A learner: one training from a seed of its own
-and 120 episodes. Of the values within 5 % of the most goals, the best has the fewest collisions. The clearance margin
-of ours follows from its model set. The penalty for corrections is 1, in the air 12 for the filters that know the map:
+Every rival but TD3 tries four values of one setting, in episodes that evaluate nothing else. A filter trains nothing:
+it drives 120 episodes with A* and 120 with a greedy policy. Of the values with which A* reaches the most goals, the
+best has the fewest collisions of the greedy policy, then the most of its goals, then the fewest interventions on A*. A
+learner trains once, from a seed of its own, and drives 120 episodes. Of the values that reach at most 6 goals (5 % of
+the episodes) fewer than the value with the most, the best has the fewest collisions. Behind our filter, SAC is not
+tuned. The clearance margin of ours follows from its model set. The penalty for corrections is 1, in the air 12 for the
+filters that know the map:
 it was chosen from 1, 4, 12, 40 and 100 by trainings of ours from seed 0, and its growth and the imitation from
-trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). All learners share TD3's other settings, and those
-were chosen on ours (`deploy/experiments/experiments.md`).
+trainings of ours from seeds 0 and 1 (`docs/results_quadrotor.md`). The other settings of TD3 are the same for all
+methods, and were chosen on ours (`deploy/experiments/experiments.md`).
 """
 THREATS = """## Threats to validity
 
@@ -325,9 +341,14 @@ THREATS = """## Threats to validity
 - **Knowledge.** Filters that read the arena's map know more than those that read rays, and methods differ in recorded
   data and in models by hand: see *Methods*. The equations by hand describe these
   simulated robots well.
+- **Recorded periods** come before the training, and no count of training steps contains them. With them, a method that
+  learns from a recording may need more periods of driving than one without.
 - **Tuning.** Each rival tuned one setting over four values, in `default`. Penalty, its growth and imitation were chosen
   on trainings of ours whose seeds are in the table. More tuning may help every method, also ours. Where the
   best value is the first or the last that was tried, a better one may lie beyond it. Learners were tuned from one seed.
+- **Rooms.** The trainings that chose penalty, its growth, imitation and turning aside were evaluated in rooms of the
+  tables (the first 200 or all 500 of an arena), and the rivals' values in other rooms. This favours ours. The campaigns
+  (`docs/campaigns.md`) drive the stored policies in 10,000 rooms of each arena, which contain these 500.
 - **Turning aside.** Our filter turns a blocked robot aside (`docs/method.md`, section 4). The rivals' filters do not;
   the same could be done with them.
 - **Learners** make an update for each step. More updates may lead to 90 % of goals in fewer steps.

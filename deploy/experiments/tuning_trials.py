@@ -1,8 +1,8 @@
 """Tune one setting of every rival with the same budget, as jobs whose results the results page lists.
 
-Each rival tries four values. Among the values of a filter with which A* loses no goal, choose the one with the fewest
-collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy, then
-by the interventions on A*. The results are the `rivals` of the task files.
+Each rival tries four values. Among the values of a filter with which A* reaches the most goals, choose the one with the
+fewest collisions of the greedy policy, which drives straight to the goal. Break ties by the goals of the greedy policy,
+then by the interventions on A*. The results are the `rivals` of the task files.
 
 A learner trains once with each value, from a seed that no comparison uses, and drives 120 episodes in the first
 arena. Among the values whose goals come within `NEARLY` of the most, its best one has the fewest collisions, then the

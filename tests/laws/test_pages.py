@@ -14,6 +14,7 @@ import pytest
 import brakeline
 from brakeline import ModelSet
 from brakeline.deploy.cli import parse
+from brakeline.deploy.commands.campaign_command import CampaignCommand
 from brakeline.deploy.experiments.compared_methods import METHODS
 from tests.laws.test_names import PARTS
 
@@ -137,15 +138,18 @@ def test_the_tutorial_shows_the_example_as_it_is() -> None:
 
 def commands(page: str) -> list[str]:
     """Return the commands of a page without redirections and comments; not those with a … in them."""
-    lines = re.findall(r"^ *(brakeline [^\n]+)$", page, re.MULTILINE)
+    lines = re.findall(r"^ *(brakeline [^\n]+)$", re.sub(r"\\\n *", " ", page), re.MULTILINE)
     return [line.partition(" > ")[0] for line in lines if "…" not in line and "..." not in line]
 
 
-@pytest.mark.parametrize("page", [README, *sorted((ROOT / "docs").glob("t*.md"))], ids=lambda page: page.name)
-def test_every_command_of_readme_and_tutorial_can_be_parsed(page: Path) -> None:
+@pytest.mark.parametrize("page", [README, *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name)
+def test_every_command_of_the_pages_can_be_parsed(page: Path) -> None:
+    """A campaign also takes the numbers of its command."""
     for command in commands(page.read_text()):
         name, *words = shlex.split(command, comments=True)[1:]
-        parse(name, words)
+        parsed = parse(name, words)
+        if isinstance(parsed, CampaignCommand):
+            parsed.check_options()
 
 
 def test_every_public_name_is_in_the_reference() -> None:

@@ -161,7 +161,7 @@ def test_another_task_in_another_arena_has_its_contacts_in_the_table(rivals, tmp
     episodes["contact_standing"] = [1]
     rows = table([cell])["parts"]["many-walkers"]["ddpc"]
     assert rows["run into while standing"].value == 1.0 and rows["run into while moving"].value == 0.0
-    assert "| run into while standing | 100.0 % [2.5, 100.0] |" in markdown(table([cell]))  # exact, of one episode
+    assert "| run into while standing | 100.00 % [2.50, 100.00] |" in markdown(table([cell]))  # exact, of one episode
     del episodes["contact_moving"]
     assert "run into while standing" not in table([cell])["parts"]["many-walkers"]["ddpc"]
 

@@ -11,7 +11,7 @@ import pytest
 from brakeline.deploy.commands import compare_command
 from brakeline.deploy.commands.compare_command import CompareCommand
 from brakeline.deploy.data import model_store
-from brakeline.deploy.experiments import bootstrap, conservatism
+from brakeline.deploy.experiments import bootstrap, conservatism, results_page
 from brakeline.deploy.experiments.compared_methods import METHODS
 from brakeline.deploy.experiments.comparison_cells import cell_configs, learning
 from brakeline.deploy.experiments.comparison_table import markdown, table
@@ -134,13 +134,39 @@ def test_cells_of_two_learners_are_not_mixed_and_the_page_names_their_settings(r
     for path in (results / "ground").glob("ddpc-s*.json"):
         change(path, lambda cell: cell["study"]["td3"].update(grown))
     text = page(results, ["ground"])
-    assert "| learner of ours | penalty for corrections 1, penalty_growth 4, imitation 1 |" in text
+    rates = "actor_rate 0.0003, critic_rate 0.0003"
+    assert f"| learner of ours | {rates}, penalty for corrections 1, penalty_growth 4, imitation 1 |" in text
+    assert f"| learner of TD3 | {rates} |" in text and "| learner of SAC | learning rate 0.0003 |" in text
+    assert f"| learner of TD3-Lagrange | {rates}, cost_limit 0.01, multiplier_rate 1 |" in text
     for name in grown:  # as in a version that did not have these settings yet
         change(results / "ground" / "none-s0.json", lambda cell, name=name: cell["study"]["td3"].pop(name))
     assert page(results, ["ground"]) == text
     change(results / "ground" / "ddpc-s0.json", lambda cell: cell["study"]["td3"].update(imitation=0.5))
     with pytest.raises(ResultError, match="ddpc has cells of several settings"):
         stored_cells(results, "ground")
+
+
+def test_a_rare_collision_does_not_read_as_none(results):
+    """One collision in four trainings is 0.25 in a training, and 0 of 400 episodes may be up to 0.92 %."""
+    path = results / "ground" / "ddpc-s0.json"
+    change(path, lambda cell: cell["training"]["episodes"].update(collision=[1] + [0] * 99))
+    lines = markdown(table(stored_cells(results, "ground"))).splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("| coll")]
+    assert rows[0][:2] == ["collision rate", "0.25 % [0.00, 1.25]"] and rows[0][2].startswith("6.00 % [")
+    assert rows[1][:3] == ["collisions", "0.2", "6.0"], "a mean over the seeds"
+    assert rows[2][1] == "0.00 % [0.00, 0.92]"
+
+
+@pytest.mark.parametrize("mirrored, words", [("turns", "learns from mirrored steps"), ("none", "actor_rate")])
+def test_the_page_says_which_learners_had_mirrored_steps(results, monkeypatch, mirrored, words):
+    """Stable-Baselines3's SAC has none, whatever its cell says of TD3's settings."""
+    ground = robot_with_task("ground")
+    task = replace(ground.task, symmetry=mirrored)
+    monkeypatch.setattr(results_page, "robot_with_task", lambda name: replace(ground, task=task))
+    lines = [line for line in page(results, ["ground"]).splitlines() if "| learner of" in line]
+    rows = {line.split("|")[1].strip(): line for line in lines}
+    assert words in rows["learner of TD3"] and ("no mirrored steps" in rows["learner of SAC"]) == (mirrored == "turns")
+    assert ("mirrored" in rows["learner of ours"]) == (mirrored == "turns")
 
 
 def test_the_command_writes_the_page_and_the_figures_without_a_run(results):
