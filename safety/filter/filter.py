@@ -86,7 +86,7 @@ class Filter:
     observed = 0  # the filter reads no observation
 
     def __init__(self, model: ModelSet, clearance_margin: float | None = None) -> None:
-        """Prepare a model set. clearance_margin [m] is by default as much as turning in place needs (see `ClearanceMargin`).
+        """Prepare a model set. clearance_margin [m]: by default what turning in place needs (see `ClearanceMargin`).
 
         Raises:
             TypeError: `model` is no model set.
