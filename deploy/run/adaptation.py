@@ -298,7 +298,7 @@ class Adaptation:
         if not refused and not width <= most:  # NaN too
             refused = f"its sets are {TIGHTER * width / most:.2g} times as wide as those in use, as widened"
         if not refused and not (stands := room_to_stand(model)) <= room:
-            refused = f"a standing robot needs {stands:.2f} m around it, with the set in use, as widened, {room:.2f} m"
+            refused = f"a standing robot needs {stands:.2f} m of room; with the set in use, as widened, {room:.2f} m"
         if refused:
             return math.inf, Recertification(f"{NAMES[way]}: {refused}")
         stated = (
@@ -383,8 +383,7 @@ def _largest_half_width(in_use: ModelSet, widening: float, data: Dataset) -> flo
 def room_to_stand(model: ModelSet) -> float:
     """Return how far the sets of a robot that stands, or turns in place, reach [m].
 
-    The recent driving may hold little standing, and then the sets of a fit are wide there. An autopilot with a weak
-    motor got such sets: its hover could no longer be verified where it was, and it hardly moved any more.
+    If the recent driving holds little standing, the sets of a fit are wide there, and the robot may be stuck.
     """
     return Filter(model).clearance_margin
 

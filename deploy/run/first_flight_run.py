@@ -55,7 +55,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
     """Take off, fly, land, store the recorded data, and return them with their model set.
 
     SIGINT or SIGTERM land the vehicle at once, and so does any error; the data until then count. During the flight,
-    the data until then are in a partial data set beside `path`, which only a killed process leaves behind.
+    the data until then are in a partial data set beside `path` (`partial_path`). It is deleted once `path` is stored.
 
     Args:
         robot: the description in real time.
@@ -82,6 +82,7 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
         raise_limits=settings.raise_limits,
         lead=settings.lead,
     )
+    partial = PartialSave(partial_path(path))
     # A second signal must not leave the vehicle in the air. No actor of this machine may take the vehicle.
     with stop_on_signals(threading.Event(), patient=True) as stop, listening(url, settings.system):
         vehicle = MavlinkVehicle(robot, flight_settings, stop=stop.is_set, from_ground=True)
@@ -93,7 +94,6 @@ def fly(robot: Robot, url: str, seed: int, settings: FirstFlightSettings, path: 
             middle = vehicle.current_period.report.measured[:3]
             box = Box(middle, np.array([0.5 * settings.room, 0.5 * settings.room, settings.height * 2.0 / 3.0]))
             metadata = {"autopilot": "; ".join(vehicle.notes), "url": url} | about_age([age])
-            partial = PartialSave(partial_path(path))
             flight = FirstFlight(vehicle, robot, box, seed, metadata, stop.is_set, partial.offer)
             try:
                 flight.fly(settings.minutes)

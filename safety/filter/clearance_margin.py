@@ -5,6 +5,7 @@ Without it a robot may stop so close to an obstacle that no motion can be verifi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,8 @@ class ClearanceMargin:
     at the plan's end only.
 
     Attributes:
-        half (M, d), extra (M,) [m]: of the boxes that a standing robot may need.
+        half (M, d): half-widths of the sets of a standing robot [m].
+        extra (M,): chord deviation or stopping distance, which come on top in every direction [m].
         whole_plan: it holds during the whole plan.
         largest: the margin in the direction in which it is largest [m].
     """
@@ -33,6 +35,18 @@ class ClearanceMargin:
     extra: Array
     whole_plan: bool
     largest: float
+
+    @classmethod
+    def of(cls, robot: Robot, tube: Tube, given: float | None) -> ClearanceMargin:
+        """Return the margin that is given [m], or else the one that the tube of turning in place needs.
+
+        Raises ValueError: the margin is negative or not finite.
+        """
+        if given is None:
+            return cls.of_standing(robot, tube)
+        if not 0.0 <= given < math.inf:  # NaN fails too
+            raise ValueError(f"a clearance margin is a finite number of at least 0, not {given:g}")
+        return cls.constant(robot, given)
 
     @classmethod
     def constant(cls, robot: Robot, margin: float) -> ClearanceMargin:
@@ -50,9 +64,10 @@ class ClearanceMargin:
         in_place = np.where([not moves for moves in robot.translates], robot.high(), 0.0)
         state = robot.state_at_inputs(in_place)
         z = np.concatenate([state[list(robot.regressor)], in_place, np.tile(in_place, robot.free_steps)])
+        tube = tube.at(z)
         if robot.heading is not None:
-            return cls.constant(robot, _turning_extent(robot, tube.at(z), z))
-        half = np.abs(tube.at(z).centers(z)) + tube.at(z).half_widths(z)
+            return cls.constant(robot, _turning_extent(robot, tube, z))
+        half = np.abs(tube.centers(z)) + tube.half_widths(z)
         chord, stop = np.split(tube.magnitudes(z)[tube.generators :], [tube.horizon])
         # The rows of each period's start and end, and of the last end: `rows_per_obstacle`.
         starts = np.vstack([np.zeros((1, half.shape[1])), half[:-1]])

@@ -12,7 +12,6 @@ can answer, and a log can be replayed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -94,8 +93,6 @@ class Filter:
         """
         if not isinstance(model, ModelSet):
             raise TypeError(f"Filter takes a ModelSet, not a {type(model).__name__}: give Filter.load(NAME_OR_PATH)")
-        if clearance_margin is not None and not 0.0 <= clearance_margin < math.inf:  # NaN fails too
-            raise ValueError(f"a clearance margin is a finite number of at least 0, not {clearance_margin:g}")
         self.model = model
         self.version = model.version
         self.bound = stated_bound(model.about)
@@ -108,9 +105,7 @@ class Filter:
         self.domain = np.hstack([recorded, np.tile(of_inputs, robot.committed_steps)])
         turning = model.turning()
         in_place = self.tube if turning is None else turning.tube()
-        margin = ClearanceMargin.of_standing(robot, in_place)
-        if clearance_margin is not None:
-            margin = ClearanceMargin.constant(robot, clearance_margin)
+        margin = ClearanceMargin.of(robot, in_place, clearance_margin)
         self.constraints = TubeConstraints(model, self.tube, outer, recorded, margin)
         self.in_place: tuple[Array, TubeConstraints] | None = None
         if turning is not None and model.in_place is not None:

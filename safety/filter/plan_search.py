@@ -126,11 +126,10 @@ class PlanSearch:
         # The clearance margin keeps room to turn. A plan in place does not move the robot, so it needs no margin.
         if margin >= (0.0 if in_place else enough):
             return allowed
-        kept_off = constraints.kept_off(planes, len(slack))
-        if constraints.least(slack - kept_off, z, safety.clearance_margin) >= 0.0:
-            return allowed
         general = safety.constraints.at(z, local_map.widening) if in_place else constraints
         proposed = Linearized(general, local_map, z, planes, slack)
+        if constraints.least(slack - proposed.kept_off, z, safety.clearance_margin) >= 0.0:
+            return allowed
         if margin >= 0.0 and general.margin(self.with_clearance_margin(proposed), z) >= 0.0:
             return allowed
         edge = "m of the free space's edge" if safety.robot.position_dim else "(in its own unit) of a limit"

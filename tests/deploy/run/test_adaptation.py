@@ -235,7 +235,7 @@ def test_a_set_with_which_a_robot_could_no_longer_stand_is_refused(kind, monkeyp
     (attempt,) = drive(kind, driven(2, 7, slip=-0.15), widening=8.0)
     room = 0.1 * Filter(in_use()).constraints.plan_widening(8.0)
     assert room == 0.8 and attempt.model is None
-    assert attempt.text.count("a standing robot needs 0.81 m around it, with the set in use, as widened, 0.80 m") == 2
+    assert attempt.text.count("a standing robot needs 0.81 m of room; with the set in use, as widened, 0.80 m") == 2
 
 
 def test_driving_that_is_too_narrow_makes_no_set(kind):

@@ -11,7 +11,7 @@ import pytest
 
 from brakeline.actors.actor_settings import FlightSettings
 from brakeline.actors.mavlink.mavlink_vehicle import MavlinkVehicle
-from brakeline.deploy.data import first_flight, partial_save
+from brakeline.deploy.data import first_flight
 from brakeline.deploy.data.first_flight import FirstFlight
 from brakeline.deploy.data.partial_save import PartialSave, partial_path
 from brakeline.deploy.data.trajectory_builder import TrajectoryBuilder
@@ -81,7 +81,6 @@ def test_a_flight_that_is_killed_leaves_what_it_recorded(
 ) -> None:
     path, kept = tmp_path / "flown.safetensors", list[Dataset]()
     part = partial_path(path)
-    monkeypatch.setattr(partial_save, "EVERY", 0.0)
     monkeypatch.setattr(first_flight, "PIECE", 10)
     part.write_bytes(b"of an earlier flight")
 
