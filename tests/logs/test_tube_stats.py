@@ -189,6 +189,9 @@ def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_w
     assert (plans["scored"], plans["beyond"], plans["beyond_widened"], plans["widening"]) == (4, 3, 2, 3.3)
     shown = printed(show(closed_loop([]) | {"plans": plans}))
     assert "3 (75.0%); 2 (50.0%) as widened, by up to 3.3 times" in shown
+    exchanges[1].reply.decision.plan_score = 0.9  # its position stayed inside
+    plans = figures([of(*exchanges)])
+    assert (plans["beyond"], plans["beyond_widened"]) == (3, 1)
 
 
 def test_the_widening_is_shown_where_no_window_was_scored():
