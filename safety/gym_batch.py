@@ -13,7 +13,7 @@ from brakeline.errors import Mismatch
 from brakeline.messaging.number_checks import check_numbers
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
-from brakeline.safety.gym_checks import check_robot, check_rows
+from brakeline.safety.gym_checks import check_filter, check_robot, check_rows
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -47,7 +47,7 @@ class BatchSafetyWrapper(VectorWrapper):
             Mismatch: the environment has no `begin_step` and `end_step`, or other wrappers around it, or the filter is
                 that of another robot.
             TooLoose: the validation report states a larger probability than accepted, or there is no report.
-            TypeError: `filter` decides on no batches.
+            TypeError: `filter` is a client, or decides on one robot at a time.
             ValueError: batches do not decide for this kind of robot, or the penalty is negative or not finite.
         """
         from brakeline.safety.model.stated_bound import check_bound
@@ -58,11 +58,9 @@ class BatchSafetyWrapper(VectorWrapper):
             raise Mismatch(
                 f"BatchSafetyWrapper steps {env.unwrapped} itself, past {env}: put it inside all other wrappers"
             )
+        check_filter(filter)
         if not hasattr(filter, "decide_batch"):
-            given = type(filter).__name__
-            raise TypeError(
-                f"a filter is needed here, not a {given}: give Filter.load(NAME_OR_PATH), of a rival RowByRow(method)"
-            )
+            raise TypeError(f"a {type(filter).__name__} decides on one robot at a time: give RowByRow of it")
         super().__init__(env)
         check_robot(env, filter.robot)
         check_bound(getattr(filter, "model", None), filter.robot, accept_bound)

@@ -1,4 +1,4 @@
-"""Check what a Gymnasium wrapper gets: the robot of the environment, the penalty, and the actions of many robots."""
+"""Check what a Gymnasium wrapper gets: the robot of the environment, the filter of many robots, and their actions."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from brakeline.errors import BadRequest, Mismatch
 from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.service.filter_client import FilterClient
 
 UNSHARED = {"accept_bound"}  # in a description: a limit for the model set, which says nothing about the robot
 
@@ -31,12 +32,17 @@ def check_robot(env: Any, robot: Robot) -> None:
     )
 
 
-def check_rows(inputs: Array, count: int, robot: Robot) -> Array:
-    """Return the inputs of many robots, if their shape is (count, m). Raises BadRequest."""
+def check_filter(filter: Any) -> None:
+    """Check what decides for many robots. Raises TypeError: it is no filter, or a client, which serves one robot."""
+    if isinstance(filter, FilterClient) or not hasattr(filter, "robot"):
+        raise TypeError(f"a filter is needed here, not a {type(filter).__name__}: give Filter.load(NAME_OR_PATH)")
+
+
+def check_rows(inputs: Array, count: int, robot: Robot) -> None:
+    """Check the shape (count, m) of the inputs of many robots. Raises BadRequest."""
     if np.shape(inputs) != (count, robot.action_dim):
         raise BadRequest(
             "action",
             f"the actions have shape {np.shape(inputs)}: give ({count}, {robot.action_dim}), for each of the {count} "
             f"environments {', '.join(robot.action)}",
         )
-    return inputs

@@ -57,7 +57,7 @@ def check_options(options: Mapping[str, Any], *known: str) -> None:
         raise ValueError(f"a reset has no option {names}; there are: {', '.join(known)}")
 
 
-def check_settings(conditions: Conditions | None, reward: Reward | None, seed_key: int) -> None:
+def check_settings(conditions: Any, reward: Any, seed_key: Any) -> None:
     """Check arguments of an environment. Raises TypeError: one has another type; ValueError: there is no such key."""
     kinds = (("conditions", conditions, Conditions, "sim.sim_conditions"), ("reward", reward, Reward, "messaging.task"))
     for name, value, kind, module in kinds:
