@@ -18,12 +18,14 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from brakeline.errors import BadRequest, BusError, Mismatch, TooLoose
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.robot import Array, Robot
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.messaging.stated_share import percent
 from brakeline.safety.action_mapping import ActionMapping, cast_action, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import correction_penalty
+from brakeline.safety.gym_checks import check_robot
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer, FilterClient
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -87,10 +89,11 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             turn_aside: turn a robot that is blocked towards the nearest direction in which it can drive on.
 
         Raises:
-            Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
+            Mismatch: the action space is not that of the robot's inputs, and `actions` is not given. Or the environment
+                states its robot (`env.unwrapped.robot`), and its description is not that of the filter.
             TooLoose: the validation report states a larger probability, or there is no report. With a client of a
                 service, `step` raises it, since only the answers state the probability.
-            ValueError: `accept_bound` is not above 0 and at most 1.
+            ValueError: `accept_bound` is not above 0 and at most 1, or the penalty is negative or not finite.
         """
         kept = {"penalty": penalty, "state": state, "obstacles": obstacles, "actions": actions}
         kept |= {"accept_bound": accept_bound, "turn_aside": turn_aside}
@@ -100,7 +103,9 @@ class SafetyWrapper(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         gymnasium.Wrapper.__init__(self, env)
         self.client = filter if isinstance(filter, FilterClient) else InProcess(filter, accept_bound)
         self._limit = 1.0 if accept_bound is None else _checked_limit(self.client, accept_bound)
+        check_robot(env, self.client.robot)
         self.penalty, self.backup_plan = penalty, self.client.backup_plan
+        check_numbers(self, "penalty", least=0.0)
         self.backup_plan.turn_aside = turn_aside
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.action_space, self.client.robot, actions)

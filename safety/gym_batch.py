@@ -10,8 +10,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from brakeline.errors import Mismatch
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.safety.filter.batch.obstacle_arrays import ObstacleArrays
 from brakeline.safety.filter.batch.plan_batch import BackupPlanBatch, BatchOutcome, correction_penalties
+from brakeline.safety.gym_checks import check_filter, check_robot, check_rows
 
 if TYPE_CHECKING:
     from brakeline.safety.filter.batch.row_by_row import BatchMethod
@@ -42,9 +44,11 @@ class BatchSafetyWrapper(VectorWrapper):
         """Wrap an environment; see `SafetyWrapper` for the arguments. `RowByRow` makes a filter of a rival.
 
         Raises:
-            Mismatch: the environment has no `begin_step` and `end_step`, or other wrappers around it.
+            Mismatch: the environment has no `begin_step` and `end_step`, or other wrappers around it, or the filter is
+                that of another robot.
             TooLoose: the validation report states a larger probability than accepted, or there is no report.
-            ValueError: batches do not decide for this kind of robot.
+            TypeError: `filter` is a client, or decides on one robot at a time.
+            ValueError: batches do not decide for this kind of robot, or the penalty is negative or not finite.
         """
         from brakeline.safety.model.stated_bound import check_bound
 
@@ -54,9 +58,14 @@ class BatchSafetyWrapper(VectorWrapper):
             raise Mismatch(
                 f"BatchSafetyWrapper steps {env.unwrapped} itself, past {env}: put it inside all other wrappers"
             )
+        check_filter(filter)
+        if not hasattr(filter, "decide_batch"):
+            raise TypeError(f"a {type(filter).__name__} decides on one robot at a time: give RowByRow of it")
         super().__init__(env)
+        check_robot(env, filter.robot)
         check_bound(getattr(filter, "model", None), filter.robot, accept_bound)
         self.plans, self.penalty = BackupPlanBatch(filter, env.num_envs, turn_aside), penalty
+        check_numbers(self, "penalty", least=0.0)
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._infos: dict[str, Any] | None = None
         self._observations: Any = None
@@ -81,6 +90,7 @@ class BatchSafetyWrapper(VectorWrapper):
         if self._infos is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         proposed, before = np.asarray(actions, dtype=float), self.plans.input_in_force
+        check_rows(proposed, self.num_envs, self.plans.robot)
         obstacles = ObstacleArrays(**self._infos["obstacles"])
         outcome = self.plans.decide(self._infos["state"], proposed, obstacles, self._observations)
         self.env.unwrapped.begin_step(outcome.inputs)  # type: ignore[attr-defined]

@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from brakeline.errors import BadRequest, Mismatch
+from brakeline.messaging.number_checks import check_numbers
 from brakeline.messaging.sensor_messages import RangeMeasurement
 from brakeline.safety.action_mapping import ActionMapping, mapping_for_space
 from brakeline.safety.environment_views import OBSTACLES, STATE, View
 from brakeline.safety.filter.backup_plan import BackupPlan, correction_penalty
 from brakeline.safety.filter.request import Request
 from brakeline.safety.gym import diagnostics, is_measurement_fault
+from brakeline.safety.gym_checks import check_filter, check_robot, check_rows
 from brakeline.safety.perception.image_memory import filled, memory_of
 from brakeline.safety.service.filter_client import Answer
 from brakeline.safety.service.in_process import InProcess, request_observation
@@ -51,11 +53,14 @@ class VectorSafetyWrapper(VectorWrapper):
         """Wrap a vector environment; see `SafetyWrapper` for the arguments.
 
         Raises:
-            Mismatch: the action space is not that of the robot's inputs, and `actions` is not given.
-            TooLoose: the validation report states a larger probability than accepted, or there is no report.
+            Mismatch, TooLoose, ValueError: see `SafetyWrapper`.
+            TypeError: `filter` is a client, which has the backup plan of one robot.
         """
         super().__init__(env)
+        check_filter(filter)
         self.client, self.penalty = InProcess(filter, accept_bound), penalty
+        check_robot(env.unwrapped.envs[0] if isinstance(env.unwrapped, SyncVectorEnv) else env, filter.robot)
+        check_numbers(self, "penalty", least=0.0)
         self.backup_plans = [BackupPlan(filter.robot, turn_aside) for _ in range(env.num_envs)]
         self._state, self._obstacles = state, obstacles
         self._actions = mapping_for_space(env.single_action_space, filter.robot, actions)
@@ -81,6 +86,7 @@ class VectorSafetyWrapper(VectorWrapper):
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         robot = self.client.robot
         proposed = np.asarray(self._actions.action_to_control(actions), dtype=float)
+        check_rows(proposed, self.num_envs, robot)
         # In the mode NEXT_STEP, an environment that has ended is reset and takes no action.
         resets = self._ended if self._mode == AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         deciding = np.flatnonzero(~resets).tolist()

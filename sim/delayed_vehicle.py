@@ -66,7 +66,11 @@ def simulated_vehicle(robot: RobotWithTask, conditions: Conditions, tap: object 
 
 
 def check_described(robot: Robot, simulated: Robot) -> None:
-    """Raise Mismatch if a simulator of the robot `simulated` can't move as the description of `robot` states."""
+    """Check a description of `robot` against that of the robot that a simulator moves.
+
+    Raises:
+        Mismatch: the simulator can't move as `robot` states, or its body reaches farther.
+    """
     (low, high), (least, most) = robot.bounds, simulated.bounds
     sizes = [(one.state_dim, one.action_dim) for one in (robot, simulated)]
     if sizes[0] != sizes[1]:
@@ -75,6 +79,8 @@ def check_described(robot: Robot, simulated: Robot) -> None:
         why = f"has a period of {simulated.period:g} s, not {robot.period:g} s"
     elif (low < least).any() or (high > most).any() or (robot.slew > simulated.slew).any():
         why = "clips inputs to narrower bounds or to a smaller slew"
+    elif robot.footprint < simulated.footprint:  # the filter would keep too little clear
+        why = f"has a body that reaches {simulated.footprint:g} m from its position, not {robot.footprint:g} m"
     else:
         return
     raise Mismatch(

@@ -57,6 +57,16 @@ def check_options(options: Mapping[str, Any], *known: str) -> None:
         raise ValueError(f"a reset has no option {names}; there are: {', '.join(known)}")
 
 
+def check_settings(conditions: Any, reward: Any, seed_key: Any) -> None:
+    """Check arguments of an environment. Raises TypeError: one has another type; ValueError: there is no such key."""
+    kinds = (("conditions", conditions, Conditions, "sim.sim_conditions"), ("reward", reward, Reward, "messaging.task"))
+    for name, value, kind, module in kinds:
+        if value is not None and not isinstance(value, kind):
+            raise TypeError(f"{name} is a {type(value).__name__}: give a {kind.__name__} of brakeline.{module}")
+    if not isinstance(seed_key, Integral) or seed_key < 0:
+        raise ValueError(f"seed_key is an integer, 0 or more, not {seed_key!r}")
+
+
 def action_and_observation_space(robot: RobotWithTask) -> tuple[Box[np.float32], Box[np.float32]]:
     """Return the space of a robot's inputs within their bounds, and the space of its observations."""
     limit = np.full(robot.task.observation_dim, OBSERVED_LIMIT, dtype=np.float32)
@@ -138,7 +148,8 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             arena: the name of one of the task's arenas. Defaults to `default`, or to the task's first one.
             make_vehicle: puts a vehicle at the start of an arena. Defaults to the task's simulator under `conditions`.
             lidar_noise: standard deviation of a range [m]. Defaults to the conditions' value for this robot.
-            seed_key: a number that is 0 or more; environments with different keys have different episodes.
+            conditions: noise, wind, payload and sensors. Defaults to those of the recorded data.
+            seed_key: an integer, 0 or more; environments with different keys have different episodes.
             reward: replaces the task's reward.
             draw: draws the arena of an episode.
 
@@ -146,8 +157,11 @@ class NavigationEnv(gymnasium.Env[Observation, Any]):
             UnknownRobot: no robot has this name.
             UnknownTask: the robot has no task.
             UnknownName: the robot has no arena of this name.
-            ValueError: the render mode is none of `metadata["render_modes"]`, or the noise cannot be.
+            TypeError: the conditions or the reward have another type.
+            ValueError: the render mode is none of `metadata["render_modes"]`, there is no such key, the noise
+                is negative, or the simulator of this robot has no such conditions.
         """
+        check_settings(conditions, reward, seed_key)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode is None, 'rgb_array' or 'human', not {render_mode!r}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot

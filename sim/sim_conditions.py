@@ -173,7 +173,11 @@ OPTIONAL = {
 
 @dataclass(frozen=True)
 class Conditions:
-    """All conditions, of every kind of robot. weak_motor: share of its force that one motor keeps."""
+    """All conditions, of every kind of robot.
+
+    `noise` counts for robots on the floor and `flight_noise` for those in the air, which ignore the other one.
+    weak_motor: share of its force that one motor keeps.
+    """
 
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     payload_kg: float = 0.0

@@ -68,7 +68,7 @@ class CompareCommand:
     """Train this many robots at once, where a batch trains. Defaults to the number in the robot's task. If you change
     it, give another --results folder."""
     quick: bool = False
-    """Run the same code within a minute or two: few steps, small networks, one seed. Writes to runs/quick, always anew.
+    """Run the same code within minutes: few steps, small networks, one seed. Writes to runs/quick, always anew.
     """
     engine: Unprefixed[Engine] = field(default_factory=lambda: Engine(workers=2))
     tune: bool = False

@@ -52,6 +52,12 @@ Take = Callable[[pb.Step], object]
 Begin = Callable[[pb.Episode], object]
 
 
+def progress(table: EpisodeTable) -> str:
+    """Say how far a training is. The first episodes to end are the shortest, so a share alone would mislead."""
+    goals = [row["goal"] for row in table.rows[-50:]]
+    return f"step {table.decisions}, {sum(goals):g} of the last {len(goals)} episodes reached the goal"
+
+
 class CellRun:
     """The run of one cell in a folder.
 
@@ -92,8 +98,7 @@ class CellRun:
                 table.step(step)
                 log.put_step(step)
                 if table.decisions % 1000 == 0:
-                    goals = [row["goal"] for row in table.rows[-50:]] or [0]
-                    self.say(f"step {table.decisions}, goals {sum(goals) / len(goals):.0%}")
+                    self.say(progress(table))
 
             policy, updates = train(trial, take, partial(log.put, EPISODE))
         policy.save(self.folder / POLICY)

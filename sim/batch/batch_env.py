@@ -32,6 +32,7 @@ from brakeline.sim.navigation_env import (
     action_and_observation_space,
     check_observation,
     check_options,
+    check_settings,
     episode_seed,
 )
 from brakeline.sim.sim_conditions import Conditions
@@ -88,9 +89,10 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
 
         Raises:
             NoBatch: this robot, arena or perception can only be simulated one by one.
-            UnknownRobot, UnknownTask, UnknownName: see `NavigationEnv`.
+            UnknownRobot, UnknownTask, UnknownName, TypeError: see `NavigationEnv`.
             ValueError: there is no robot, or no simulator of this robot has such conditions.
         """
+        check_settings(conditions, reward, seed_key)
         if num_envs < 1:
             raise ValueError(f"a batch has at least one robot, not {num_envs}")
         self.robot = robot_with_task(robot) if isinstance(robot, str) else robot
@@ -132,7 +134,9 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
 
         Raises:
             ValueError: there is no such option, or not a seed or flag for each robot.
+            gymnasium.error.ClosedEnvironmentError: the threads have ended.
         """
+        self._check_open()
         options = options or {}
         check_options(options, "episode_seeds", "reset_mask")
         rows = self._rows_of(options.get("reset_mask"))
@@ -146,6 +150,17 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         self._now = self._join(rows, *self._begin(rows, episodes))
         check_observation(self.robot, self._now[0].shape[1])
         return self._now
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Refuse a copy. Raises TypeError: the threads and the physics of many robots cannot be copied."""
+        raise TypeError(
+            "a batch of robots cannot be copied or sent to another process: make another one there, and repeat the "
+            'episodes by reset(options={"episode_seeds": infos["episode_seed"]}) and their actions'
+        )
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise gymnasium.error.ClosedEnvironmentError("this environment is closed: make another one")
 
     def _rows_of(self, mask: Any) -> NDArray[np.intp]:
         """Return the robots of a mask (N,), or all of them without one; the first reset is of all."""
@@ -176,7 +191,9 @@ class BatchNavigationEnv(VectorEnv[Observations, Array, Any]):
         Raises:
             BadInput: an input is not finite.
             gymnasium.error.ResetNeeded: no episode has begun.
+            gymnasium.error.ClosedEnvironmentError: the threads have ended.
         """
+        self._check_open()
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset() before the first step")
         inputs = np.asarray(actions, dtype=float)

@@ -36,6 +36,20 @@ def test_the_filter_ends_the_collisions_of_a_policy_that_knows_no_obstacles():
     assert " 0 collisions, " in names["drive"](SafetyWrapper(env, Filter.load("ground")), 2)
 
 
+def test_the_page_about_environments_changes_a_task():
+    page = (EXAMPLES.parent / "docs" / "environments.md").read_text()
+    code = page.partition("### Change the task")[2].partition("```python\n")[2].partition("```")[0]
+    ground, air = code.partition("windy = ")[::2]
+    names: dict[str, object] = {}
+    exec(ground, names)
+    env = names["env"].unwrapped
+    assert (env.arena_name, env.reward.goal, env.conditions.noise.scale) == ("open", 50.0, 2.0)
+    assert env.reset(seed=0)[1]["scan"] is not None
+    exec("windy = " + air, names)
+    assert names["env"].unwrapped.conditions.wind.speed == 3.0
+    assert names["env"].reset(seed=0)[0].shape == (189,)
+
+
 def test_the_notebook_runs_from_top_to_bottom(capsys):
     matplotlib.use("Agg")
     names: dict[str, object] = {}

@@ -128,6 +128,25 @@ def test_a_file_that_is_no_log_is_rejected(tmp_path: Path) -> None:
         list(read(tmp_path / "text.mcap"))
 
 
+def documented(number: int, log: Path) -> str:
+    """Return a Python block of the page about logs, which reads this log."""
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
+    return page.split("```python\n")[number + 1].split("```", 1)[0].replace("runs/latest/run.mcap", str(log))
+
+
+def test_a_figure_of_ones_own_comes_from_the_steps_of_a_log(
+    tmp_path: Path, say: Say, capsys: pytest.CaptureFixture[str]
+) -> None:
+    steps = [
+        pb.Step(robot="ground", actor="a", episode=episode, index=i + 1, proposed=[0.25, 0.0], action=[speed, 0.0])
+        for i, (episode, speed) in enumerate([(0, 0.25), (0, 0.0), (1, 0.25)])
+    ]
+    other = say("health/a", pb.Health(process="a"))
+    write(tmp_path / "run.mcap", [other, *(say("step/ground/a", step, 0.2) for step in steps)])
+    exec(documented(1, tmp_path / "run.mcap"), {})
+    assert capsys.readouterr().out.splitlines() == ["ground a 0 0.125", "ground a 1 0.0"]
+
+
 def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Path) -> None:
     """A flight's log has JSON channels, at which the strict reader stops."""
     segment = open_segment(tmp_path / "run.mcap", {})
@@ -137,9 +156,7 @@ def test_the_two_lines_of_the_documentation_read_json_channels_too(tmp_path: Pat
     segment.finish()
     with (tmp_path / "run.mcap").open("rb") as file, pytest.raises(DecoderNotFoundError):
         list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
-    code = page[page.index("```python") :].removeprefix("```python").split("```", 1)[0]
-    code = code.replace("runs/latest/run.mcap", str(tmp_path / "run.mcap"))
+    code = documented(0, tmp_path / "run.mcap")
     seen: list[tuple[str, object]] = []
     exec(code.replace("print(channel.topic, value)", "seen.append((channel.topic, value))"), {"seen": seen})
     assert [topic for topic, _ in seen] == ["log/a", "mavlink/1/1/HEARTBEAT"] and seen[1][1] == {"type": 2}

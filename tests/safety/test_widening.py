@@ -14,10 +14,12 @@ from brakeline.safety.filter.backup_plan import BackupPlan, Prediction
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.request import Request
 from brakeline.safety.filter.widening import MODELS, MOST, RESERVE, WINDOWS, PastWindow, Widening, widening_factor
+from brakeline.safety.gym import SafetyWrapper
 from brakeline.safety.model.model_config import MOST_OUTSIDE
 from brakeline.safety.service.client import request_message
 from brakeline.safety.service.in_process import InProcess
 from brakeline.safety.service.wire import decision_of, decision_reply, request_of
+from brakeline.sim.navigation_env import NavigationEnv
 from tests.robots import GROUND
 from tests.safety.asked import cylinder
 from tests.safety.test_one_step import certified, ready, request
@@ -261,7 +263,24 @@ def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
         answer = client.decide(robot.measure(), action, [], known_free=True)
         scores.append((0.0, 0.0) if answer.score is None else (answer.plan_score, answer.score))
         robot.step(answer.action)
-    scores, factors = np.array(scores), np.array(factors)
-    assert ((scores[100:] > 1.0).mean(0) > (0.15, 0.3)).all()
-    assert ((scores[100:] > factors[100:]).mean(0) < 0.02).all()
-    assert (factors[0] == 1.0).all() and 1.5 < factors[-1, 0] < factors[-1, 1] < 20.0
+    used, widened = np.array(scores), np.array(factors)
+    assert ((used[100:] > 1.0).mean(0) > (0.15, 0.3)).all()
+    assert ((used[100:] > widened[100:]).mean(0) < 0.02).all()
+    assert (widened[0] == 1.0).all() and 1.5 < widened[-1, 0] < widened[-1, 1] < 20.0
+
+
+def test_episodes_behind_the_filter_repeat_once_the_widening_is_forgotten():
+    """As docs/environments.md says: the scores of earlier episodes widen the sets of this one."""
+    env = SafetyWrapper(NavigationEnv(GROUND, "dense"), Filter.load("ground"))
+
+    def executed(number, forget):
+        if forget:
+            env.backup_plan.widening.forget()
+        env.reset(options={"episode_seed": number})
+        return [env.step(np.array([0.25, 0.0]))[4]["diagnostics"]["executed"] for _ in range(60)]
+
+    fresh = executed(2, forget=True)
+    env.backup_plan.widening.judge(2.0)  # the robot left a set
+    assert not np.array_equal(executed(2, forget=False), fresh)
+    env.backup_plan.widening.judge(2.0)
+    assert np.array_equal(executed(2, forget=True), fresh)

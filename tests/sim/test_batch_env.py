@@ -1,9 +1,11 @@
 """Many robots at once see what single environments with the same seeds give, in every autoreset mode."""
 
+import copy
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList
 
@@ -185,3 +187,27 @@ def test_what_only_single_environments_simulate_is_refused() -> None:
     with pytest.raises(BadInput, match="finite"):
         env.step(np.full((2, 2), np.nan))
     env.close()
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["one", "batch"])
+def test_wrong_settings_are_refused_before_the_first_episode(many: bool) -> None:
+    wrong: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
+        ({"reward": {"goal": 1.0}}, TypeError, r"reward is a dict: give a Reward of brakeline\.messaging\.task"),
+        ({"conditions": {"wind": 3.0}}, TypeError, r"conditions is a dict: give a Conditions of brakeline\.sim\."),
+        ({"seed_key": -1}, ValueError, "seed_key is an integer, 0 or more, not -1"),
+        ({"seed_key": 0.5}, ValueError, "not 0.5"),
+    )
+    for how, error, message in wrong:
+        with pytest.raises(error, match=message):
+            BatchNavigationEnv(GROUND, 2, **how) if many else NavigationEnv(GROUND, **how)
+
+
+def test_a_closed_batch_and_a_copy_of_one_are_refused() -> None:
+    env = BatchNavigationEnv(GROUND, 2)
+    with pytest.raises(TypeError, match="episode_seeds"):
+        copy.deepcopy(env)
+    env.reset(seed=0)
+    env.close()
+    for call in (lambda: env.step(np.zeros((2, 2))), env.reset):
+        with pytest.raises(ClosedEnvironmentError, match="make another one"):
+            call()

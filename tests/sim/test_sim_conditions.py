@@ -108,6 +108,8 @@ def test_a_flight_has_the_conditions_of_its_simulated_vehicle_and_none_behind_a_
         ("quadrotor", "period = 0.2", "period = 0.1", r"has a period of 0\.2 s, not 0\.1 s"),
         ("ground", "high = 0.25", "high = 0.3", "narrower bounds"),
         ("quadrotor", "slew = 0.8", "slew = 1.6", "smaller slew"),
+        ("ground", "radius = 0.105", "radius = 0.04", r"body that reaches 0\.105 m from its position, not 0\.04 m"),
+        ("quadrotor", "radius = 0.3", "radius = 0.2", r"reaches 0\.3 m"),
     ],
 )
 def test_a_simulator_refuses_a_description_that_it_cannot_follow(kind, before, after, why, tmp_path):

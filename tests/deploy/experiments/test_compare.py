@@ -117,6 +117,14 @@ def repeatable(value):
     return value
 
 
+def test_the_progress_of_a_training_counts_episodes():
+    """It read "goals 100%" after 3,000 steps of 16 robots, of which one episode had ended: the shortest."""
+    one, many = EpisodeTable(rows=[{"goal": 1}], decisions=3000), EpisodeTable(rows=[{"goal": 0}, {"goal": 1}] * 40)
+    assert cell_run.progress(one) == "step 3000, 1 of the last 1 episodes reached the goal"
+    assert cell_run.progress(many) == "step 0, 25 of the last 50 episodes reached the goal"
+    assert cell_run.progress(EpisodeTable()) == "step 0, 0 of the last 0 episodes reached the goal"
+
+
 def test_the_same_seed_gives_the_same_cell_and_another_seed_another(cells, tmp_path):
     for method, backend in (("ddpc", SINGLE), ("sailr", BATCH)):
         again = tiny(method, backend).run(tmp_path / method)

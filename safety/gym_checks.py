@@ -1,0 +1,48 @@
+"""Check what a Gymnasium wrapper gets: the robot of the environment, the filter of many robots, and their actions."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from brakeline.errors import BadRequest, Mismatch
+from brakeline.messaging.robot import Array, Robot
+from brakeline.safety.service.filter_client import FilterClient
+
+UNSHARED = {"accept_bound"}  # in a description: a limit for the model set, which says nothing about the robot
+
+
+def check_robot(env: Any, robot: Robot) -> None:
+    """Check that an environment that states its robot (`env.unwrapped.robot`) has the filter's robot.
+
+    Raises:
+        Mismatch: the two descriptions differ; the message names the fields.
+    """
+    simulated = getattr(env.unwrapped, "robot", None)
+    if not isinstance(simulated, Robot) or simulated.layout() == robot.layout():
+        return
+    ours, theirs = ({name: json.dumps(value) for name, value in one.description.items()} for one in (robot, simulated))
+    fields = sorted(name for name in {*ours, *theirs} - UNSHARED if ours.get(name) != theirs.get(name))
+    differ = f"descriptions differ in {', '.join(fields)}" if fields else "descriptions differ in real time (`-late`)"
+    raise Mismatch(
+        f"the environment has the robot {simulated.name}, the filter was made for {robot.name}: their {differ}. "
+        "Give both the same description; `brakeline certify DESCRIPTION --use` makes the model set of a description"
+    )
+
+
+def check_filter(filter: Any) -> None:
+    """Check what decides for many robots. Raises TypeError: it is no filter, or a client, which serves one robot."""
+    if isinstance(filter, FilterClient) or not hasattr(filter, "robot"):
+        raise TypeError(f"a filter is needed here, not a {type(filter).__name__}: give Filter.load(NAME_OR_PATH)")
+
+
+def check_rows(inputs: Array, count: int, robot: Robot) -> None:
+    """Check the shape (count, m) of the inputs of many robots. Raises BadRequest."""
+    if np.shape(inputs) != (count, robot.action_dim):
+        raise BadRequest(
+            "action",
+            f"the actions have shape {np.shape(inputs)}: give ({count}, {robot.action_dim}), for each of the {count} "
+            f"environments {', '.join(robot.action)}",
+        )
