@@ -91,6 +91,11 @@ class InferredColumn:
         """Return whether an input changes so much in one period that it has no slew limit."""
         return not 0.0 < self.change < JUMP * (self.most - self.least)
 
+    @property
+    def steers(self) -> bool:
+        """Return whether an input is an angle of steering, which a robot holds while it brakes."""
+        return self.unit == "rad"
+
 
 @dataclass(frozen=True)
 class InferredSchema:
@@ -188,8 +193,10 @@ def _period(log: AlignedLog) -> tuple[float, str]:
 
 def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> tuple[int, int]:
     """Return the periods of the strongest braking, and those of the longest delay: estimates, not bounds."""
-    ramps = [(max(-c.least, c.most), c.change) for c in inputs if c.jumps is False and c.change > 0.0]
-    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in states if c.follows and c.change > 0.0]
+    held = {c.name for c in inputs if c.steers}
+    braking = [c for c in states if c.follows and c.follows not in held]
+    ramps = [(max(-c.least, c.most), c.change) for c in inputs if not (c.jumps or c.steers) and c.change > 0.0]
+    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in braking if c.change > 0.0]
     brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
     return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
 

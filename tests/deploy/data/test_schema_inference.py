@@ -193,6 +193,13 @@ def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
     assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()
 
 
+def test_a_steering_that_a_robot_holds_while_braking_does_not_make_braking_longer():
+    speed = InferredColumn("v", "m/s", 0.0, 0.8, follows="cmd_v", change=0.2)
+    wheel = InferredColumn("wheel", "rad", -0.9, 0.9, follows="cmd_wheel", change=0.1)
+    inputs = InferredColumn("cmd_v", "m/s", 0.0, 0.8), InferredColumn("cmd_wheel", "rad", -0.9, 0.9, change=0.1)
+    assert brake_periods(0.1, [speed, wheel], inputs)[0] == 4
+
+
 @pytest.mark.parametrize("most", [np.inf, 1e308])
 def test_a_value_that_falls_forever_needs_endless_periods_to_stop(most: float) -> None:
     column = InferredColumn("v", "m/s", -1.0, most, change=1e-9)
