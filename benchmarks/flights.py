@@ -33,6 +33,7 @@ OVERHEAD = 240.0  # s that a command may take besides its flight: estimator, lan
 # A few minutes of flight give a loose bound. The benchmark measures flights behind it all the same.
 ACCEPT_ANY = ("--accept-bound", "1")
 ACCEPT_ONE_FLIGHT = ("--accept-bound", "0.03")  # of mode one-step
+WINDOWS = ("beyond", "beyond_plan", "beyond_widened")  # counts of windows outside (`TubeStats`)
 TRUTH_FIGURES = ("true collisions", "true clearance least m", "estimate off truth at most m")
 
 
@@ -315,7 +316,8 @@ def flight_row(fly: Callable[[], dict[str, Any]]) -> dict[str, float | str]:
     row |= {"interventions": f"{figures['interventions'] / max(1, figures['steps']):.1%}"}
     row |= {"outside": f"{contained['violations']} of {contained['steps']}"}
     if plans := figures.get("plans"):
-        row |= {"stops outside": f"{plans['outside']} of {plans['flown']}"}
+        row |= {"stops outside": f"{plans['outside']} of {plans['flown']}", "widened": plans["widening"]}
+        row |= {f"windows {name}": f"{plans[name]} of {plans['scored']}" for name in WINDOWS}
     return row | _vehicle_row(flight)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from time import thread_time
 
@@ -12,12 +13,13 @@ import torch
 from torch import nn
 
 from benchmarks.timing import WARM_UP, Figures, timed
-from brakeline.learner.learner_config import TD3Config
+from brakeline.learner.learner_config import Precision, TD3Config
 from brakeline.learner.replay import Batch
 from brakeline.learner.td3 import TD3
 from brakeline.messaging.policy_weights import MLP
 from brakeline.messaging.task import robot_with_task
 
+OURS: dict[str, Precision] = {"ours": "float32", "ours, bfloat16": "bfloat16"}
 UPDATES = 20  # of a block
 BLOCKS = 15
 
@@ -115,6 +117,16 @@ class Stacked(Plain):
         torch._foreach_lerp_(slow, fast, self.config.tau)
 
 
+def in_half(work: Callable[[], object]) -> Callable[[], None]:
+    """Return the same work with torch's automatic mixed precision (bfloat16)."""
+
+    def mixed() -> None:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            work()
+
+    return mixed
+
+
 def products(config: TD3Config, inputs: int) -> Callable[[], None]:
     """Return the matrix products of an update with hidden layers of 256, and nothing else: no code is faster."""
     size, width = config.batch, config.hidden[0]
@@ -178,8 +190,13 @@ def run() -> Figures:
             array[...] = rng.uniform(-1, 1, array.shape)
         tensors = [torch.rand(size, width) for width in (observations, actions, 1, observations)]
         peers = {"torch.nn and torch.optim": Plain, "the faster parts of torch": Stacked}
-        ways: dict[str, Callable[[], object]] = {"ours": partial(TD3(observations, actions, config, 0).update, batch)}
-        ways |= {name: partial(kind(config, observations, actions).update, *tensors) for name, kind in peers.items()}
+        ways: dict[str, Callable[[], object]] = {}
+        for name, precision in OURS.items():
+            learner = TD3(observations, actions, replace(config, precision=precision), 0)
+            ways[name] = partial(learner.update, batch)
+        for name, kind in peers.items():
+            ways[name] = partial(kind(config, observations, actions).update, *tensors)
+            ways[f"{name}, bfloat16"] = in_half(partial(kind(config, observations, actions).update, *tensors))
         ways["the matrix products alone"] = products(config, observations + actions)
         rows = in_turn(ways, "torch.nn and torch.optim")
         figures |= {f"TD3 update, batch {size}: {name}": row for name, row in rows.items()}

@@ -74,9 +74,10 @@ def judged(filter: Filter, widening: Widening, data: Dataset, share: float) -> d
         ]
         for state, before, action in zip(trajectory.states, inputs, trajectory.inputs, strict=False):
             request = Request(state, action, before, np.zeros((robot.horizon, robot.action_dim)), nothing)
-            if (score := filter.score(replace(request, past=widening.past))) is not None:
-                widening.judge(score, share)
-                left.append(score > starts[-robot.horizon])
+            if (scores := filter.scores(replace(request, past=widening.past))) is not None:
+                score, plan_score = scores
+                widening.judge(score, share, plan_score)
+                left.append(plan_score > starts[-robot.horizon])
             starts.append(widening.factor)
             widening.executed(state, before, action)
     shares = np.array(left)

@@ -63,7 +63,8 @@ class TD3Config:
     warmup: int = 2000
     """Propose random actions for this many steps before the first update."""
     precision: Precision = "float32"
-    """Compute the products of wide layers in this precision."""
+    """Compute the products of wide layers in this precision. bfloat16 is faster on a processor that multiplies it
+    (AVX512-BF16, AMX), and slower on others."""
 
     def __post_init__(self) -> None:
         check_numbers(self, "actor_rate", "critic_rate", "target_noise", "target_noise_clip", least=0.0)

@@ -54,7 +54,7 @@ class Dense:
 class HalfDense(Dense):
     """A `Dense` that rounds the factors and results of its products to bfloat16. Parameters stay in float32.
 
-    It is twice as fast on a processor that multiplies bfloat16 (AVX512-BF16, AMX), and slower on others.
+    It is faster on a processor that multiplies bfloat16 (AVX512-BF16, AMX), and slower on others.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, batch: int) -> None:

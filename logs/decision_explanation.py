@@ -100,6 +100,11 @@ def limits_applied(robot: Robot, proposed: Array, before: Array, executed: Array
     return ", ".join(words) or "limited by the robot"
 
 
+def plan_score(decision: pb.Decision) -> float:
+    """Return the score of the errors that decide about obstacles. A log from before has only that of all errors."""
+    return decision.plan_score if decision.HasField("plan_score") else decision.score
+
+
 def bound_in(decision: pb.Decision) -> float | None:
     """Return the bound that the model set states; None if the decision has none."""
     return valid_bound(decision.bound) if decision.HasField("bound") else None

@@ -196,8 +196,10 @@ def _safety_rows(figures: Figures) -> Iterator[tuple[str, str]]:
         outside = f"{share(plans['outside'], plans['flown'])}; {stated(plans)}"
         yield "verified plans that were followed", f"{plans['flown']}, left their tube: {outside}"
     if plans.get("scored"):
-        wide = f"{share(plans['beyond_widened'], plans['scored'])} as widened, by up to {plans['widening']:.3g} times"
-        yield "windows outside the stated sets", f"{share(plans['beyond'], plans['scored'])}; {wide}"
+        counts = (plans[name] for name in ("beyond", "beyond_plan", "beyond_widened"))
+        every, of_plans, wide = (share(count, plans["scored"]) for count in counts)
+        widest = f"{wide} as widened, by up to {plans['widening']:.3g} times"
+        yield "windows outside the stated sets", f"{every}; {of_plans} outside those of plans, {widest}"
     elif plans.get("widening", 1.0) > 1.0:
         yield "sets widened", f"by up to {plans['widening']:.3g} times"
     if plans.get("slowed"):

@@ -10,6 +10,7 @@ import math
 from collections import Counter, deque
 from dataclasses import dataclass
 
+from brakeline.logs.decision_explanation import plan_score
 from brakeline.logs.episode_stats import INTERVENTIONS, Figures, closest_of, kind_of
 from brakeline.logs.json_values import finite
 from brakeline.logs.quantiles import QuantileSketch, summary
@@ -132,7 +133,7 @@ class LearningCurve:
         if decision.HasField("score"):
             now["scored"] += 1
             now["beyond"] += not decision.score <= 1.0
-            now["beyond_widened"] += not decision.score <= widening
+            now["beyond_widened"] += not plan_score(decision) <= widening
         if decision.tube_half_width:
             now["tubes"] += 1
             now.half_width += max(decision.tube_half_width)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from brakeline.logs.decision_explanation import bound_in
+from brakeline.logs.decision_explanation import bound_in, plan_score
 from brakeline.logs.decision_view import tube_boxes
 from brakeline.logs.episode_stats import Figures
 from brakeline.logs.recorded_robots import RecordedRobots
@@ -36,7 +36,8 @@ class TubeStats:
         excess: largest ratio of the distance from the tube's center to its half-width.
         bound: largest fraction of plans outside that the model sets state; None if a decision has no bound.
         scored: number of windows of a plan's length that the filter scored, whatever the plans were.
-        beyond, beyond_widened: how many of them left the stated sets, and the sets as widened at their end.
+        beyond: how many of them left the stated sets, of plans or of the state after one period.
+        beyond_plan: how many left the stated sets of plans. beyond_widened: the same, as widened at their end.
         widening: largest widening of a request.
         slowed: number of requests whose proposals were limited (`brakeline.actors.slow_down`).
         slow_downs: how often that began.
@@ -49,6 +50,7 @@ class TubeStats:
     bound: float | None = 0.0
     scored: int = 0
     beyond: int = 0
+    beyond_plan: int = 0
     beyond_widened: int = 0
     widening: float = 1.0
     slowed: int = 0
@@ -71,7 +73,8 @@ class TubeStats:
         if decision.HasField("score"):
             self.scored += 1
             self.beyond += not decision.score <= 1.0
-            self.beyond_widened += not decision.score <= max(exchange.request.widening, 1.0)
+            self.beyond_plan += not plan_score(decision) <= 1.0
+            self.beyond_widened += not plan_score(decision) <= max(exchange.request.widening, 1.0)
         if self._own is not None and not self._goes_on(exchange):
             self._end()
         if self._own is not None:
@@ -173,7 +176,7 @@ def figures(parts: Iterable[TubeStats]) -> Figures:
     every = [part.ended() for part in parts]
     stated = [part.bound for part in every if part.flown]
     known = [bound for bound in stated if bound is not None]
-    counts = ("flown", "outside", "scored", "beyond", "beyond_widened", "slowed", "slow_downs")
+    counts = ("flown", "outside", "scored", "beyond", "beyond_plan", "beyond_widened", "slowed", "slow_downs")
     return {name: sum(getattr(part, name) for part in every) for name in counts} | {
         "excess": max((part.excess for part in every), default=0.0),
         "bound": max(known) if known and len(known) == len(stated) else None,

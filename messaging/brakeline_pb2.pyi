@@ -443,6 +443,7 @@ class Request(_message.Message):
     KNOWN_FREE_FIELD_NUMBER: _builtins.int
     TURN_ASIDE_FIELD_NUMBER: _builtins.int
     WIDENING_FIELD_NUMBER: _builtins.int
+    STATE_WIDENING_FIELD_NUMBER: _builtins.int
     PAST_STATES_FIELD_NUMBER: _builtins.int
     PAST_INPUTS_FIELD_NUMBER: _builtins.int
     PAST_FROM_START_FIELD_NUMBER: _builtins.int
@@ -467,6 +468,8 @@ class Request(_message.Message):
     """turn a blocked robot towards the nearest direction in which it can drive on"""
     widening: _builtins.float
     """factor on every set of the tube, at least 1; 0: not given, so 1"""
+    state_widening: _builtins.float
+    """factor on the set of the next state, if it is larger than `widening`; 0: not given"""
     past_from_start: _builtins.bool
     """that window began within `horizon` periods of the episode's start, or of a gap"""
     slow: _builtins.float
@@ -561,6 +564,7 @@ class Request(_message.Message):
         known_free: _builtins.bool = ...,
         turn_aside: _builtins.bool = ...,
         widening: _builtins.float = ...,
+        state_widening: _builtins.float = ...,
         past_states: _abc.Iterable[_builtins.float] | None = ...,
         past_inputs: _abc.Iterable[_builtins.float] | None = ...,
         past_from_start: _builtins.bool = ...,
@@ -570,7 +574,7 @@ class Request(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["image", b"image", "reservation", b"reservation", "scan", b"scan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "layout", b"layout", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["acceleration_age", b"acceleration_age", "action", b"action", "actor", b"actor", "episode", b"episode", "fleet", b"fleet", "image", b"image", "input_in_force", b"input_in_force", "known_free", b"known_free", "layout", b"layout", "model", b"model", "observation", b"observation", "obstacles", b"obstacles", "past_from_start", b"past_from_start", "past_inputs", b"past_inputs", "past_states", b"past_states", "plan", b"plan", "plan_token", b"plan_token", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "reservation", b"reservation", "robot", b"robot", "scan", b"scan", "slow", b"slow", "state", b"state", "state_widening", b"state_widening", "step", b"step", "time", b"time", "turn_aside", b"turn_aside", "widening", b"widening"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -633,6 +637,7 @@ class Decision(_message.Message):
     BOUND_FIELD_NUMBER: _builtins.int
     JUDGES_FIELD_NUMBER: _builtins.int
     SCORE_FIELD_NUMBER: _builtins.int
+    PLAN_SCORE_FIELD_NUMBER: _builtins.int
     OUTSIDE_SHARE_FIELD_NUMBER: _builtins.int
     kind: Global___Kind.ValueType
     predicted_heading: _builtins.float
@@ -676,6 +681,10 @@ class Decision(_message.Message):
     """the model set can score the last periods: send them with the next request"""
     score: _builtins.float
     """largest ratio of an error to its set, without widening, in the periods of the request"""
+    plan_score: _builtins.float
+    """The same of the errors that decide about obstacles and limits: those of positions, and of coordinates with a limit.
+    Absent: no score, or a log from before.
+    """
     outside_share: _builtins.float
     """of such periods, the share that may leave the sets, as asked of the model set"""
     @_builtins.property
@@ -740,22 +749,27 @@ class Decision(_message.Message):
         bound: _builtins.float | None = ...,
         judges: _builtins.bool = ...,
         score: _builtins.float | None = ...,
+        plan_score: _builtins.float | None = ...,
         outside_share: _builtins.float = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "bound", b"bound", "for_clearance", b"for_clearance", "reservation", b"reservation", "score", b"score", "stopped", b"stopped"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_plan_score", b"_plan_score", "_score", b"_score", "bound", b"bound", "for_clearance", b"for_clearance", "plan_score", b"plan_score", "reservation", b"reservation", "score", b"score", "stopped", b"stopped"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_score", b"_score", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "judges", b"judges", "kind", b"kind", "margin", b"margin", "model", b"model", "outside_share", b"outside_share", "plan", b"plan", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "score", b"score", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_bound", b"_bound", "_for_clearance", b"_for_clearance", "_plan_score", b"_plan_score", "_score", b"_score", "at_least", b"at_least", "bound", b"bound", "broken", b"broken", "compared", b"compared", "contained", b"contained", "for_clearance", b"for_clearance", "iterations", b"iterations", "judges", b"judges", "kind", b"kind", "margin", b"margin", "model", b"model", "outside_share", b"outside_share", "plan", b"plan", "plan_score", b"plan_score", "plan_tokens", b"plan_tokens", "predicted_center", b"predicted_center", "predicted_half_width", b"predicted_half_width", "predicted_heading", b"predicted_heading", "queue_ms", b"queue_ms", "reason", b"reason", "reservation", b"reservation", "score", b"score", "solve_ms", b"solve_ms", "solver", b"solver", "stopped", b"stopped", "time_ms", b"time_ms", "token_rejected", b"token_rejected", "tube_center", b"tube_center", "tube_half_width", b"tube_half_width", "verified", b"verified", "verify_ms", b"verify_ms"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__bound: _TypeAlias = _typing.Literal["bound"]  # noqa: Y015
     _WhichOneofArgType__bound: _TypeAlias = _typing.Literal["_bound", b"_bound"]  # noqa: Y015
     _WhichOneofReturnType__for_clearance: _TypeAlias = _typing.Literal["for_clearance"]  # noqa: Y015
     _WhichOneofArgType__for_clearance: _TypeAlias = _typing.Literal["_for_clearance", b"_for_clearance"]  # noqa: Y015
+    _WhichOneofReturnType__plan_score: _TypeAlias = _typing.Literal["plan_score"]  # noqa: Y015
+    _WhichOneofArgType__plan_score: _TypeAlias = _typing.Literal["_plan_score", b"_plan_score"]  # noqa: Y015
     _WhichOneofReturnType__score: _TypeAlias = _typing.Literal["score"]  # noqa: Y015
     _WhichOneofArgType__score: _TypeAlias = _typing.Literal["_score", b"_score"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__bound) -> _WhichOneofReturnType__bound | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__for_clearance) -> _WhichOneofReturnType__for_clearance | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__plan_score) -> _WhichOneofReturnType__plan_score | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__score) -> _WhichOneofReturnType__score | None: ...
 
@@ -867,7 +881,7 @@ class ReplyBatch(_message.Message):
     REPLIES_FIELD_NUMBER: _builtins.int
     REQUEST_FIELD_NUMBER: _builtins.int
     request: _builtins.bytes
-    """digest of the question's bytes: SHA-256, 16 bytes"""
+    """digest of the query's bytes: SHA-256, 16 bytes"""
     @_builtins.property
     def replies(self) -> _containers.RepeatedCompositeFieldContainer[Global___Reply]: ...
     def __init__(

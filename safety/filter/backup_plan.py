@@ -83,7 +83,7 @@ class BackupPlan:
         predicted: set of the next measured state, if the decision had one.
         reservation: the rest of the robot's reservation, in a world with other robots.
         seen (n,): last measured state.
-        widening: the last states and inputs, and the factor on the sets of the next decision.
+        widening: the last states and inputs, and the factors on the sets of the next decision.
         turn_aside: its requests let the filter turn a blocked robot aside (`Request.turn_aside`).
         acceleration_age: age of the horizontal acceleration in the measured states [s] (`Request.acceleration_age`).
     """
@@ -138,6 +138,7 @@ class BackupPlan:
         score: float | None = None,
         judges: bool = False,
         outside_share: float = 0.0,
+        plan_score: float | None = None,
     ) -> Array:
         """Commit to the plan of a decision; return the input to execute next.
 
@@ -146,13 +147,14 @@ class BackupPlan:
             score: the score of the window that ended with the request, if the filter gave one.
             judges: whether the filter can score a window. If not, `past` gives none, and the last period is scored.
             outside_share: the share of windows that may leave the sets.
+            plan_score: that of the decision; None: `score` stands for it, too.
         """
         self._judged = judges
         if score is None and not judges and self._compare and self.predicted is not None:  # the model set before did
             self.widening.judge_period(self.predicted.share_used(self.robot, self.seen))
         known = not verified or self.widening.use(model)
         if score is not None and known:
-            self.widening.judge(score, outside_share)
+            self.widening.judge(score, outside_share, plan_score)
         self.reservation = reservation
         self._plan_tokens = (b"", *plan_tokens)
         self.plan, self.model = plan, model if verified else UNVERIFIED

@@ -182,7 +182,8 @@ class Filter:
         else:
             check_for_filter(self.robot, request)
         if self.start > 1.0 and request.past is None:  # an episode has begun
-            request = replace(request, widening=request.widening * self.start)
+            factors = {name: self.start * getattr(request, name) for name in ("widening", "state_widening")}
+            request = replace(request, **factors)
         record.contained = request.predicted is None or request.predicted.contains(self.robot, request.state)
         record.broken = 0 if request.movers is None else int((~request.movers.consistent).sum())
         blind = "" if not record.broken else BROKEN
@@ -332,6 +333,7 @@ class Filter:
             reservation = self._reserve(constraints, local_map.start, centers, half, z)
         predicted = constraints.predict(local_map, z)
         margin, at_least = constraints.clear(request, local_map, z, candidate.margin)
+        scores = self.scores(request) or (None, None)
         total, solved = (perf_counter_ns() - record.started) * 1e-6, record.solve_ns * 1e-6
         return Decision(
             kind=candidate.kind,
@@ -358,14 +360,12 @@ class Filter:
             bound=self.bound,
             judges=self.model.one_step is not None,
             outside_share=self.outside_share,
-            score=self.score(request),
+            score=scores[0],
+            plan_score=scores[1],
         )
 
-    def score(self, request: Request) -> float | None:
-        """Return the largest ratio of an error to its set in the window that ends with the request (§15).
-
-        None if there is no window, or no predictor for driving of any kind.
-        """
+    def scores(self, request: Request) -> tuple[float, float] | None:
+        """Return `score` and `plan_score` of a decision (docs/method.md §15); None if it has none."""
         if self._score is None or request.past is None or not request.finite:
             return None
         return self._score(request.past, request.state)

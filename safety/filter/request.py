@@ -66,7 +66,8 @@ class Request(ComparedByValue):
         reservation: the reservation of this robot, in a world with other robots.
         other_reservations: the reservations of the other robots.
         observation: the input of a rival's networks; the filter does not need it.
-        widening: factor on every set, at least 1 (docs/method.md §15).
+        widening: factor on every set of a plan, at least 1 (docs/method.md §15).
+        state_widening: factor on the set of the next state, if it is larger than `widening`; at least 1.
         past: the last periods of a plan's length; the decision returns their score.
         known_free: all space within reach is free, apart from the obstacles. A request without obstacles and scan needs
             it. In joint space there is no space to describe: no request needs it.
@@ -91,6 +92,7 @@ class Request(ComparedByValue):
     known_free: bool = False
     turn_aside: bool = False
     widening: float = 1.0
+    state_widening: float = 1.0
     past: PastWindow | None = None
     acceleration_age: float = 0.0
 
@@ -141,6 +143,8 @@ class Decision(ComparedByValue):
         outside_share: the share of windows that may leave the sets (`certify --outside`). 0 if `judges` is false.
         score: the largest ratio of an error to its set, without widening, in the request's past window. None without
             such a window, or if the model set cannot score it.
+        plan_score: the same of the errors that decide about obstacles and limits: those of positions, and of
+            coordinates with a limit. After one period, `score` counts all coordinates.
         for_clearance: whether the proposal was verified too and only came nearer than the clearance margin. None if
             unknown.
     """
@@ -170,6 +174,7 @@ class Decision(ComparedByValue):
     judges: bool = False
     outside_share: float = 0.0
     score: float | None = None
+    plan_score: float | None = None
 
 
 def check_for_filter(robot: Robot, request: Request) -> None:
@@ -211,9 +216,10 @@ def check_surroundings(robot: Robot, request: Request) -> None:
         _check_no_space(robot, request)
     elif not (len(request.obstacles) or moving or request.scan is not None or request.known_free):
         raise BadRequest("obstacles", NOTHING_KNOWN)
-    if not 1.0 <= request.widening < math.inf:  # a smaller factor would make sets smaller than stated
-        why = "send the factor of the last scores, or none"
-        raise BadRequest("widening", f"a widening is finite and at least 1, not {request.widening:g}: {why}")
+    for name in ("widening", "state_widening"):
+        if not 1.0 <= (factor := getattr(request, name)) < math.inf:  # less would make sets smaller than stated
+            why = "send the factor of the last scores, or none"
+            raise BadRequest(name, f"{name} is finite and at least 1, not {factor:g}: {why}")
     if request.past is not None:
         _check_past(robot, request.past)
     if not robot.position_dim:

@@ -1,8 +1,10 @@
-"""Compute the factor by which the filter must widen a robot's sets at present (docs/method.md §15).
+"""Compute the factors by which the filter must widen a robot's sets at present (docs/method.md §15).
 
 A payload, a worn tyre or wind makes any model wrong. The client that stores the backup plan also stores the last states
 and inputs. The filter scores each window of a plan's length when it ends: the largest ratio of an error to its set.
-The largest recent score, and a tenth more, is the factor by which the filter widens every set of the next decision.
+The largest recent score, and a tenth more, is a factor by which the filter widens sets of the next decision. The sets
+of plans follow the scores of positions alone, because only positions decide about obstacles. The set of the next state
+follows the scores of all coordinates.
 `certify --outside` lets a share of the windows leave their sets. So many of the largest scores do not count.
 Some model sets predict plans only, so the filter cannot score windows. Then the client scores each period itself.
 """
@@ -54,25 +56,35 @@ class PastWindow(ComparedByValue):
 
 @dataclass
 class _ModelScores:
-    """The scores of one model set, which are relative to its sets."""
+    """The scores of one model set, which are relative to its sets: of plans, and of all coordinates."""
 
-    scores: Array = field(default_factory=lambda: np.zeros(WINDOWS))  # score i stands at i modulo WINDOWS
+    scores: Array = field(default_factory=lambda: np.zeros((2, WINDOWS)))  # scores i stand at i modulo WINDOWS
     count: int = 0
-    factor: float = 1.0
+    factors: tuple[float, float] = (1.0, 1.0)  # on the sets of plans, and on the set of the next state
     left: deque[bool] = field(default_factory=lambda: deque(maxlen=PLANS))
 
 
 class Widening:
-    """The last measured states and executed inputs of one robot, and the factor that follows from their scores.
+    """The last measured states and executed inputs of one robot, and the factors that follow from their scores.
 
     Attributes:
-        factor: the factor on every set: at least 1.
+        factors: on every set of a plan, and on the set of the next state. Both are at least 1.
     """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.interrupt()
         self.forget()
+
+    @property
+    def factor(self) -> float:
+        """The factor on every set of a plan."""
+        return self.factors[0]
+
+    @property
+    def state_factor(self) -> float:
+        """The factor on the set of the next state."""
+        return self.factors[1]
 
     @property
     def left(self) -> deque[bool]:
@@ -82,7 +94,7 @@ class Widening:
     def forget(self) -> None:
         """Drop the scores of every model set."""
         self._models: dict[str, _ModelScores] = {}
-        self._asked = 1.0  # the factor of the last request
+        self._asked = (1.0, 1.0)  # the factors of the last request
         self._begin("")
 
     def use(self, model: str) -> bool:
@@ -98,15 +110,16 @@ class Widening:
         self._models[model] = self._of  # the last one of the dictionary decided last
         if len(self._models) > MODELS:
             del self._models[next(iter(self._models))]
-        self.factor = self._of.factor
+        self.factors = self._of.factors
         self._uncounted = 0  # periods since the last window in `left` ended
-        self._factors.extend(1.0 for _ in range(len(self._factors)))
+        self._factors.extend((1.0, 1.0) for _ in range(len(self._factors)))
 
     def interrupt(self) -> None:
         """Begin a new window: an episode has ended, or a period had no measurement. The scores stay."""
         self._states: deque[Array] = deque(maxlen=self.robot.horizon)
         self._inputs: deque[Array] = deque(maxlen=self.robot.horizon + 1)
-        self._factors: deque[float] = deque(maxlen=self.robot.horizon)  # of the requests at the periods' starts
+        # `factors` of the requests at the periods' starts
+        self._factors: deque[tuple[float, float]] = deque(maxlen=self.robot.horizon)
         self._uncounted = self._periods = 0
 
     def executed(self, state: Array, before: Array, action: Array) -> None:
@@ -116,7 +129,7 @@ class Widening:
         self._states.append(state.copy())
         self._inputs.append(action.copy())
         self._factors.append(self._asked)
-        self._asked = self.factor
+        self._asked = self.factors
         self._uncounted += 1
         self._periods += 1
 
@@ -127,13 +140,17 @@ class Widening:
             return None
         return PastWindow(np.array(self._states), np.array(self._inputs), self._periods < 2 * N)
 
-    def judge(self, score: float, outside_share: float = 0.0) -> None:
-        """Add the score of a window that has ended. A score that is no number counts as infinite.
+    def judge(self, score: float, outside_share: float = 0.0, plan_score: float | None = None) -> None:
+        """Add the scores of a window that has ended. A score that is no number counts as infinite.
 
-        outside_share: the share of windows that may leave the sets.
+        Args:
+            score: of all coordinates.
+            outside_share: the share of windows that may leave the sets.
+            plan_score: of positions and limited coordinates. None: `score` stands for it, too.
         """
-        score = score if score == score else np.inf
-        self._add(score, bool(self._factors) and score > self._factors[0], outside_share)
+        of_plan = score if plan_score is None else plan_score
+        scores = np.nan_to_num([of_plan, score], nan=np.inf, posinf=np.inf)
+        self._add(scores, bool(self._factors) and bool(scores[0] > self._factors[0][0]), outside_share)
 
     def judge_period(self, share_used: float) -> None:
         """Add the score of the last period, for a model set that cannot score windows.
@@ -146,14 +163,15 @@ class Widening:
             share_used: share of the predicted set, as it was widened, that the measured state used.
         """
         if self._factors:
-            score = share_used * self._factors[-1]
-            self._add(score if score > 1.0 else 0.0, share_used > 1.0, 0.0)
+            score = share_used * self._factors[-1][1]
+            self._add(np.full(2, score if score > 1.0 else 0.0), share_used > 1.0, 0.0)
 
-    def _add(self, score: float, left: bool, outside_share: float) -> None:
+    def _add(self, scores: Array, left: bool, outside_share: float) -> None:
         scored = self._of
         if self._factors and self._uncounted >= self.robot.horizon:
             scored.left.append(left)
             self._uncounted = 0
-        scored.scores[scored.count % WINDOWS] = score
+        scored.scores[:, scored.count % WINDOWS] = scores
         scored.count += 1
-        self.factor = scored.factor = float(widening_factor(scored.scores, outside_share))
+        of_plan, of_state = widening_factor(scored.scores, outside_share).tolist()
+        self.factors = scored.factors = of_plan, of_state

@@ -26,8 +26,11 @@ class WindowScore:
         self._sets = W, M, kappa, w, scored
         self._start = one_step.start
 
-    def __call__(self, past: PastWindow, state: Array) -> float:
-        """Return the largest ratio of an error to its set in the window that ends in a measured state (n,)."""
+    def __call__(self, past: PastWindow, state: Array) -> tuple[float, float]:
+        """Return the largest ratio of an error to its set in the window that ends in a measured state (n,).
+
+        The first number is of all errors, the second of those of `scored_coordinates` alone.
+        """
         states = np.concatenate([past.states, state[None]])
-        score = self._score(states, np.ascontiguousarray(past.inputs), *self._sets)
-        return score / self._start if past.from_start else score
+        score, of_plan = self._score(states, np.ascontiguousarray(past.inputs), *self._sets)
+        return (score / self._start, of_plan / self._start) if past.from_start else (score, of_plan)

@@ -83,6 +83,7 @@ def request_message(
         time=time,
         fleet=fleet,
         widening=backup_plan.widening.factor,
+        state_widening=backup_plan.widening.state_factor,
         acceleration_age=backup_plan.acceleration_age,
     )
     set_measurement(message, scan_in(scan))
@@ -167,8 +168,9 @@ def _check_figures(decision: pb.Decision, robot: Robot) -> None:
         raise _bad_reply("bound", "a bound that is no share of plans")
     if not 0.0 <= decision.outside_share <= MOST_OUTSIDE:
         raise _bad_reply("outside_share", f"a share of windows outside that is not within 0 and {MOST_OUTSIDE:g}")
-    if not decision.score >= 0.0:  # infinity is a score
-        raise _bad_reply("score", "a score that is no ratio")
+    for name in ("score", "plan_score"):
+        if not getattr(decision, name) >= 0.0:  # infinity is a score
+            raise _bad_reply(name, "a score that is no ratio")
     if len(decision.plan_tokens) > robot.horizon + 1 or any(len(token) != SIZE for token in decision.plan_tokens):
         raise _bad_reply("plan_tokens", "plan tokens of the wrong size or number")
     stopped = decision.stopped

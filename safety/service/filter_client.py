@@ -169,4 +169,5 @@ def accept(backup_plan: BackupPlan, answer: Answer) -> Array:
         answer.score,
         answer.judges,
         answer.outside_share,
+        answer.plan_score,
     )

@@ -139,6 +139,7 @@ class InProcess:
             turn_aside=backup_plan.turn_aside,
             acceleration_age=backup_plan.acceleration_age,
             widening=backup_plan.widening.factor,
+            state_widening=backup_plan.widening.state_factor,
             past=backup_plan.past,
         )
 

@@ -143,6 +143,7 @@ def request_of(
         known_free=message.known_free,
         turn_aside=message.turn_aside,
         widening=message.widening or 1.0,
+        state_widening=message.state_widening or 1.0,
         past=_past_of(message, robot),
         acceleration_age=message.acceleration_age,
     )
@@ -224,6 +225,7 @@ def decision_reply(decision: Decision, queue_ms: float) -> pb.Reply:
         bound=decision.bound,
         outside_share=decision.outside_share,
         score=decision.score,
+        plan_score=decision.plan_score,
         **{name: getattr(decision, name) for name in SAME_FIELDS},
     )
     if (stopped := decision.blocked_by) is not None:
@@ -274,6 +276,7 @@ def decision_of(m: pb.Decision, robot: Robot) -> Decision:
         # Of another share nothing is let out: then the largest score counts.
         outside_share=m.outside_share if 0.0 <= m.outside_share <= MOST_OUTSIDE else 0.0,
         score=max(m.score, 0.0) if m.HasField("score") else None,
+        plan_score=max(m.plan_score, 0.0) if m.HasField("plan_score") else None,
     )
 
 

@@ -143,7 +143,15 @@ def test_malformed_exchanges_raise_no_error(data):
     assert plans.outside <= plans.flown
 
 
-NOT_SCORED = {"scored": 0, "beyond": 0, "beyond_widened": 0, "widening": 1.0, "slowed": 0, "slow_downs": 0}
+NOT_SCORED = {
+    "scored": 0,
+    "beyond": 0,
+    "beyond_plan": 0,
+    "beyond_widened": 0,
+    "widening": 1.0,
+    "slowed": 0,
+    "slow_downs": 0,
+}
 
 
 def test_plans_are_among_the_figures_of_a_run():
@@ -188,7 +196,10 @@ def test_windows_that_the_filter_scored_are_counted_beside_what_was_stated_and_w
     plans = figures([of(*exchanges)])
     assert (plans["scored"], plans["beyond"], plans["beyond_widened"], plans["widening"]) == (4, 3, 2, 3.3)
     shown = printed(show(closed_loop([]) | {"plans": plans}))
-    assert "3 (75.0%); 2 (50.0%) as widened, by up to 3.3 times" in shown
+    assert "3 (75.0%); 3 (75.0%) outside those of plans, 2 (50.0%) as widened, by up to 3.3 times" in shown
+    exchanges[1].reply.decision.plan_score = 0.9  # its position stayed inside
+    plans = figures([of(*exchanges)])
+    assert (plans["beyond"], plans["beyond_plan"], plans["beyond_widened"]) == (3, 2, 1)
 
 
 def test_the_widening_is_shown_where_no_window_was_scored():

@@ -259,7 +259,8 @@ def score(predictor, root, weight, states, executed, W, M, kappa, w, scored):
     widths = M @ np.abs(W @ window) + kappa @ np.abs(window) + w
     off = np.abs(after - rollouts(predictor, window[None])[0, :, : states.shape[1]])
     shares = off / (widths * stretches(predictor, root, weight, window[None])[0][:, None])
-    return max(shares[:, scored].max(), shares[0].max())
+    of_scored = shares[:, scored].max()
+    return max(of_scored, shares[0].max()), of_scored
 
 
 def distances(center, axes, half, rho, rounded, point):

@@ -104,7 +104,7 @@ def apart(one, other):
     parts = [(one.plan, other.plan), (one.tube_center, other.tube_center), (one.margin, other.margin)]
     parts += [(one.tube_half_width, other.tube_half_width), (one.predicted.center, other.predicted.center)]
     parts += [(one.predicted.half_width, other.predicted.half_width), (one.predicted.heading, other.predicted.heading)]
-    parts += [] if one.score is None else [(one.score, other.score)]
+    parts += [] if one.score is None else [(one.score, other.score), (one.plan_score, other.plan_score)]
     if other.blocked_by is not None and len(other.blocked_by.normal):
         parts += [(one.blocked_by.normal, other.blocked_by.normal), (one.blocked_by.at, other.blocked_by.at)]
         parts += [(one.blocked_by.room, other.blocked_by.room)]
@@ -195,12 +195,15 @@ def test_past_windows_are_scored():
     ready, rng = one_step(), np.random.default_rng(3)
     robot = ready.robot
     requests = []
-    for request in (scene(rng, ready) for _ in range(40)):
+    for plain_request in (scene(rng, ready) for _ in range(40)):
+        widening, state_widening = rng.uniform(1.0, 1.5, 2)
+        request = replace(plain_request, widening=widening, state_widening=state_widening)
         states = np.tile(request.state, (robot.horizon, 1)) + 0.01 * rng.normal(size=(robot.horizon, robot.state_dim))
         past = PastWindow(states, np.tile(request.input_in_force, (robot.horizon + 1, 1)), bool(rng.random() < 0.5))
         requests.append(replace(request, past=past if rng.random() < 0.5 else None))
     answers = check_same(ready, requests)
     assert 5 < sum(bool(scored) for scored in answers.scored) < 35
+    assert (answers.plan_score < answers.score)[answers.scored].any()
 
 
 def test_row_by_row_a_filter_states_what_it_states_in_each_row():

@@ -32,6 +32,7 @@ MALFORMED: dict[str, tuple[Any, ...]] = {
     "bound": (*NUMBERS, -1e-9, 1.001),
     "outside_share": (*NUMBERS, -1e-9, 0.5),
     "score": (nan, -inf, -1e-9),
+    "plan_score": (nan, -inf, -1e-9),
     "room": (nan,),
 }
 NOT_NEGATIVE = ("half_width", "radius", "tube_half_width", "predicted_half_width")
@@ -40,7 +41,7 @@ ANY = (
     *("reason", "solver", "by", "at_least", "contained", "compared", "judges", "for_clearance", "token_rejected"),
     *("verified", "iterations", "broken"),
 )
-MAY_BE_MISSING = (*ANY, "stopped", "score", "plan_tokens", "normal", "at")
+MAY_BE_MISSING = (*ANY, "stopped", "score", "plan_score", "plan_tokens", "normal", "at")
 
 
 class Asked:

@@ -56,7 +56,8 @@ def test_a_batch_decides_as_single_plans_do_over_whole_episodes() -> None:
             plan = single.backup_plan
             assert np.abs(outcome.inputs[row] - plan.next_input).max() < 1e-6
             assert status[plans._status[row]] == plan.model
-            assert plans.widening[row] == pytest.approx(plan.widening.factor, abs=1e-6)
+            factors = plans.widening[row], plans.state_widening[row]
+            assert factors == pytest.approx(plan.widening.factors, abs=1e-6)
             penalty = correction_penalty(GROUND, actions[row], before[row], outcome.inputs[row], 1.0)
             assert penalties[row] == pytest.approx(penalty, abs=1e-12)
         _, _, terminated, truncated, infos = env.step(outcome.inputs)
@@ -77,10 +78,12 @@ def test_a_batch_leaves_out_as_many_scores_as_a_single_plan() -> None:
     plans, singles, rng = BackupPlanBatch(SAFETY, 3), [Widening(GROUND) for _ in range(3)], np.random.default_rng(1)
     plans._outside_share = 0.005
     for scores in rng.exponential(1.0, (WINDOWS + 50, 3)):
-        plans._judge(np.ones(3, dtype=bool), scores)
-        for single, score in zip(singles, scores, strict=True):
-            single.judge(float(score), 0.005)
-        assert plans.widening.tolist() == [single.factor for single in singles]
+        of_plans = 0.7 * scores
+        plans._judge(np.ones(3, dtype=bool), of_plans, scores)
+        for single, of_plan, score in zip(singles, of_plans.tolist(), scores.tolist(), strict=True):
+            single.judge(score, 0.005, of_plan)
+        factors = zip(plans.widening.tolist(), plans.state_widening.tolist(), strict=True)
+        assert list(factors) == [single.factors for single in singles]
 
 
 class Broken:

@@ -51,7 +51,7 @@ def test_each_request_of_a_batch_has_its_reply_in_order(service, model):
 def test_a_standing_robot_with_widened_sets_reserves_as_much_as_they_take(service):
     backup_plan, replies = BackupPlan(GROUND), {}
     for factor in (1.0, 10.0):
-        backup_plan.widening.factor = factor
+        backup_plan.widening.factors = factor, factor
         asked = request_message(backup_plan, np.zeros(5), [NAN, 0.0], known_free=True, actor="a", fleet=["a"])
         replies[factor] = read_reply(service.replies(asked)[0], asked, GROUND)
         reserved = replies[factor].reservation

@@ -1,4 +1,4 @@
-"""The widening of all sets that follows from how much of them was used (docs/method.md §15)."""
+"""The widening of the sets that follows from how much of them was used (docs/method.md §15)."""
 
 from dataclasses import replace
 
@@ -100,7 +100,8 @@ def test_sets_are_wider_at_an_episodes_start_and_windows_from_there_are_judged_b
     noise = np.array(ROBOT.measurement_bound[:2])
     assert at_start.tube_half_width - noise == pytest.approx(1.5 * (later.tube_half_width - noise))
     assert at_start.margin < later.margin
-    assert safety.score(replace(ask, past=replace(past, from_start=True))) == pytest.approx(later.score / 1.5)
+    from_start = safety.scores(replace(ask, past=replace(past, from_start=True)))
+    assert from_start == pytest.approx((later.score / 1.5, later.plan_score / 1.5))
 
 
 def test_a_window_knows_whether_its_plan_was_decided_without_a_past_window():
@@ -120,6 +121,7 @@ def test_a_window_knows_whether_its_plan_was_decided_without_a_past_window():
     ("changes", "said"),
     [
         *(({"widening": factor}, "widening") for factor in (0.99, 0.0, -1.0, np.nan, np.inf)),
+        *(({"state_widening": factor}, "state_widening") for factor in (0.99, 0.0, -1.0, np.nan, np.inf)),
         ({"past": PastWindow(np.zeros((N, 5)), np.zeros((N, 2)))}, "past"),
         ({"past": PastWindow(np.zeros((N - 1, 5)), np.zeros((N + 1, 2)))}, "past"),
         ({"past": PastWindow(np.full((N, 5), np.nan), np.zeros((N + 1, 2)))}, "NaN"),
@@ -144,6 +146,40 @@ def test_every_set_grows_by_the_factor_and_the_margin_falls(of):
     assert wide.margin < stated.margin
     moving = replace(ask, state=np.array([0.0, 0.0, 0.0, 0.1, 0.0]), input_in_force=np.array([0.1, 0.0]))
     assert not safety.decide(replace(moving, widening=1e3)).verified
+
+
+def test_errors_of_speeds_alone_widen_the_set_of_the_next_state_and_not_those_of_plans():
+    """Only positions decide about obstacles; the speed after a period says whether the robot is where it should be."""
+    safety, widening = ready(), Widening(ROBOT)
+    ask = request(np.zeros(5), np.array([0.2, 0.1]), np.zeros(2), POSTS)
+    fast, far = np.zeros((2, N, 5))
+    fast[1, 3], far[1:, 0] = 0.5, 0.5  # m/s, measured once; m
+    stopped = np.zeros((N + 1, 2))
+    of_speed = safety.decide(replace(ask, past=PastWindow(fast, stopped)))
+    of_position = safety.decide(replace(ask, state=far[-1], past=PastWindow(far, stopped)))
+    assert of_speed.plan_score < 1.0 < of_speed.score
+    assert of_position.plan_score == of_position.score > 1.0
+
+    for _ in range(N):
+        widening.executed(np.zeros(5), np.zeros(2), np.zeros(2))
+    widening.judge(3.0, plan_score=0.5)
+    assert widening.factor == 1.0 and widening.state_factor == pytest.approx(3.0 * RESERVE)
+    assert list(widening.left) == [False], "the plan stayed in its tube"
+    stated, wide = safety.decide(ask), safety.decide(replace(ask, state_widening=widening.state_factor))
+    assert (wide.tube_half_width == stated.tube_half_width).all() and wide.margin == stated.margin
+    assert wide.predicted.half_width == pytest.approx(3.0 * RESERVE * stated.predicted.half_width)
+    less = safety.decide(replace(ask, widening=2.0, state_widening=1.5))
+    both = safety.decide(replace(ask, widening=2.0))
+    assert (less.predicted.half_width == both.predicted.half_width).all(), "as much as those of plans at least"
+
+
+def test_a_service_that_does_not_score_plans_apart_widens_them_by_the_whole_score():
+    """Its replies lack the score of plans, as those of a version before."""
+    plan, still = BackupPlan(ROBOT), np.zeros((N, 2))
+    box = Prediction(np.zeros(5), np.full(5, 0.1), 0.0)
+    for score in (None, 2.0):
+        plan.accept(still, "model", box, True, judges=True, score=score)
+    assert plan.widening.factor == plan.widening.state_factor == pytest.approx(2.0 * RESERVE)
 
 
 def test_a_model_set_that_scores_no_windows_is_widened_by_what_each_period_uses():
@@ -182,13 +218,14 @@ def test_factor_and_window_cross_the_wire_and_a_new_model_set_starts_without_sco
     for action in wandering(rng, ROBOT.horizon + 3):
         answer = client.decide(robot.measure(), action, [], known_free=True)
         robot.step(answer.action)
-    plan.widening.judge(2.0)
+    plan.widening.judge(3.0, plan_score=2.0)
     question = request_of(request_message(plan, robot.measure(), np.zeros(2), known_free=True), ROBOT)
-    assert question.widening == pytest.approx(2.0 * RESERVE)
+    assert (question.widening, question.state_widening) == pytest.approx((2.0 * RESERVE, 3.0 * RESERVE))
     assert (question.past.states == plan.past.states).all() and (question.past.inputs == plan.past.inputs).all()
     assert question.past.from_start and plan.past.from_start
     sent = decision_reply(answer, 0.0).decision
-    assert decision_of(sent, ROBOT).score == answer.score and decision_of(sent, ROBOT).judges
+    got = decision_of(sent, ROBOT)
+    assert (got.score, got.plan_score) == (answer.score, answer.plan_score) and got.judges
     plan.accept(answer.plan, "another", answer.predicted, True, judges=True, score=5.0)
     assert plan.widening.factor == 1.0
 
@@ -220,11 +257,11 @@ def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
     robot = Unicycle((0.0, 0.0, 0.0), rng, slip=-0.05)  # it drives slower than asked
     scores, factors = [], []
     for action in wandering(rng, 300):
-        factors.append(client.backup_plan.widening.factor)
+        factors.append(client.backup_plan.widening.factors)
         answer = client.decide(robot.measure(), action, [], known_free=True)
-        scores.append(0.0 if answer.score is None else answer.score)
+        scores.append((0.0, 0.0) if answer.score is None else (answer.plan_score, answer.score))
         robot.step(answer.action)
     scores, factors = np.array(scores), np.array(factors)
-    assert (scores[100:] > 1.0).mean() > 0.3
-    assert (scores[100:] > factors[100:]).mean() < 0.02
-    assert factors[0] == 1.0 and 1.5 < factors[-1] < 20.0
+    assert ((scores[100:] > 1.0).mean(0) > (0.15, 0.3)).all()
+    assert ((scores[100:] > factors[100:]).mean(0) < 0.02).all()
+    assert (factors[0] == 1.0).all() and 1.5 < factors[-1, 0] < factors[-1, 1] < 20.0

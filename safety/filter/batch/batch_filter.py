@@ -124,6 +124,8 @@ def _expected(robot: Robot, requests: RequestArrays) -> Iterator[tuple[str, Arra
     yield "obstacles.count", obstacles.count, "i", ()
     if requests.widening is not None:
         yield "widening", requests.widening, "f", ()
+    if requests.state_widening is not None:
+        yield "state_widening", requests.state_widening, "f", ()
     if (predicted := requests.predicted) is not None:
         yield "predicted_center", predicted.center, "f", (n,)
         yield "predicted_half_width", predicted.half_width, "f", (n,)
@@ -149,6 +151,7 @@ def blank_answers(robot: Robot, requests: RequestArrays, xp: Any, device: Any) -
         "predicted_heading": (),
         "margin": (),
         "score": (),
+        "plan_score": (),
         "proposal_margin": (),
     }
     arrays: dict[str, Any] = {
@@ -177,6 +180,7 @@ def write_decision(answers: dict[str, Any], row: int, decision: Decision) -> Non
         "predicted_heading": predicted.heading,
         "margin": decision.margin,
         "score": np.nan if decision.score is None else decision.score,
+        "plan_score": np.nan if decision.plan_score is None else decision.plan_score,
     }
     for name, value in values.items():
         array = np.asarray(value, dtype=float)

@@ -55,7 +55,8 @@ class DecisionArrays:
         predicted_heading (B,): heading of its frame [rad].
         for_clearance (B,): see `Decision`; false where that is None.
         score (B,): see `Decision`.
-        scored (B,): whether the row has a score.
+        plan_score (B,): see `Decision`.
+        scored (B,): whether the row has scores.
         steps (B,): number of steps of the solver.
         turned (B,): 1 or -1 where the plan turns a blocked robot aside, to the left or right; else 0.
         proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
@@ -83,6 +84,7 @@ class DecisionArrays:
     compared: Array
     for_clearance: Array
     score: Array
+    plan_score: Array
     scored: Array
     steps: Array
     turned: Array
@@ -134,6 +136,7 @@ class DecisionArrays:
             judges=self.judges,
             outside_share=self.outside_share,
             score=float(self.score[index]) if bool(self.scored[index]) else None,
+            plan_score=float(self.plan_score[index]) if bool(self.scored[index]) else None,
         )
 
     def _blocking(self, index: int) -> BlockingConstraint:

@@ -115,8 +115,9 @@ class LaneDecisions:
             finite = xp.abs(xp.reshape(part, (B, -1))) < HUGE
             good &= xp.all(finite, axis=1)
         good &= (obstacles.count > 0) | requests.known_free
-        if requests.widening is not None:
-            good &= (requests.widening >= 1.0) & (requests.widening < HUGE)
+        for factor in (requests.widening, requests.state_widening):
+            if factor is not None:
+                good &= (factor >= 1.0) & (factor < HUGE)
         if (predicted := requests.predicted) is not None:
             sets = xp.concat([predicted.center, predicted.half_width, predicted.heading[:, None]], axis=1)
             valid = xp.all(xp.abs(sets) < HUGE, axis=1) & xp.all(predicted.half_width >= 0.0, axis=1)
@@ -139,7 +140,8 @@ class LaneDecisions:
         given = robot.committed_steps * m
         z_0 = xp.concat([xp.take(state, self._regressor, axis=0), before, plan[:given]])
         proposal = self._search.limited(action, z_0[z_0.shape[0] - m :])
-        asked = self._widening(requests, rows)
+        asked = self._factor(requests.widening, requests, rows)
+        of_state = xp.maximum(asked, self._factor(requests.state_widening, requests, rows))
         widening = xp.where(asked > 1.0, asked * self._growth, asked)
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
@@ -147,15 +149,13 @@ class LaneDecisions:
         near, beyond = within_reach(xp, obstacles, start, reach, robot.least_margin)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
-        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, asked)
+        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, of_state)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
 
-    def _widening(self, requests: RequestArrays, rows: Array) -> Array:
-        """Return the factors (B,) on the sets of rows: larger where an episode has begun, as in `Filter.decide`."""
+    def _factor(self, given: Array | None, requests: RequestArrays, rows: Array) -> Array:
+        """Return given factors (B,) on the sets of rows: larger where an episode has begun, as in `Filter.decide`."""
         xp, past = self._xp, requests.past
-        factor = xp.ones_like(rows, dtype=xp.float64)
-        if requests.widening is not None:
-            factor = xp.take(requests.widening, rows, axis=0)
+        factor = xp.ones_like(rows, dtype=xp.float64) if given is None else xp.take(given, rows, axis=0)
         begun = xp.ones_like(rows, dtype=xp.bool) if past is None else ~xp.take(past.given, rows, axis=0)
         return xp.where(begun, factor * self._start, factor)
 
@@ -332,9 +332,10 @@ class LaneDecisions:
             for part in (past.states, past.inputs)
         )
         now = xp.asarray(xp.permute_dims(xp.take(state, given, axis=0), (1, 0)), copy=True)
-        score = self._score(states, inputs, now)
         begun = xp.take(past.from_start, to, axis=0)
-        answers["score"][to], answers["scored"][to] = xp.where(begun, score / self._start, score), True
+        for name, score in zip(("score", "plan_score"), self._score(states, inputs, now), strict=True):
+            answers[name][to] = xp.where(begun, score / self._start, score)
+        answers["scored"][to] = True
 
     def _blocking(self, plan: PlanBatch, scene: SceneBatch, margin: Array) -> dict[str, Array]:
         """Return the arrays of a `BlockingArrays` for proposals: `TubeConstraints.worst_of`."""

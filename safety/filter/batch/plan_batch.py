@@ -75,7 +75,8 @@ class BackupPlanBatch:
         self._states, self._inputs = np.zeros((size, N, n)), np.zeros((size, N + 1, m))
         self._periods = np.zeros(size, dtype=np.int64)
         self._judged, self._widened = False, np.ones(size)  # factors by which the predicted sets were widened
-        self._scores, self._place = np.zeros((size, WINDOWS)), np.zeros(size, dtype=np.int64)
+        # scores of plans, and of all coordinates
+        self._scores, self._place = np.zeros((size, 2, WINDOWS)), np.zeros(size, dtype=np.int64)
         self._scored, self._outside_share = np.zeros(size, dtype=bool), 0.0
         self.reset(np.ones(size, dtype=bool))
 
@@ -90,8 +91,13 @@ class BackupPlanBatch:
 
     @property
     def widening(self) -> Array:
-        """The factor (B,) on every set of the next decision."""
-        return widening_factor(self._scores, self._outside_share)
+        """The factor (B,) on every set of the next plan."""
+        return widening_factor(self._scores[:, 0], self._outside_share)
+
+    @property
+    def state_widening(self) -> Array:
+        """The factor (B,) on the sets of the next states."""
+        return widening_factor(self._scores[:, 1], self._outside_share)
 
     def request(
         self, states: Array, actions: Array, obstacles: ObstacleArrays, observations: Observations | None = None
@@ -109,6 +115,7 @@ class BackupPlanBatch:
             known_free=np.ones(self._size, dtype=bool),
             turn_aside=self._turn_aside,
             widening=self.widening,
+            state_widening=self.state_widening,
             model=names[self._status].tolist(),
             predicted=self.predicted if self.predicted.given.any() else None,
             past=past if self._judged and past.given.any() else None,
@@ -171,14 +178,15 @@ class BackupPlanBatch:
         return self._advance(states)
 
     def _accept(self, states: Array, rows: Flags, answers: DecisionArrays) -> None:
-        self._judged, asked = answers.judges, self.widening
+        self._judged, asked = answers.judges, self.state_widening
         self._outside_share = answers.outside_share
         first = rows & answers.verified & ~self._scored
         self._scored |= first
-        self._judge(rows & ~first & answers.scored, answers.score)
+        self._judge(rows & ~first & answers.scored, answers.plan_score, answers.score)
         if not answers.judges:  # as `BackupPlan.accept`: the client scores the last period
             scores = self._shares_used(states) * self._widened
-            self._judge(rows & ~first & self.predicted.given, np.where(scores <= 1.0, 0.0, scores))
+            scores = np.where(scores <= 1.0, 0.0, scores)
+            self._judge(rows & ~first & self.predicted.given, scores, scores)
         self._widened = np.where(rows, asked, self._widened)
         self.plan[rows] = answers.plan[rows]
         self._status[rows] = np.where(answers.verified[rows], VERIFIED, OPEN)
@@ -187,10 +195,11 @@ class BackupPlanBatch:
         sets.heading[rows] = answers.predicted_heading[rows]
         sets.given[rows] = np.isfinite(answers.predicted_center[rows]).all(axis=1)
 
-    def _judge(self, rows: Flags, scores: Array) -> None:
+    def _judge(self, rows: Flags, of_plans: Array, scores: Array) -> None:
         """Add the scores of windows that have ended. A score that is no number counts as infinite."""
         where = np.flatnonzero(rows)
-        self._scores[where, self._place[where]] = np.where(np.isnan(scores[where]), np.inf, scores[where])
+        both = np.stack([of_plans, scores], axis=1)[where]
+        self._scores[where, :, self._place[where]] = np.where(np.isnan(both), np.inf, both)
         self._place[where] = (self._place[where] + 1) % WINDOWS
 
     def _advance(self, states: Array) -> Array:

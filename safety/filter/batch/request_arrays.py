@@ -91,7 +91,8 @@ class RequestArrays:
         obstacles: at least those within `Filter.reach`.
         known_free (B,): all space within reach is free, apart from the obstacles; bool.
         turn_aside: the filter turns blocked robots aside (`Request.turn_aside`), for each robot (B,), or for all.
-        widening (B,): factor on every set, at least 1. None: 1 for all.
+        widening (B,): factor on every set of a plan, at least 1. None: 1 for all.
+        state_widening (B,): see `Request`. None: 1 for all.
         model: version of the model set that verified the plan, for each robot or for all of them.
         predicted: None if no robot has one.
         past: None if no robot has one.
@@ -106,6 +107,7 @@ class RequestArrays:
     known_free: Array
     turn_aside: Array | bool = False
     widening: Array | None = None
+    state_widening: Array | None = None
     model: Sequence[str] | str = ""
     predicted: PredictionArrays | None = None
     past: PastArrays | None = None
@@ -141,6 +143,7 @@ class RequestArrays:
             known_free=np.array([request.known_free for request in requests], dtype=bool),
             turn_aside=np.array([request.turn_aside for request in requests], dtype=bool),
             widening=np.array([request.widening for request in requests], dtype=float),
+            state_widening=np.array([request.state_widening for request in requests], dtype=float),
             model=[request.model for request in requests],
             predicted=PredictionArrays(center, half_width, heading, given) if given.any() else None,
             past=PastArrays(states, inputs, from_start > 0.0, windows) if windows.any() else None,
@@ -185,6 +188,7 @@ class RequestArrays:
             known_free=bool(self.known_free[index]),
             turn_aside=self.turn_aside if isinstance(self.turn_aside, bool) else bool(self.turn_aside[index]),
             widening=1.0 if self.widening is None else float(self.widening[index]),
+            state_widening=1.0 if self.state_widening is None else float(self.state_widening[index]),
             past=past,
             observation=np.zeros(0, np.float32) if self.observation is None else on_host(self.observation[index]),
         )

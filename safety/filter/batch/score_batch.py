@@ -26,12 +26,13 @@ class ScoreBatch:
             constant(kappa.reshape(-1, kappa.shape[2])),
         )
         self._w = constant(w[..., None])
-        counts = np.zeros(w.shape[:2])
-        counts[0], counts[:, scored_coordinates(robot)] = 1.0, 1.0
-        self._counts = constant(counts[..., None])
+        counts = np.zeros((2, *w.shape))
+        counts[:, :, scored_coordinates(robot)] = 1.0
+        counts[0, 0] = 1.0
+        self._counts = [constant(one[..., None]) for one in counts]  # of all errors, and of scored coordinates alone
 
-    def __call__(self, states: Array, inputs: Array, state: Array) -> Array:
-        """Return the largest ratio of an error to its set (B,), NaN if one is NaN.
+    def __call__(self, states: Array, inputs: Array, state: Array) -> tuple[Array, Array]:
+        """Return the largest ratio of an error to its set (B,), NaN if one is NaN: see `WindowScore`.
 
         states (N, n, B), inputs (N + 1, m, B): of the past periods. state (n, B): measured now.
         """
@@ -50,5 +51,8 @@ class ScoreBatch:
         off = xp.abs(xp.stack(moved, axis=1) - predicted)
         width = self._M @ xp.abs(self._W @ window) + self._kappa @ xp.abs(window)
         width = (xp.reshape(width, (N, n, -1)) + self._w) * stretch[:, None]
-        share = xp.where((off != 0.0) & (self._counts > 0.0), off / width, 0.0)
-        return xp.max(xp.reshape(share, (N * n, -1)), axis=0)
+        share = xp.where(off != 0.0, off / width, 0.0)
+        score, of_plan = (
+            xp.max(xp.reshape(xp.where(counts > 0.0, share, 0.0), (N * n, -1)), axis=0) for counts in self._counts
+        )
+        return score, xp.where(xp.isnan(score), score, of_plan)

@@ -12,7 +12,8 @@ from brakeline.safety.model.one_step import Predictor
 
 
 @compiled(
-    f"f8({PREDICTOR}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1])"
+    f"UniTuple(f8, 2)({PREDICTOR}, f8[:,::1], f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], "
+    "f8[:,::1], i8[::1])"
 )
 def score(
     predictor: Predictor,
@@ -25,8 +26,10 @@ def score(
     kappa: Array,
     w: Array,
     scored: Index,
-) -> float:
-    """Return the largest ratio of an error to its set in a window that has ended, or NaN if one is NaN.
+) -> tuple[float, float]:
+    """Return the largest ratio of an error to its set in a window that has ended; NaN if one is NaN.
+
+    The first number is of all errors, the second of those of the scored coordinates.
 
     Args:
         states (N + 1, n): measured states. executed (N + 1, m): the input in force before, and the inputs.
@@ -40,7 +43,7 @@ def score(
         window[i] = states[0, others[i]]
     window[r:] = executed.ravel()
     predicted, wider = rollout(predictor, window), stretch(predictor, root, weight, window)
-    atoms, first, largest = np.zeros(len(W)), states[0], 0.0
+    atoms, first, largest, of_scored = np.zeros(len(W)), states[0], 0.0, 0.0
     for i in range(len(W)):
         for j in range(len(window)):
             atoms[i] += W[i, j] * window[j]
@@ -63,6 +66,8 @@ def score(
                 width += M[k, i, j] * atoms[j]
             share = off / (width * wider[k]) if off != 0.0 else 0.0
             if share != share:
-                return share
+                return share, share
             largest = max(largest, share)
-    return largest
+            if k > 0 or i in scored:
+                of_scored = max(of_scored, share)
+    return largest, of_scored
