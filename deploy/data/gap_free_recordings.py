@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -102,7 +103,7 @@ def _longest_step(usual: float, period: float) -> float:
 
     It lies halfway between two multiples of the usual time, so that noise of the stamps does not decide.
     """
-    return usual * (max(np.floor(0.5 * period / usual + 0.01), 1.0) + GAP - 1.0)
+    return usual * (max(math.floor(0.5 * period / usual + 0.01), 1) + GAP - 1.0)
 
 
 def _lost_messages(series: Series, period: float, hold: float) -> list[Span]:

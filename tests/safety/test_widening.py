@@ -261,7 +261,7 @@ def test_a_payload_is_noticed_within_seconds_and_the_sets_hold_again():
         answer = client.decide(robot.measure(), action, [], known_free=True)
         scores.append((0.0, 0.0) if answer.score is None else (answer.plan_score, answer.score))
         robot.step(answer.action)
-    scores, factors = np.array(scores), np.array(factors)
-    assert ((scores[100:] > 1.0).mean(0) > (0.15, 0.3)).all()
-    assert ((scores[100:] > factors[100:]).mean(0) < 0.02).all()
-    assert (factors[0] == 1.0).all() and 1.5 < factors[-1, 0] < factors[-1, 1] < 20.0
+    shares, widened = np.array(scores), np.array(factors)
+    assert ((shares[100:] > 1.0).mean(0) > (0.15, 0.3)).all()
+    assert ((shares[100:] > widened[100:]).mean(0) < 0.02).all()
+    assert (widened[0] == 1.0).all() and 1.5 < widened[-1, 0] < widened[-1, 1] < 20.0
