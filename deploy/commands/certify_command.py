@@ -292,7 +292,8 @@ def bounds_in_words(s: ValidationReport, period: float) -> str:
     ]
     if s.chosen is not None and s.marginal is not None:
         lines += [
-            f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap)",
+            f"  a plan like these: {s.marginal:.2%} leave their tube on average (from plans that overlap; more if "
+            "ground, load or battery change slowly, because minutes hold few such changes)",
             f"  predictor: {s.chosen.features} features, selected from products of up to {s.chosen.degree} variables, "
             + ("with" if s.chosen.lags else "without")
             + " the earlier input; 99 % of "

@@ -59,7 +59,9 @@ class RobotCommand:
         if path.suffix != ".toml" or not NAME.fullmatch(path.stem):
             raise ValueError(f"{self.file}: a description is a file NAME.toml, NAME of letters, digits, '_' and '-'")
         if path.exists():
-            raise ValueError(f"{path} exists: check it with `brakeline robot check {path}`, or choose another name")
+            raise ValueError(
+                f"{path} exists: check it with `brakeline robot check {path}`, delete it, or choose another name"
+            )
         text = (ROBOTS_FOLDER / "template.txt").read_text().replace('"NAME"', f'"{path.stem}"')
         notes: tuple[str, ...] = ()
         options = self.reading.options(self.map)

@@ -61,11 +61,11 @@ def _state(one: InferredColumn) -> str:
 
 
 def _input(one: InferredColumn) -> str:
-    most, steers = None if one.jumps else _outwards(one.change), one.unit == "rad"
+    most = None if one.jumps else _outwards(one.change)
     values: dict[str, Any] = {"unit": one.unit or "1"}
     values |= {"low": min(_outwards(one.least), 0.0), "high": max(_outwards(one.most), 0.0)}
     values |= {} if most is None else {"slew": most}
-    values |= {"moves": not steers if one.moves is None else one.moves, "stop": "hold" if steers else "ramp"}
+    values |= {"moves": not one.steers if one.moves is None else one.moves, "stop": "hold" if one.steers else "ramp"}
     remarks = [] if one.unit else [f"its unit {UNKNOWN}"]
     remarks += [] if one.moves is not None else [f"moves: {UNKNOWN}, the log never changes it alone"]
     remarks += ["it jumps, so that it has no slew limit"] if most is None else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ Span = tuple[float, float]  # begin and end in s
 Indices = NDArray[np.signedinteger]
 
 GAP = 1.5  # times the usual time between two samples: a larger one is a gap
+REGULAR = 0.9  # share of the times between two messages of an input without a gap: its sender repeats it all the time
 JUMP = 2.0  # times the fastest motion: faster is a jump
 MOST_USUAL = 3.0  # times the fastest motion of the description, to which the usual speed of a log counts
 MOST_JUMPS, FEW_JUMPS = 0.1, 5  # share and number of rows with jumps, above which the rows are of several robots
@@ -49,7 +51,7 @@ def gap_free_recordings(
     """
     names, input_names = column_names(robot)
     recordings: list[GapFreeRecording] = []
-    gaps = jumps = shared = 0
+    gaps = lost = jumps = shared = 0
     for run in sorted({int(i) for table, _ in places.values() for i in np.unique(table.run)} or {0}):
         states, given = (
             [table.series(column, run) for table, column in (places[name] for name in columns)]
@@ -69,6 +71,9 @@ def gap_free_recordings(
         spans = [_uncut(time, at) for (time, _), at in zip(states, cuts, strict=True)]
         spans += [_uncut(states[i][0], indices) for i, indices in jump_rows.items()]
         spans += [_uncut(time, np.flatnonzero(np.diff(time) > hold), hold) for time, _ in inputs]
+        losses = [_lost_messages(series, robot.period, hold) for series in inputs]
+        lost += len({end for loss in losses for _, end in loss})
+        spans += [_outside(loss) for loss in losses]
         if robot.heading is not None:
             time, heading = states[robot.heading]
             states[robot.heading] = time, np.unwrap(heading)
@@ -77,6 +82,7 @@ def gap_free_recordings(
             if all(len(time) >= 2 for time, _ in part):
                 recordings.append(GapFreeRecording(part, inputs, begin, end))
     counts = {"gaps in the stamps: the recording is cut there": gaps, "jumps of the pose": jumps}
+    counts["times an input changed while messages of it are missing: the recording is cut there"] = lost
     counts["rows with the stamp of the row before and another pose: left out"] = shared
     return recordings, [f"{count} {what}" for what, count in counts.items() if count]
 
@@ -89,7 +95,38 @@ def _gaps(time: Array, period: float, name: str) -> Indices:
         raise NoSource(
             f"{name} has a sample every {usual:.3g} s: the robot's period of {period:g} s needs at least one per period"
         )
-    return np.flatnonzero(apart > max(GAP * usual, 0.5 * period))
+    return np.flatnonzero(apart > _longest_step(usual, period))
+
+
+def _longest_step(usual: float, period: float) -> float:
+    """Return the time in s between two samples above which samples are missing for more than half a period.
+
+    It lies halfway between two multiples of the usual time, so that noise of the stamps does not decide.
+    """
+    return usual * (max(math.floor(0.5 * period / usual + 0.01), 1) + GAP - 1.0)
+
+
+def _lost_messages(series: Series, period: float, hold: float) -> list[Span]:
+    """Return the times without messages of an input in which it changed, if its sender usually repeats it.
+
+    Nobody knows when the robot got the new input. If the sender is silent for longer than `hold`, it does not send.
+    """
+    time, values = series
+    apart = np.diff(time)
+    usual = float(np.median(apart)) if len(apart) else 0.0
+    gap = apart > (_longest_step(usual, period) if usual > 0.0 else np.inf)
+    if not gap.any() or gap.mean() > 1.0 - REGULAR:
+        return []
+    return [
+        (float(time[i] + usual), float(time[i + 1]))
+        for i in np.flatnonzero(gap & (apart <= hold) & (np.diff(values) != 0.0))
+    ]
+
+
+def _outside(holes: list[Span]) -> list[Span]:
+    """Return the spans of time outside holes, which are in order."""
+    begins, ends = [-np.inf, *(end for _, end in holes)], [*(begin for begin, _ in holes), np.inf]
+    return list(zip(begins, ends, strict=True))
 
 
 def _pose(robot: Robot) -> tuple[int, ...]:

@@ -199,6 +199,12 @@ def unit_like(gain: float, si: str) -> str:
     return best if fits[best] < LIKE_UNIT and not same_gain(gain) else ""
 
 
+def likely_unit(gain: float, si: str) -> str:
+    """Return the only unit near the gain of an input, which a robot that slips follows by less; else an empty text."""
+    near = [unit for unit, scale in UNITS[si].items() if same_gain(gain * scale)]
+    return near[0] if len(near) == 1 and near[0] != si else ""
+
+
 def speed_contradiction(name: str, fit: SpeedFit) -> str:
     """Return the sentence for a speed in another unit; empty if the gain is near 1 or no unit explains it."""
     unit = unit_like(fit.gain, fit.unit)

@@ -17,6 +17,7 @@ from brakeline.deploy.data.motion_check import (
     best_fit,
     contradictions,
     directions_of_motion,
+    likely_unit,
     span_means,
     speed_fit,
     speeds_of_motion,
@@ -109,6 +110,11 @@ def _wrong_sense(log: AlignedLog, name: str, unit: str, speeds: list[tuple[str, 
             )
         if 1.0 / FAR_GAIN[is_input] < fit.gain < FAR_GAIN[is_input]:
             return ""
+        if is_input and (likely := likely_unit(fit.gain, unit)):
+            return (
+                f"{name} is {fit.gain:.3g} times the {quantity} of the positions: it may be in {likely}. Convert it "
+                f"with {unit_option(name, likely)}, write it in {unit}, {as_it_is}"
+            )
         return (
             f"{name} is {fit.gain:.3g} times the {quantity} of the positions, and no unit explains this. "
             f"Write {name} in {unit} and the positions in m, {as_it_is}"

@@ -30,6 +30,7 @@ from brakeline.deploy.data.motion_check import (
     UNCONVERTED,
     heading_contradiction,
     heading_unit,
+    likely_unit,
     needless_conversion,
     needlessly_converted,
     same_gain,
@@ -49,7 +50,7 @@ from brakeline.deploy.data.sources.quantity_names import (
 )
 from brakeline.deploy.data.sources.source_table import Array, Table, notes_of
 from brakeline.deploy.data.stamps import TIME
-from brakeline.deploy.data.unit_table import in_si, si_of
+from brakeline.deploy.data.unit_table import in_si, si_of, unit_option
 from brakeline.errors import NoSource
 
 POSITION = re.compile(r"(?:pos(?:ition)?[ _.]?|p)?([xyz])(?:[ _.]?pos(?:ition)?)?(?:[ _.]?m)?", re.IGNORECASE)
@@ -90,6 +91,11 @@ class InferredColumn:
         """Return whether an input changes so much in one period that it has no slew limit."""
         return not 0.0 < self.change < JUMP * (self.most - self.least)
 
+    @property
+    def steers(self) -> bool:
+        """Return whether an input is an angle of steering, which a robot holds while it brakes."""
+        return self.unit == "rad"
+
 
 @dataclass(frozen=True)
 class InferredSchema:
@@ -125,7 +131,7 @@ def infer_schema(*sources: Sequence[Table], options: LogOptions = PLAIN) -> Infe
         )
     if not sources[0][0].name:
         notes += _find_heading(log, options)
-        _find_speeds(log, options)
+        notes += _find_speeds(log, options)
     others = [n for n in log.columns if n not in (*log.positions, log.heading, *log.inputs)]
     pairs = followers_of_inputs(log, others)
     for name, follower in pairs.items():
@@ -187,8 +193,10 @@ def _period(log: AlignedLog) -> tuple[float, str]:
 
 def brake_periods(period: float, states: Sequence[InferredColumn], inputs: Sequence[InferredColumn]) -> tuple[int, int]:
     """Return the periods of the strongest braking, and those of the longest delay: estimates, not bounds."""
-    ramps = [(max(-c.least, c.most), c.change) for c in inputs if c.jumps is False and c.change > 0.0]
-    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in states if c.follows and c.change > 0.0]
+    held = {c.name for c in inputs if c.steers}
+    braking = [c for c in states if c.follows and c.follows not in held]
+    ramps = [(max(-c.least, c.most), c.change) for c in inputs if not (c.jumps or c.steers) and c.change > 0.0]
+    falls = [(max(abs(c.least), abs(c.most)), c.change) for c in braking if c.change > 0.0]
     brake = max((math.ceil(round(min(ENDLESS, most / change), 6)) for most, change in (*ramps, *falls)), default=1)
     return brake, math.ceil(max((c.delay or 0.0 for c in states), default=0.0) / period)
 
@@ -301,8 +309,9 @@ def _from_columns(table: Table, options: LogOptions) -> _Fields:
     inputs = [name for name in places if INPUT.match(name)] or [
         name for name in places if name not in positions and np.mean(np.diff(known[name]) == 0.0) >= HELD
     ]
+    of_headers = {name: table.units[column] for name, (_, column) in places.items() if column in table.units}
     places, units = _in_si(places, options)
-    return _Fields(places, positions, inputs, units, notes=notes)
+    return _Fields(places, positions, inputs, of_headers | units, notes=notes)
 
 
 def _is_flat(z: Array) -> bool:
@@ -356,10 +365,14 @@ def _find_heading(log: AlignedLog, options: LogOptions) -> list[str]:
     return ["no column is clearly the heading: none agrees with the motion, and none is named heading or yaw"]
 
 
-def _find_speeds(log: AlignedLog, options: LogOptions) -> None:
-    """Set the units of the columns that measure speeds. Raises NoSource for speeds in another unit."""
+def _find_speeds(log: AlignedLog, options: LogOptions) -> list[str]:
+    """Set the units of the columns that measure speeds, and return notes on inputs that may be in another unit.
+
+    Raises:
+        NoSource: a speed is in another unit.
+    """
     speeds = speeds_of_motion(log, log.heading)
-    problems = []
+    problems, notes = list[str](), list[str]()
     for name in log.columns:
         if name in (*log.positions, log.heading):
             continue
@@ -374,5 +387,11 @@ def _find_speeds(log: AlignedLog, options: LogOptions) -> None:
             log.units |= {} if name in log.inputs else {name: fit.unit}
         elif problem := speed_contradiction(name, fit):
             problems.append(problem)
+        elif name in log.inputs and not log.units.get(name) and (unit := likely_unit(fit.gain, fit.unit)):
+            notes.append(
+                f"{name} may be in {unit}: it is {fit.gain:.3g} times the speed or turn rate that follows it, in "
+                f"{fit.unit}. If so, delete the file and repeat the command with {unit_option(name, unit)}"
+            )
     if problems:
         raise NoSource("\n".join((*problems, "If a column is no speed, give it --unit NAME=1")))
+    return notes

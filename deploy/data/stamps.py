@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from brakeline.deploy.data.sources.source_table import Array, Table
 from brakeline.deploy.data.unit_table import NAMES as UNIT_NAMES
-from brakeline.deploy.data.unit_table import factor, split_header, unknown_unit
+from brakeline.deploy.data.unit_table import factor, si_of, split_header, unknown_unit
 from brakeline.errors import NoSource
 
 TIME, RUN = "time", "run"
@@ -87,6 +87,7 @@ def stamped(table: Table, column: str = "", unit: str = "") -> Table:
 def in_header_units(table: Table) -> Table:
     """Return a table of columns `NAME [UNIT]` as columns NAME in SI units; the stamps stay as they are."""
     columns: dict[str, Array] = {}
+    units: dict[str, str] = {}
     notes: list[str] = []
     for name, values in table.columns.items():
         plain, unit = split_header(name)
@@ -95,10 +96,10 @@ def in_header_units(table: Table) -> Table:
         if scale is None or as_it_is or factor(unit, "s") is not None:
             columns[name] = values
             continue
-        columns[plain] = values * scale
+        columns[plain], units[plain] = values * scale, si_of(unit)
         if scale != 1.0:
             notes.append(f"column {name}: converted from {unit} to SI")
-    return replace(table, columns=columns, notes=(*table.notes, *notes))
+    return replace(table, columns=columns, units=units, notes=(*table.notes, *notes))
 
 
 def _cut_at_steps_back(table: Table) -> Table:

@@ -20,6 +20,25 @@ from brakeline.safety.perception.scan_free_space import half_spaces as unseen_ha
 UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
+def near_edge(margin: float, planar: bool = True, too_long_for: float = np.inf) -> str:
+    """Return the sentence on a proposal that is not allowed as it is.
+
+    Args:
+        margin: from its tube to the edge of free space [m], or to a limit in that limit's unit; negative beyond it.
+        planar: whether the edge is that of free space.
+        too_long_for: how far the filter looks ahead [m], if the tube leads farther.
+    """
+    unit, edge = ("m", "the free space's edge") if planar else ("(in its own unit)", "a limit")
+    if too_long_for < np.inf:
+        return (
+            f"the proposal's tube leads farther than the {too_long_for:.3g} m that the filter looks ahead: the "
+            "recorded driving says too little about this proposal"
+        )
+    if margin < 0.0:
+        return f"the proposal's tube ends {-margin:.3g} {unit} beyond {edge}"
+    return f"the proposal's tube comes within {margin:.3g} {unit} of {edge}"
+
+
 @dataclass(frozen=True, eq=False)
 class BlockingConstraint(ComparedByValue):
     """The constraint that a proposal violated, or came nearest to."""

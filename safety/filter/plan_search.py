@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes, near_edge
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
@@ -132,8 +132,9 @@ class PlanSearch:
             return allowed
         if margin >= 0.0 and general.margin(self.with_clearance_margin(proposed), z) >= 0.0:
             return allowed
-        edge = "m of the free space's edge" if safety.robot.position_dim else "(in its own unit) of a limit"
-        record.reason = f"the proposal's tube comes within {margin:.3g} {edge}"
+        planar = safety.robot.position_dim > 0
+        too_long = constraints.far and not constraints.extent(z) < constraints.reach  # of a rollout that diverges: NaN
+        record.reason = near_edge(margin, planar, constraints.reach if too_long else np.inf)
         record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, margin >= 0.0)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.

@@ -21,8 +21,9 @@ class Table:
     """One stream of a source: a file of columns (with an empty name), a topic, or a message type.
 
     time (T,) in s; columns: (T,) each, NaN for a missing value; run (T,): index of the recording of each row; notes:
-    what the reader could not read, or did not use, in sentences; lines (T,): line of each row in a file of text. A
-    reader of columns leaves `time` empty: `stamps.stamped` finds it among the columns.
+    what the reader could not read, or did not use, in sentences; lines (T,): line of each row in a file of text; units:
+    the SI unit of each column whose header names a unit. A reader of columns leaves `time` empty: `stamps.stamped`
+    finds it among the columns.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Table:
     notes: tuple[str, ...] = ()
     lines: NDArray[np.intp] | None = None
     source: str = ""  # name of the file
+    units: dict[str, str] = field(default_factory=dict)
 
     def series(self, column: str, run: int) -> Series:
         """Return times and values of a column in one run, without missing values.

@@ -57,6 +57,10 @@ def percent(values):
     values[:, SPEED] *= 100.0 / 0.6
 
 
+def degrees_of_a_robot_that_slips(values):
+    values[:, TURN] = np.degrees(1.2 * values[:, TURN])
+
+
 def no_position(values):
     values[:, [X, Y, HEADING]] = 0.0
 
@@ -75,6 +79,7 @@ def nothing_sent(values):
         (swap(V, W), "v follows the turn rate of the positions, not their speed: are two columns swapped?"),
         (swap(SPEED, TURN), "speed follows the turn rate of the positions"),
         (percent, "times the speed of the positions, and no unit explains this. Write speed in m/s"),
+        (degrees_of_a_robot_that_slips, "it may be in deg/s. Convert it with --unit 'turn rate=deg/s'"),
         (lambda values: late(values, [SPEED, TURN], PERIOD), "Shift the stamps with --delay -0.2"),
         (lambda values: late(values, [SPEED, TURN], 4 * PERIOD), "Shift the stamps with --delay -0.8"),
         (of_another_drive, "v does not follow speed"),

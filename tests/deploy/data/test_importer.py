@@ -218,6 +218,46 @@ def test_cut_at_gaps_jumps_runs_and_inputs_out_of_bounds():
     assert lengths(made) == [49, 48] and "1 periods left out: an input was outside" in made.report.notes[0]
 
 
+@pytest.mark.parametrize("stamped", [0.0, 1764460000.0])  # s: where the clock begins
+def test_a_lost_row_within_half_a_period_is_no_gap_whatever_the_clock(stamped):
+    time, values = steady(step=0.05)
+    kept = np.delete(np.arange(401), np.arange(20, 380, 7))
+    assert lengths(resample([table(stamped + time[kept], values[kept])], porter(), LogOptions())) == [99]
+    kept = np.delete(np.arange(401), [200, 201])
+    assert len(lengths(resample([table(stamped + time[kept], values[kept])], porter(), LogOptions()))) == 2
+
+
+def with_messages(given, lost=()) -> Table:
+    """Return a table with a row for each pose (20 Hz) and for each message of both inputs that was not lost (5 Hz)."""
+    time, values = steady(step=0.05)
+    sent = np.delete(np.arange(len(given)), list(lost))
+    poses = np.hstack([values[:, :5], np.full((len(time), 2), np.nan)])
+    messages = np.hstack([np.full((len(sent), 5), np.nan), given[sent]])
+    stamps = np.r_[time, 0.2 * sent]
+    order = np.argsort(stamps, kind="stable")
+    return table(stamps[order], np.vstack([poses, messages])[order])
+
+
+def test_cut_where_a_message_of_an_input_that_changes_is_lost():
+    given = np.tile([0.3, 0.0], (101, 1))
+    given[:, 0] -= 0.01 * (np.arange(101) % 7)
+    given[70:80, 0] = 0.3
+    whole = resample([with_messages(given)], porter(), LogOptions())
+    cut = resample([with_messages(given, lost=[30, 75])], porter(), LogOptions())
+    note = "1 times an input changed while messages of it are missing: the recording is cut there"
+    assert lengths(whole) == [99] and lengths(cut) == [29, 68] and note in cut.report.notes
+    of_all, left = (np.vstack([t.inputs for t in made.data.trajectories]) for made in (whole, cut))
+    assert np.allclose(left, np.delete(of_all, [29, 30], axis=0))
+
+
+def test_a_sender_that_is_silent_while_nothing_changes_loses_no_messages():
+    given = np.tile([0.3, 0.0], (101, 1))
+    given[:, 0] -= 0.05 * (np.arange(101) // 3 % 2)
+    sent = [0, *(np.flatnonzero(np.diff(given[:, 0]) != 0.0) + 1)]
+    silent = sorted(set(range(101)) - set(sent) - set(range(0, 101, 6)))
+    assert lengths(resample([with_messages(given, lost=silent)], porter(), LogOptions())) == [99]
+
+
 @pytest.mark.parametrize("later", [0.0, 0.01])  # s, of the second robot's rows
 def test_rows_of_two_robots_are_refused_and_a_column_tells_them_apart(later):
     time, values = steady(step=0.1)

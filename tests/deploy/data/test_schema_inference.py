@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,41 @@ def test_an_input_of_the_same_name_a_slew_and_one_that_only_turns(tmp_path):
     assert ahead.change == pytest.approx(0.05) and (ahead.moves, turning.moves) == (True, False)
 
 
+def steering_log(path, header):
+    """Write the log of a robot with a steered wheel that somebody drives, in degrees."""
+    rng, rows, (x, y, heading, v, angle), given = np.random.default_rng(3), [], np.zeros(5), np.zeros(2)
+    for k in range(1500):
+        if k % 2 == 0 and rng.random() < 0.2:
+            given = np.round(rng.uniform([0.0, -40.0], [0.8, 40.0]), 1) * (rng.random() > 0.2)
+        rows.append([0.1 * k, x, y, math.degrees(heading), v, angle, *given])
+        v, angle = v + 0.4 * (given[0] - v), angle + 0.4 * (given[1] - angle)
+        x, y = x + 0.1 * v * math.cos(heading), y + 0.1 * v * math.sin(heading)
+        heading += 0.1 * v * math.tan(math.radians(angle)) / 0.4
+    text = "\n".join(",".join(f"{value:.5g}" for value in row) for row in rows)
+    path.write_text(f"time,x,y,yaw [deg],v,{header}\n{text}\n")
+    return path
+
+
+def test_the_unit_in_a_header_is_the_unit_of_the_description(tmp_path, capsys):
+    log = steering_log(tmp_path / "drive.csv", "wheel [deg],cmd_v,cmd_wheel [deg]")
+    assert main(["robot", "new", str(tmp_path / "my.toml"), "--from", str(log)]) == 0
+    robot = robot_named(str(tmp_path / "my.toml"))
+    assert "wheel [rad]" in robot.state and "cmd_wheel [rad]" in robot.action
+    drafted = tomllib.loads((tmp_path / "my.toml").read_text())
+    assert drafted["input"]["cmd_wheel"]["stop"] == "hold"  # as a car holds its steering
+
+
+def test_an_input_in_another_unit_than_its_speed_is_noted(tmp_path, driven, capsys):
+    time, values = driven[0], driven[1].copy()
+    values[:, 6] = np.degrees(values[:, 6]) * 1.2  # the robot turns more slowly than it is told to
+    log = write_csv(tmp_path / "drive.csv", time, values, columns=(*COLUMNS[:5], "cmd_v", "cmd_w"))
+    assert main(["robot", "new", str(tmp_path / "my.toml"), "--from", str(log)]) == 0
+    assert "cmd_w may be in deg/s: it is" in " ".join(capsys.readouterr().out.split())
+    log = write_csv(tmp_path / "drive.csv", *driven, columns=(*COLUMNS[:5], "cmd_v", "cmd_w"))
+    assert main(["robot", "new", str(tmp_path / "other.toml"), "--from", str(log)]) == 0
+    assert "may be in" not in capsys.readouterr().out
+
+
 def test_without_positions_or_inputs_it_says_what_is_missing(driven, tmp_path):
     time, values = driven
     with pytest.raises(NoSource, match="the position columns `x` and `y` are missing; the columns are: a, b"):
@@ -155,6 +191,13 @@ def test_of_several_robots_in_a_log_the_files_name_chooses(tmp_path, capsys):
     assert "holds the robots ground, quadrotor: name the file after" in " ".join(capsys.readouterr().err.split())
     assert main(["robot", "new", str(tmp_path / "quadrotor.toml"), "--from", str(log)]) == 0
     assert "horizon = 12" in (tmp_path / "quadrotor.toml").read_text()
+
+
+def test_a_steering_that_a_robot_holds_while_braking_does_not_make_braking_longer():
+    speed = InferredColumn("v", "m/s", 0.0, 0.8, follows="cmd_v", change=0.2)
+    wheel = InferredColumn("wheel", "rad", -0.9, 0.9, follows="cmd_wheel", change=0.1)
+    inputs = InferredColumn("cmd_v", "m/s", 0.0, 0.8), InferredColumn("cmd_wheel", "rad", -0.9, 0.9, change=0.1)
+    assert brake_periods(0.1, [speed, wheel], inputs)[0] == 4
 
 
 @pytest.mark.parametrize("most", [np.inf, 1e308])
