@@ -33,7 +33,7 @@ from brakeline.safety.service.server import ModelRegistry
 
 TIMES = ("time_ms", "solve_ms", "verify_ms", "queue_ms")
 # Fields that depend on a key that no log holds, and fields that explain a decision without changing it.
-EXPLANATIONS = ("plan_tokens", "token_rejected", "stopped", "bound")
+EXPLANATIONS = ("plan_tokens", "token_rejected", "stopped", "bound", "reason")
 # Fields of the solver's work, which may depend on the last bits although its solution does not.
 SOLVER_WORK = ("solver", "iterations")
 ROUNDING = 1e-12  # largest difference of equal numbers, relative to the number or to 1, whichever is larger

@@ -20,15 +20,15 @@ from brakeline.safety.perception.scan_free_space import half_spaces as unseen_ha
 UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
-def near_edge(margin: float, planar: bool = True, too_long_for: float = np.inf) -> str:
+def near_edge(margin: float, of_space: bool = True, too_long_for: float = np.inf) -> str:
     """Return the sentence on a proposal that is not allowed as it is.
 
     Args:
         margin: from its tube to the edge of free space [m], or to a limit in that limit's unit; negative beyond it.
-        planar: whether the edge is that of free space.
+        of_space: whether the edge is that of free space, or else a limit.
         too_long_for: how far the filter looks ahead [m], if the tube leads farther.
     """
-    unit, edge = ("m", "the free space's edge") if planar else ("(in its own unit)", "a limit")
+    unit, edge = ("m", "the free space's edge") if of_space else ("(in its own unit)", "a limit")
     if too_long_for < np.inf:
         return (
             f"the proposal's tube leads farther than the {too_long_for:.3g} m that the filter looks ahead: the "

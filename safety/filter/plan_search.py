@@ -132,9 +132,9 @@ class PlanSearch:
             return allowed
         if margin >= 0.0 and general.margin(self.with_clearance_margin(proposed), z) >= 0.0:
             return allowed
-        planar = safety.robot.position_dim > 0
+        of_space = safety.robot.position_dim > 0
         too_long = constraints.far and not constraints.extent(z) < constraints.reach  # of a rollout that diverges: NaN
-        record.reason = near_edge(margin, planar, constraints.reach if too_long else np.inf)
+        record.reason = near_edge(margin, of_space, constraints.reach if too_long else np.inf)
         record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, margin >= 0.0)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.
