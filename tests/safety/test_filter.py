@@ -47,7 +47,7 @@ def test_a_reason_says_on_which_side_of_the_edge_the_tube_ends(ready):
     assert near_edge(-3.0, too_long_for=3.0).startswith(
         "the proposal's tube leads farther than the 3 m that the filter"
     )
-    assert near_edge(-0.2, planar=False) == "the proposal's tube ends 0.2 (in its own unit) beyond a limit"
+    assert near_edge(-0.2, of_space=False) == "the proposal's tube ends 0.2 (in its own unit) beyond a limit"
 
 
 def test_where_nothing_is_near_the_proposal_is_allowed_within_its_bounds_and_the_margin_is_a_lower_bound(ready):
