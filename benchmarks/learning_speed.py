@@ -117,7 +117,7 @@ class Stacked(Plain):
         torch._foreach_lerp_(slow, fast, self.config.tau)
 
 
-def in_half(work: Callable[[], object]) -> Callable[[], None]:
+def in_bfloat16(work: Callable[[], object]) -> Callable[[], None]:
     """Return the same work with torch's automatic mixed precision (bfloat16)."""
 
     def mixed() -> None:
@@ -196,7 +196,7 @@ def run() -> Figures:
             ways[name] = partial(learner.update, batch)
         for name, kind in peers.items():
             ways[name] = partial(kind(config, observations, actions).update, *tensors)
-            ways[f"{name}, bfloat16"] = in_half(partial(kind(config, observations, actions).update, *tensors))
+            ways[f"{name}, bfloat16"] = in_bfloat16(partial(kind(config, observations, actions).update, *tensors))
         ways["the matrix products alone"] = products(config, observations + actions)
         rows = in_turn(ways, "torch.nn and torch.optim")
         figures |= {f"TD3 update, batch {size}: {name}": row for name, row in rows.items()}

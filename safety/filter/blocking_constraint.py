@@ -20,13 +20,14 @@ from brakeline.safety.perception.scan_free_space import half_spaces as unseen_ha
 UNSEEN, SIGHT, ROBOT = "unseen", "sight", "robot"
 
 
-def near_edge(margin: float, of_space: bool = True, too_long_for: float = np.inf) -> str:
-    """Return the sentence on a proposal that is not allowed as it is.
+def why_not_allowed(margin: float, of_space: bool = True, too_long_for: float = np.inf) -> str:
+    """Return a sentence that says why a proposal is not allowed.
 
     Args:
-        margin: from its tube to the edge of free space [m], or to a limit in that limit's unit; negative beyond it.
-        of_space: whether the edge is that of free space, or else a limit.
-        too_long_for: how far the filter looks ahead [m], if the tube leads farther.
+        margin: the distance of its tube to the edge of free space [m], or to a limit, in the limit's unit. It is
+            negative if the tube ends beyond the edge.
+        of_space: true for the edge of free space, false for a limit.
+        too_long_for: how far the filter looks ahead [m], if the tube leads farther; otherwise infinity.
     """
     unit, edge = ("m", "the free space's edge") if of_space else ("(in its own unit)", "a limit")
     if too_long_for < np.inf:

@@ -241,7 +241,7 @@ class TubeConstraints:
             *self._next,
             self._regressor(z),
             first,
-            local_map.of_state * stretch,
+            local_map.state_widening * stretch,
             np.ascontiguousarray(local_map.start),
             local_map.turn,
         )

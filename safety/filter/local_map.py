@@ -33,7 +33,7 @@ class LocalMap:
     unseen: OccupiedCells | OccludedRegions | None = None  # space that a scan does not show to be free
     other_reservations: OtherReservations | None = None  # those of other robots
     widening: float = 1.0  # factor on every set of a plan (docs/method.md §15)
-    of_state: float = 1.0  # factor on the set of the next state
+    state_widening: float = 1.0  # factor on the set of the next state
 
     @property
     def parked(self) -> LocalMap:
@@ -86,8 +86,8 @@ def local_map(
     unseen: OccupiedCells | OccludedRegions | None = occluded
     if isinstance(request.scan, Scan):
         unseen = _unseen(request.scan, start, reach, whole_plan)
-    of_state = max(request.widening, request.state_widening)
-    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, widening, of_state)
+    state_widening = max(request.widening, request.state_widening)
+    return LocalMap(start, heading, turn, near, beyond, moving, unseen, other_reservations, widening, state_widening)
 
 
 @cache

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes, near_edge
+from brakeline.safety.filter.blocking_constraint import BlockingConstraint, Planes, why_not_allowed
 from brakeline.safety.filter.constraints import TubeConstraints
 from brakeline.safety.filter.kernels import qp_kernels, tube_kernels
 from brakeline.safety.filter.local_map import LocalMap
@@ -134,7 +134,7 @@ class PlanSearch:
             return allowed
         of_space = safety.robot.position_dim > 0
         too_long = constraints.far and not constraints.extent(z) < constraints.reach  # of a rollout that diverges: NaN
-        record.reason = near_edge(margin, of_space, constraints.reach if too_long else np.inf)
+        record.reason = why_not_allowed(margin, of_space, constraints.reach if too_long else np.inf)
         record.find_blocking = partial(constraints.worst_of, local_map, z, slack, planes, margin >= 0.0)
         # First with the clearance margin, or at least no nearer; then free space alone, where not even standing would
         # meet the first rows.

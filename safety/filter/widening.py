@@ -149,8 +149,8 @@ class Widening:
             plan_score: of positions and limited coordinates. None: `score` stands for it, too.
         """
         of_plan = score if plan_score is None else plan_score
-        scores = np.nan_to_num([of_plan, score], nan=np.inf, posinf=np.inf)
-        self._add(scores, bool(self._factors) and bool(scores[0] > self._factors[0][0]), outside_share)
+        of_plan, score = (one if one == one else np.inf for one in (of_plan, score))
+        self._add((of_plan, score), bool(self._factors) and of_plan > self._factors[0][0], outside_share)
 
     def judge_period(self, share_used: float) -> None:
         """Add the score of the last period, for a model set that cannot score windows.
@@ -164,9 +164,10 @@ class Widening:
         """
         if self._factors:
             score = share_used * self._factors[-1][1]
-            self._add(np.full(2, score if score > 1.0 else 0.0), share_used > 1.0, 0.0)
+            score = score if score > 1.0 else 0.0
+            self._add((score, score), share_used > 1.0, 0.0)
 
-    def _add(self, scores: Array, left: bool, outside_share: float) -> None:
+    def _add(self, scores: tuple[float, float], left: bool, outside_share: float) -> None:
         scored = self._of
         if self._factors and self._uncounted >= self.robot.horizon:
             scored.left.append(left)

@@ -13,7 +13,7 @@ from brakeline.messaging.robot import Limit
 from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import Prediction, correction_penalty
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
-from brakeline.safety.filter.blocking_constraint import SIGHT, near_edge
+from brakeline.safety.filter.blocking_constraint import SIGHT, why_not_allowed
 from brakeline.safety.filter.filter import Filter
 from brakeline.safety.filter.plan_search import DecisionRecord, Linearized, PlanSearch
 from brakeline.safety.filter.qp_solver import INFEASIBLE
@@ -44,10 +44,10 @@ def test_a_reason_says_on_which_side_of_the_edge_the_tube_ends(ready):
             sentences.append(f"the proposal's tube {where.format(abs(blocking.room))} the free space's edge")
             assert decision.reason.startswith(sentences[-1])
     assert {"ends", "comes"} <= {word for sentence in sentences for word in sentence.split()}
-    assert near_edge(-3.0, too_long_for=3.0).startswith(
+    assert why_not_allowed(-3.0, too_long_for=3.0).startswith(
         "the proposal's tube leads farther than the 3 m that the filter"
     )
-    assert near_edge(-0.2, of_space=False) == "the proposal's tube ends 0.2 (in its own unit) beyond a limit"
+    assert why_not_allowed(-0.2, of_space=False) == "the proposal's tube ends 0.2 (in its own unit) beyond a limit"
 
 
 def test_where_nothing_is_near_the_proposal_is_allowed_within_its_bounds_and_the_margin_is_a_lower_bound(ready):

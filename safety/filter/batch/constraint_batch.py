@@ -28,7 +28,7 @@ class SceneBatch:
     widening: Array
     reach: Array
     far: Array  # (B,): a tube may leave the sensor's range
-    of_state: Array  # (B,): factor on the set of the next state
+    state_widening: Array  # (B,): factor on the set of the next state
 
 
 @dataclass(frozen=True)

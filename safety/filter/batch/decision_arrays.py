@@ -9,7 +9,7 @@ import numpy as np
 
 from brakeline.safety.filter.backup_plan import Prediction
 from brakeline.safety.filter.batch.obstacle_arrays import Array, ObstacleArrays, on_host
-from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, near_edge
+from brakeline.safety.filter.blocking_constraint import SIGHT, BlockingConstraint, why_not_allowed
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Decision
 from brakeline.safety.filter.turning_aside import turns_aside_to
 
@@ -108,7 +108,7 @@ class DecisionArrays:
         kind = KINDS[int(self.kind[index])]
         adjusted, blocked = kind == ADJUSTED, kind != ALLOWED
         set_ = (on_host(self.predicted_center[index]), on_host(self.predicted_half_width[index]))
-        reason = near_edge(float(self.proposal_margin[index]))
+        reason = why_not_allowed(float(self.proposal_margin[index]))
         if not adjusted:
             reason += "; no verified input was found"
         elif turned := int(self.turned[index]):

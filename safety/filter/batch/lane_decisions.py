@@ -141,7 +141,7 @@ class LaneDecisions:
         z_0 = xp.concat([xp.take(state, self._regressor, axis=0), before, plan[:given]])
         proposal = self._search.limited(action, z_0[z_0.shape[0] - m :])
         asked = self._factor(requests.widening, requests, rows)
-        of_state = xp.maximum(asked, self._factor(requests.state_widening, requests, rows))
+        state_widening = xp.maximum(asked, self._factor(requests.state_widening, requests, rows))
         widening = xp.where(asked > 1.0, asked * self._growth, asked)
         reach = xp.minimum(self._reach * widening, xp.full_like(widening, self._furthest))
         start = [state[i] for i in range(d)]
@@ -149,7 +149,7 @@ class LaneDecisions:
         near, beyond = within_reach(xp, obstacles, start, reach, robot.least_margin)
         beyond = xp.minimum(beyond, xp.full_like(beyond, robot.sight))
         far = (widening > 1.0) | self._constraints.base_far
-        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, of_state)
+        scene = SceneBatch(start, self._turn(state), near, beyond, widening, reach, far, state_widening)
         return LaneBatch(scene, z_0, proposal, plan[given : robot.free_steps * m])
 
     def _factor(self, given: Array | None, requests: RequestArrays, rows: Array) -> Array:

@@ -33,7 +33,7 @@ class SetBatch:
         xp, d = self._xp, self._d
         window = self._regressor @ plan.z
         sizes = self._M @ xp.abs(self._W @ window) + self._w + self._kappa @ xp.abs(window)
-        half = (self._widths @ sizes) * (scene.of_state * plan.path.stretch[0])
+        half = (self._widths @ sizes) * (scene.state_widening * plan.path.stretch[0])
         center = plan.path.first + self._C @ window
         moved = scene.turn.to_world([center[i] for i in range(d)])
         center[:d] = xp.stack([a + b for a, b in zip(scene.start, moved, strict=True)])
