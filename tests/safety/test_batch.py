@@ -191,6 +191,13 @@ def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
     check_same(ground(), scenes(ground(), 50, crowd=0.8))
 
 
+def test_a_tube_that_leads_farther_than_the_filter_looks_has_the_reason_of_the_single_path():
+    ready = one_step()
+    requests = [replace(request, widening=widening) for widening in (5.0, 20.0) for request in scenes(ready, 60)]
+    answers = check_same(ready, requests)
+    assert any("looks ahead" in answers.row(row).reason for row in range(120) if row not in answers.singly)
+
+
 def test_past_windows_are_scored():
     ready, rng = one_step(), np.random.default_rng(3)
     robot = ready.robot

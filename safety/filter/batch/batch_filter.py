@@ -153,6 +153,7 @@ def blank_answers(robot: Robot, requests: RequestArrays, xp: Any, device: Any) -
         "score": (),
         "plan_score": (),
         "proposal_margin": (),
+        "too_long_for": (),
     }
     arrays: dict[str, Any] = {
         name: xp.full((B, *shape), xp.nan, dtype=xp.float64, device=device) for name, shape in shapes.items()

@@ -60,6 +60,7 @@ class DecisionArrays:
         steps (B,): number of steps of the solver.
         turned (B,): 1 or -1 where the plan turns a blocked robot aside, to the left or right; else 0.
         proposal_margin (B,): margin of the proposal [m]; NaN where the single path decided.
+        too_long_for (B,): how far the filter looks ahead [m], where the proposal's tube leads farther; else infinity.
         blocked: the constraints that the proposals of adjusted rows violated.
         singly: the decisions of the rows that the single path decided, by row.
         obstacles: those of the requests.
@@ -89,6 +90,7 @@ class DecisionArrays:
     steps: Array
     turned: Array
     proposal_margin: Array
+    too_long_for: Array
     blocked: BlockingArrays
     singly: Mapping[int, Decision]
     obstacles: ObstacleArrays
@@ -108,7 +110,7 @@ class DecisionArrays:
         kind = KINDS[int(self.kind[index])]
         adjusted, blocked = kind == ADJUSTED, kind != ALLOWED
         set_ = (on_host(self.predicted_center[index]), on_host(self.predicted_half_width[index]))
-        reason = why_not_allowed(float(self.proposal_margin[index]))
+        reason = why_not_allowed(float(self.proposal_margin[index]), too_long_for=float(self.too_long_for[index]))
         if not adjusted:
             reason += "; no verified input was found"
         elif turned := int(self.turned[index]):

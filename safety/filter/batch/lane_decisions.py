@@ -233,8 +233,10 @@ class LaneDecisions:
             return done
         to, scene = xp.take(rows, done, axis=0), taken(xp, lanes.scene, done)
         margin = xp.take(proposed.margin, done, axis=-1)
-        answers["proposal_margin"][to] = margin
-        for name, value in self._blocking(taken(xp, proposed.plan, done), scene, margin).items():
+        answers["proposal_margin"][to], plan = margin, taken(xp, proposed.plan, done)
+        too_long = scene.far & ~(plan.extent < scene.reach)  # of a rollout that diverges: NaN
+        answers["too_long_for"][to] = xp.where(too_long, scene.reach, xp.inf)
+        for name, value in self._blocking(plan, scene, margin).items():
             getattr(answers["blocked"], name)[to] = value
         z = xp.where(goes_on, xp.concat([lanes.z_0, lanes.committed]), candidates.z)
         plan = c.around(scene, xp.take(z, done, axis=-1))
