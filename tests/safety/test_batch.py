@@ -193,9 +193,7 @@ def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
 
 def test_a_tube_that_leads_farther_than_the_filter_looks_has_the_reason_of_the_single_path():
     ready = one_step()
-    answers = check_same(
-        ready, [replace(request, widening=w) for w in (1.0, 1.5, 2.5) for request in scenes(ready, 40)]
-    )
+    answers = check_same(ready, [replace(request, widening=100.0) for request in scenes(ready, 40)])
     assert any("looks ahead" in answers.row(row).reason for row in range(len(answers)) if row not in answers.singly)
 
 
