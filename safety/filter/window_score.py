@@ -29,7 +29,7 @@ class WindowScore:
     def __call__(self, past: PastWindow, state: Array) -> tuple[float, float]:
         """Return the largest ratio of an error to its set in the window that ends in a measured state (n,).
 
-        The first number is of all errors, the second of those of `scored_coordinates` alone.
+        The first number counts all errors, the second only those of `scored_coordinates`.
         """
         states = np.concatenate([past.states, state[None]])
         score, of_plan = self._score(states, np.ascontiguousarray(past.inputs), *self._sets)

@@ -29,7 +29,7 @@ def score(
 ) -> tuple[float, float]:
     """Return the largest ratio of an error to its set in a window that has ended; NaN if one is NaN.
 
-    The first number is of all errors, the second of those of the scored coordinates.
+    The first number counts all errors, the second only those of the scored coordinates.
 
     Args:
         states (N + 1, n): measured states. executed (N + 1, m): the input in force before, and the inputs.
