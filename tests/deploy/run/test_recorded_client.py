@@ -1,6 +1,7 @@
 """The log of a program of one's own: every request and step is in it, and it says how the robot followed its sets."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from brakeline.deploy.run.recorded_client import RecordedClient
-from brakeline.errors import BadRequest, BusError
+from brakeline.errors import BadRequest, BusError, NoReply, Refused
 from brakeline.logs.reader import open_log
 from brakeline.messaging.bus import Bus, BusSettings
 from brakeline.messaging.free_ports import free_endpoint
@@ -21,6 +22,7 @@ from brakeline.safety.service.client import SafetyClient
 from brakeline.safety.service.in_process import InProcess
 from tests.faults.failing_calls import full
 from tests.safety.served import Service
+from tests.waiting import until
 
 AHEAD = [Obstacle("cylinder", (0.6, 0.0), (0.1,))]
 PERIODS = 12
@@ -45,6 +47,17 @@ def drive(safety, periods=PERIODS, state=(0.0,) * 5, obstacles=AHEAD):
         state = after(state, answer.action)
         states.append(state)
     return np.array(states)
+
+
+def known(client: SafetyClient) -> bool:
+    """Return whether a service answers the client, if only to refuse an empty request."""
+    try:
+        client.bus.ask(DECIDE, b"", 5.0, robot="ground")
+    except NoReply:
+        return False
+    except Refused:
+        return True
+    raise AssertionError("an empty request was decided")
 
 
 def messages(log: Path, kind: str) -> list:
@@ -93,6 +106,7 @@ def test_a_period_without_a_decision_is_a_fallback(method, tmp_path) -> None:
                 safety.decide(state, [0.25, 0.0], AHEAD)
             braking = safety.fallback()
             bus.serve(DECIDE, Service(ModelSet.load("ground")).answer)
+            until(partial(known, client), "the client knows the new service")
             safety.decide(after(state, braking), [0.25, 0.0], AHEAD)
     steps, exchanges = messages(safety.path, "step"), messages(safety.path, "exchange")
     assert [s.fallback for s in steps] == [False, False, False, True]
