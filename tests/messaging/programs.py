@@ -29,8 +29,8 @@ time.sleep(60)
 """
 
 
-def answers(bus: Bus, payload: bytes = b"?") -> bytes | None:
+def answers(bus: Bus, payload: bytes = b"?", timeout: float = 0.5) -> bytes | None:
     try:
-        return bus.ask(DECIDE, payload, timeout=0.5, robot="ground")
+        return bus.ask(DECIDE, payload, timeout=timeout, robot="ground")
     except BusError:
         return None

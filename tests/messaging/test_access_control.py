@@ -9,6 +9,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from brakeline.messaging.bus.identity import names_in
 from brakeline.messaging.free_ports import HERE, free_endpoint
 from brakeline.messaging.process_runtime import Process
 from tests.messaging.keyring import keyring
+from tests.messaging.programs import answers
 from tests.waiting import until
 
 JOINED = 0.3  # s that a declaration may take to reach everybody on this machine
@@ -135,7 +137,7 @@ def test_a_second_queryable_answers_nobody(system: System) -> None:
     with pytest.raises(NoReply):
         asker.ask(topics.DECIDE, b"?", 2.0, robot="ground")
     system.join("safety").serve(topics.DECIDE, lambda payload, asker: b"verified")
-    time.sleep(JOINED)
+    until(lambda: answers(asker, timeout=10.0), "the service is known")
     assert {asker.ask(topics.DECIDE, b"?", 10.0, robot="ground") for _ in range(200)} == {b"verified"}
 
 
@@ -247,6 +249,13 @@ def test_a_name_that_is_struck_out_can_do_nothing(keys: Path, tmp_path: Path) ->
     system.close()
 
 
+def answered(speaker: Bus, topic: topics.Topic, **robot: str) -> bool:
+    try:
+        return speaker.ask(topic, b"?", 5.0, **robot) == b"answer"
+    except BusError:  # as yet
+        return False
+
+
 def test_the_table_works_with_keys(secure: System) -> None:
     """Whoever the table lets speak is heard by all whom it lets listen: nothing honest is shut out."""
     for topic in topics.TOPICS:
@@ -261,7 +270,8 @@ def test_the_table_works_with_keys(secure: System) -> None:
         if topic.delivery is topics.Delivery.QUERY:
             for listener in listeners:
                 listener.serve(topic, lambda payload, asker: b"answer", **({} if topic is topics.DECIDE else robot))
-            time.sleep(JOINED)
+            for speaker in speakers:
+                until(partial(answered, speaker, topic, **robot), f"the speaker knows a listener of {topic.name}")
             assert {speaker.ask(topic, b"?", 5.0, **robot) for speaker in speakers} == {b"answer"}, topic.name
             continue
         got: list[list[Sample]] = [[] for _ in listeners]

@@ -232,7 +232,7 @@ def test_a_question_for_which_nobody_waits_is_dropped_with_a_warning(
         return payload
 
     router.serve(DECIDE, work)
-    until(lambda: actor.ask(DECIDE, b"ready", timeout=10.0, robot="ground") == b"ready")
+    until(lambda: answers(actor, b"ready", 10.0) == b"ready")
     slow = threading.Thread(target=lambda: actor.ask(DECIDE, b"slow", timeout=PATIENCE, robot="ground"))
     slow.start()
     assert held.wait(PATIENCE)
