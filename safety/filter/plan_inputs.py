@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from brakeline.compilation import compiled
 from brakeline.messaging.robot import Array, Robot
 from brakeline.safety.model.model_set import ModelSet
 from brakeline.safety.model.turning_in_place import widened
+
+MOST_COMBINED = 3  # inputs
 
 
 @compiled("f8[::1](f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
@@ -51,6 +55,7 @@ class PlanInputs:
         narrower: the inputs that were recorded leave out some of those that the description allows.
         nothing (m,): zero input.
         schedule (N·m, (F + given)·m): S of docs/method.md §2, from the chosen inputs to all inputs of a plan.
+        pattern (n, m): the inputs of `spread`, from -1 (smallest) to 1 (largest).
         braking (F, m): share of its value that an input still has in each free period while the robot brakes.
     """
 
@@ -70,6 +75,7 @@ class PlanInputs:
             self.low = np.maximum(self.low, np.minimum(recorded[0], self.nothing))
             self.high = np.minimum(self.high, np.maximum(recorded[1], self.nothing))
         self.narrower = bool((self.low > robot.low()).any() or (self.high < robot.high()).any())
+        self.pattern = _pattern(robot.action_dim)
         self.braking = np.ascontiguousarray(robot.stop_profile()[: robot.free_steps - robot.committed_steps])
 
     def limited(self, wanted: Array, before: Array) -> Array:
@@ -97,6 +103,24 @@ class PlanInputs:
         """Return z (nz,) of an action (m,) followed by braking."""
         return regressors_of_braking(z_0, self.braking, action)
 
+    def spread(self, before: Array) -> Array:
+        """Return inputs (n, m) all over what bounds and slew allow after `before` (m,): ends and middles, combined.
+
+        A robot of more than three inputs gets one changed at a time: the combinations would be too many.
+        """
+        low, high = (
+            self.limited(np.full_like(before, -np.inf), before),
+            self.limited(np.full_like(before, np.inf), before),
+        )
+        return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * self.pattern)
+
     def plan(self, z: Array) -> Array:
         """Return all inputs (N, m) of the plan with regressors z."""
         return (self.schedule @ z[self.robot.regressor_dim :]).reshape(self.robot.horizon, -1)
+
+
+def _pattern(m: int) -> Array:
+    """Return combinations (n, m) of -1, 0 and 1: all of them for up to three inputs, else of one input at a time."""
+    if m <= MOST_COMBINED:
+        return np.array([*product((-1.0, 0.0, 1.0), repeat=m)])
+    return np.concatenate([np.zeros((1, m)), np.eye(m), -np.eye(m)])

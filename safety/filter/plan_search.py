@@ -2,7 +2,7 @@
 
 The search stops at the first verified plan of: the proposal with the clearance margin, the QP's answer, the proposal.
 If a robot chooses several inputs of a plan, the QP's answer may begin with the proposal and go on otherwise than by
-braking. The proposal is then allowed.
+braking. The proposal is then allowed. If the QPs of a rollout find nothing, the search tries inputs of a fixed pattern.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class PlanSearch:
             if adjusted is not None:
                 break
         for_clearance = margin >= 0.0 and adjusted is not None
-        adjusted = self._turned_only(adjusted) or adjusted
+        adjusted = self._turned_only(adjusted) or adjusted or self._spread_out()
         if adjusted is not None:
             adjusted.for_clearance = for_clearance
         else:
@@ -235,6 +235,24 @@ class PlanSearch:
         constraints = constraints.at(z, local_map.widening)
         margin = constraints.margin_in(local_map, z)
         return PlanCandidate(ADJUSTED, safety.inputs.plan(z), z, margin, True, constraints) if margin >= 0.0 else None
+
+    def _spread_out(self) -> PlanCandidate | None:
+        """Return a verified plan near one of the inputs of `PlanInputs.spread`, where a rollout's QPs found none.
+
+        A QP is as good as its linearisation. In flights of an ArduCopter among dense obstacles, the QPs missed one
+        decision in sixteen for which a grid of inputs had a verified plan.
+        """
+        inputs = self.safety.inputs
+        if not isinstance(self.safety.tube, RolloutTube):
+            return None
+        for z in sorted((inputs.regressors(self.z_0, u) for u in inputs.spread(self.before)), key=self._off):
+            at = self._around(z)
+            margin = at.constraints.least(at.slack, z)
+            if margin >= 0.0:
+                found = PlanCandidate(ADJUSTED, inputs.plan(z), z, margin, True, at.constraints)
+                closer = self._solve(at, with_clearance=False)
+                return found if closer is None or self._off(closer.z) > self._off(z) else closer
+        return None
 
     def _off(self, z: Array) -> float:
         """Return the distance of the first free input in z from the proposal, in units of the inputs' ranges."""

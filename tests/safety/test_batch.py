@@ -12,13 +12,16 @@ from brakeline.messaging.moving_obstacles import split_moving
 from brakeline.messaging.obstacle import Obstacle, Shapes
 from brakeline.messaging.obstacle_motion import Motion
 from brakeline.messaging.robot import Disc
+from brakeline.safety.filter import plan_search
 from brakeline.safety.filter.backup_plan import UNVERIFIED, BackupPlan
 from brakeline.safety.filter.batch import lane_decisions, qp_batch, search_batch
 from brakeline.safety.filter.batch.batch_filter import BatchFilter
 from brakeline.safety.filter.batch.decision_arrays import KINDS
+from brakeline.safety.filter.batch.qp_batch import QPBatch
 from brakeline.safety.filter.batch.request_arrays import RequestArrays
 from brakeline.safety.filter.batch.row_by_row import RowByRow
 from brakeline.safety.filter.filter import WORTH_A_BATCH, Filter
+from brakeline.safety.filter.qp_solver import INFEASIBLE
 from brakeline.safety.filter.request import ADJUSTED, ALLOWED, FAILSAFE, RECOVERING, Request
 from brakeline.safety.filter.widening import PastWindow
 from brakeline.safety.model.fitting import fit_model_set
@@ -26,6 +29,7 @@ from brakeline.safety.model.model_set import ModelConfig
 from brakeline.safety.service.in_process import InProcess
 from tests.robots import GROUND
 from tests.safety.test_one_step import CONFIG, ROBOT, driven, two_inputs
+from tests.safety.test_one_step import scenes as among_posts
 
 SAME = 1e-6
 WORTH = 3 * WORTH_A_BATCH  # of the ground robot
@@ -140,7 +144,7 @@ def test_a_batch_decides_as_the_single_path(filters, form):
     assert len(answers.singly) < 0.5 * len(requests)
 
 
-@pytest.mark.parametrize("form", ["ground direct", "two discs"])
+@pytest.mark.parametrize("form", ["ground direct", "two discs", "one-step"])
 def test_a_batch_turns_blocked_robots_aside(filters, form):
     ready, rng, requests = filters(form), np.random.default_rng(1), []
     robot = ready.robot
@@ -189,6 +193,28 @@ def regressors(ready, request):
 def test_the_number_of_lanes_at_once_changes_no_decision(monkeypatch):
     monkeypatch.setattr(lane_decisions, "PLAN_ROWS", 50)  # seven lanes
     check_same(ground(), scenes(ground(), 50, crowd=0.8))
+
+
+def test_where_the_qps_find_nothing_for_a_rollout_a_verified_input_of_the_pattern_is_found(monkeypatch):
+    ready = one_step()
+    requests = [replace(request, model=ready.version) for request in among_posts(150)]
+
+    def impossible(self, rows, z_0, proposal):
+        no = np.zeros(z_0.shape[1], dtype=bool)
+        return np.zeros((self.free, len(no))), no, ~no, np.zeros(len(no))
+
+    monkeypatch.setattr(QPBatch, "solve", impossible)
+    monkeypatch.setattr(plan_search, "solve", lambda program: INFEASIBLE)
+    answers = check_same(ready, requests)
+    adjusted = [row for row in range(len(answers)) if KINDS[answers.kind[row]] == ADJUSTED]
+    assert set(adjusted) <= set(answers.singly) and (answers.margin[adjusted] >= 0.0).all()
+    shares = []  # of what bounds and slew allow, from -1 to 1
+    for row in adjusted:
+        middle, change = ready.builder.reachable(requests[row].input_in_force)
+        shares.append((answers.plan[row, 0] - middle) / change)
+    apart = np.abs(shares - np.round(shares)).max(axis=1)
+    assert (apart < 1e-9).sum() > 20, "the others turn in place"
+    assert any(row not in answers.singly for row in range(len(answers)) if KINDS[answers.kind[row]] == FAILSAFE)
 
 
 def test_a_tube_that_leads_farther_than_the_filter_looks_has_the_reason_of_the_single_path():

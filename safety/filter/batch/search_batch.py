@@ -73,6 +73,7 @@ class SearchBatch:
         self._standing = constant(safety.standing[:, None].astype(float)) > 0.5
         self._translating = constant(safety.translating[self.known :, None, None].astype(float))
         self._repeats = len(inputs.braking)
+        self._pattern = [constant(share[:, None]) for share in inputs.pattern]
 
     # --- inputs and regressors -------------------------------------------------------------------------------------
 
@@ -146,8 +147,24 @@ class SearchBatch:
                 candidates.adjusted[to], candidates.allowed[to] = changed, ~changed
                 candidates.for_clearance[to] = xp.take(verified, to, axis=0) & changed
                 open_ = open_[~solved & ~unsure]
-        candidates.hopeless[open_] = True
+        candidates.hopeless[open_] = self._nothing_spread_out(taken(xp, lanes, open_))
         return candidates
+
+    def _nothing_spread_out(self, lanes: LaneBatch) -> Array:
+        """Return the lanes (B,) for which no input of `PlanInputs.spread` is verified; others need the single path."""
+        xp, before = self._xp, lanes.z_0[self.known - self._m :]
+        none = xp.ones_like(before[0], dtype=xp.bool)
+        if self.constraints.tube.linear or not none.shape[0]:
+            return none
+        low, high = (
+            self.limited(xp.full_like(before, -xp.inf), before),
+            self.limited(xp.full_like(before, xp.inf), before),
+        )
+        for share in self._pattern:
+            z = self.regressors(lanes.z_0, 0.5 * (low + high) + 0.5 * (high - low) * share)
+            plan = self.constraints.around(lanes.scene, z)
+            none &= self.constraints.least(lanes.scene, plan.slack, plan.extent) < -ROUNDING
+        return none
 
     def _changed(self, lanes: LaneBatch, z: Array) -> Array:
         """Return which plans (B,) begin with another input than the proposal: with one chosen input, all do."""
